@@ -1,0 +1,286 @@
+"""What an instrument and a method are, and the registry that finds them.
+
+A plugin is a plain class, named in the entry-point group ``errormotion.instruments`` or ``errormotion.methods`` of any
+distribution. The built-in ones come through the same door. The registry reads the entry points once, loads a plugin
+only when it is asked for, and keeps a broken one in its list together with its error.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from types import TracebackType
+from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+
+import numpy as np
+import xarray as xr
+from pydantic import BaseModel, ConfigDict
+
+from errormotion.errors import PluginError
+
+Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
+Group = Literal["instruments", "methods"]
+GROUPS: tuple[Group, ...] = ("instruments", "methods")
+
+
+class PluginSettings(BaseModel):
+    """Base of every plugin's settings: unknown keys are refused, values are fixed once made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(frozen=True)
+class InstrumentInfo:
+    """What an instrument says of itself.
+
+    ``status`` is honest about what it has met: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
+    ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
+    """
+
+    id: str
+    kind: str
+    summary: str
+    status: Status
+    version: str = "1"
+    simulator: str | None = None
+
+
+@dataclass(frozen=True)
+class MethodInfo:
+    """What a method says of itself; ``cannot_see`` lists in words what it is blind to."""
+
+    id: str
+    summary: str
+    status: Status
+    version: str = "1"
+    cannot_see: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a method needs: instrument kinds to acquire, a raw schema to identify."""
+
+    instruments: tuple[str, ...]
+    raw_schema: str
+    optional_instruments: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who answered at an address: goes into the provenance of everything that it measured."""
+
+    manufacturer: str
+    model: str
+    serial_number: str
+    firmware: str = ""
+    simulated: bool = False
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A block of equally spaced samples of one or more channels, as an instrument hands them over.
+
+    Attributes
+    ----------
+    values : ndarray, float64, (channel, n)
+        SI units; NaN where the instrument gave no valid value.
+    first : int
+        Device counter of the first sample (samples since the start of the stream, lost ones included).
+    rate : float
+        Samples per second.
+    host_time : float
+        ``time.monotonic()`` when the block had come off the wire, s.
+    dropped : int
+        Samples that the device counter shows missing inside this block; they are NaN in ``values``.
+    invalid : mapping of str to int
+        Why values are NaN: reason to count.
+    """
+
+    values: np.ndarray
+    first: int
+    rate: float
+    host_time: float
+    dropped: int = 0
+    invalid: Mapping[str, int] = field(default_factory=dict)
+
+
+@runtime_checkable
+class Instrument(Protocol):
+    """A driver: one plain class. Nothing touches the wire before ``__enter__`` (or ``open``)."""
+
+    info: ClassVar[InstrumentInfo]
+    Settings: ClassVar[type[PluginSettings]]
+    address: str
+    settings: Any
+
+    def open(self) -> None:
+        """Open the connection; idempotent."""
+
+    def close(self) -> None:
+        """Close the connection and end every thread; idempotent."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def identify(self) -> Identity:
+        """Ask the device who it is."""
+
+    def read(self) -> Any:
+        """Return one reading now."""
+
+
+@runtime_checkable
+class Bench(Protocol):
+    """What a method sees of a bench: opened instruments by kind, and where and what the machine is."""
+
+    machine: str
+
+    def of_kind(self, kind: str) -> Any:
+        """Return the one instrument of this kind; BenchError names what is missing."""
+
+    def has_kind(self, kind: str) -> bool:
+        """Whether the bench offers an instrument of this kind."""
+
+    def ask(self, message: str) -> None:
+        """Ask the operator to do something and wait for it; passes at once on a virtual machine."""
+
+
+@runtime_checkable
+class Method(Protocol):
+    """What is measured and how it becomes an error dataset."""
+
+    info: ClassVar[MethodInfo]
+    needs: ClassVar[Needs]
+    Settings: ClassVar[type[PluginSettings]]
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: Any,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield raw datasets to be joined along ``append_dim(settings)``.
+
+        ``inputs`` are results of earlier tests by the name the campaign gives them. ``done`` is what an interrupted
+        run already holds: go on behind it.
+        """
+
+    def append_dim(self, settings: Any) -> str:
+        """Return the dimension along which the yielded datasets are joined."""
+
+    def progress(self, settings: Any) -> float:
+        """Return the expected total length of ``append_dim`` (samples or items), for the progress bar."""
+
+    def identify(self, raw: xr.Dataset, settings: Any) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset; leaves ``raw`` as it is."""
+
+    def plan(self, settings: Any) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One entry of the registry: the class, or why it could not be loaded."""
+
+    id: str
+    group: Group
+    entry_point: EntryPoint
+    cls: Any = None
+    error: str = ""
+    traceback: str = ""
+
+    @property
+    def distribution(self) -> str:
+        """Name and version of the distribution that brought the plugin."""
+        dist = self.entry_point.dist
+        return f"{dist.name} {dist.version}" if dist is not None else "unknown"
+
+
+@cache
+def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
+    return {group: tuple(entry_points(group=f"errormotion.{group}")) for group in GROUPS}
+
+
+@cache
+def _loaded(group: Group, point: EntryPoint) -> Plugin:
+    required = ("info", "Settings", "identify")
+    try:
+        cls = point.load()
+        missing = [name for name in required if not hasattr(cls, name)]
+        if missing:
+            raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
+        if cls.info.id != point.name:
+            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{cls.info.id}'")
+    except Exception as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
+        return Plugin(
+            point.name,
+            group,
+            point,
+            error=f"{type(error).__name__}: {error}",
+            traceback=traceback.format_exc(),
+        )
+    return Plugin(point.name, group, point, cls)
+
+
+def available(group: Group) -> list[Plugin]:
+    """Return every plugin of a group, broken ones included, sorted by id."""
+    return [_loaded(group, point) for point in sorted(_found()[group], key=lambda point: point.name)]
+
+
+def get(group: Group, plugin_id: str) -> Any:
+    """Return a plugin's class.
+
+    Raises
+    ------
+    PluginError
+        Unknown id (the nearest known ones are named), two distributions claiming one id, or a plugin that does not
+        load.
+    """
+    points = [point for point in _found()[group] if point.name == plugin_id]
+    what = group.rstrip("s")
+    if not points:
+        names = sorted({point.name for point in _found()[group]})
+        near = get_close_matches(plugin_id, names, n=1)
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        raise PluginError(f"No {what} plugin '{plugin_id}'; there are: {', '.join(names) or 'none'}.{hint}")
+    if len(points) > 1:
+        sources = ", ".join(_loaded(group, point).distribution for point in points)
+        raise PluginError(f"Several distributions claim the {what} '{plugin_id}': {sources}. Remove all but one.")
+    plugin = _loaded(group, points[0])
+    if plugin.error:
+        raise PluginError(f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}")
+    return plugin.cls
+
+
+def refresh() -> None:
+    """Forget what was found: entry points are read again at the next call."""
+    _found.cache_clear()
+    _loaded.cache_clear()
+
+
+__all__: Sequence[str] = [
+    "GROUPS",
+    "Bench",
+    "Identity",
+    "Instrument",
+    "InstrumentInfo",
+    "Method",
+    "MethodInfo",
+    "Needs",
+    "Plugin",
+    "PluginSettings",
+    "Samples",
+    "available",
+    "get",
+    "refresh",
+]
