@@ -1,0 +1,47 @@
+# Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
+# demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint docs bench validate lock
+
+BIN := .venv/bin
+ARGS ?=
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):[^#]*## /  \1\t/' | expand -t 14
+
+setup: .venv/.dev  ## install everything into .venv (uv where it is, else pip)
+
+demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, report
+	$(BIN)/errormotion demo $(ARGS)
+
+test: .venv/.dev  ## run the tests (ARGS="tests/kinematics -k fit" runs some)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: .venv/.dev  ## style, types, and which package imports which
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+docs: .venv/.dev  ## build docs/_build/html; a warning is an error
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+bench: .venv/.dev  ## run every benchmark and print its figures
+	@set -e; for script in benchmarks/bench_*.py; do \
+		[ -e "$$script" ] || continue; echo "== $$script"; $(BIN)/python "$$script"; done
+
+validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validation.md
+	$(BIN)/python benchmarks/validate.py $(ARGS)
+
+lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
+	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \
+		--upgrade --generate-hashes --no-emit-index-url --no-header -o requirements.lock
+	uv pip compile -q --universal --python-version 3.11 pyproject.toml --group build -c requirements.lock \
+		--generate-hashes --no-emit-index-url --no-header --no-annotate -o requirements-core.lock
+
+.venv/.core: requirements-core.lock pyproject.toml
+	@tools/setup core
+
+.venv/.dev: requirements.lock requirements-core.lock pyproject.toml
+	@tools/setup dev
