@@ -1,0 +1,240 @@
+"""Files that a person writes: TOML checked by a pydantic model, and every mistake told at once.
+
+Each mistake names the file, the dotted key, what was expected, what was found, and for an unknown key the nearest
+known one.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from errormotion.datasets.units import EDGE, Quantity
+from errormotion.errors import DatasetError, ErrormotionError
+
+Model = TypeVar("Model", bound=BaseModel)
+Key = str | int
+
+_EXPECTED = {
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "dict_type": "a table",
+    "mapping_type": "a table",
+    "list_type": "an array",
+    "tuple_type": "an array",
+    "string_type": "a string in quotes",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "int_parsing": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "path_type": "a path in quotes",
+}
+
+
+def load_model(path: str | Path, model: type[Model], *, error: type[ErrormotionError] = DatasetError) -> Model:
+    """Read a TOML file into a pydantic model; units are compulsory in it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, UTF-8.
+    model : type of BaseModel
+        What it must hold; models with ``extra="forbid"`` refuse unknown keys.
+    error : type of ErrormotionError
+        What to raise.
+
+    Raises
+    ------
+    ErrormotionError
+        Of the type ``error``: the file cannot be read, is no TOML (with line and column), or holds mistakes (all of
+        them in one message).
+    """
+    found, mistakes = check(read_toml(path, error=error), model)
+    if found is None:
+        raise error(report(path, mistakes))
+    return found
+
+
+def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError) -> dict[str, Any]:
+    """Return the tables of a TOML file; a byte order mark is allowed.
+
+    Raises
+    ------
+    ErrormotionError
+        Of the type ``error``: missing, unreadable, not UTF-8, not TOML.
+    """
+    try:
+        raw = Path(path).read_bytes()
+    except OSError as reason:
+        raise error(f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.") from reason
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as reason:
+        line = raw.count(b"\n", 0, reason.start) + 1
+        raise error(
+            f"{path}, line {line}: byte 0x{raw[reason.start]:02x} is not UTF-8. Save the file as UTF-8."
+        ) from reason
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as reason:
+        place = re.search(r"(.*) \(at line (\d+), column (\d+)\)$", str(reason), re.DOTALL)
+        if place:
+            raise error(f"{path}, line {place[2]}, column {place[3]}: not TOML: {place[1]}") from reason
+        lines = text.splitlines() or [""]
+        complaint = str(reason).removesuffix(" (at end of document)")
+        raise error(f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}") from reason
+
+
+def check(
+    data: Mapping[str, Any], model: type[Model], *, prefix: Sequence[Key] = (), edge: bool = True
+) -> tuple[Model | None, list[str]]:
+    """Return the model of some tables, or None and every mistake in them.
+
+    Parameters
+    ----------
+    data : mapping
+        As TOML gives it.
+    model : type of BaseModel
+        What it must hold.
+    prefix : sequence of str or int
+        Where ``data`` stands in its file, for the dotted keys of the messages.
+    edge : bool
+        A person wrote it: bare numbers are refused where a unit belongs.
+    """
+    try:
+        return model.model_validate(data, context=EDGE if edge else None), []
+    except ValidationError as failure:
+        return None, [_mistake(details, model, prefix) for details in failure.errors(include_url=False)]
+
+
+def report(source: str | Path, mistakes: Sequence[str]) -> str:
+    """Return the one message for all mistakes of one file."""
+    count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
+    return "\n  - ".join([f"{source}: {count}", *mistakes])
+
+
+def dotted(keys: Iterable[Key]) -> str:
+    """Return ``test[0].settings.average`` for ``("test", 0, "settings", "average")``."""
+    text = ""
+    for key in keys:
+        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else key
+    return text
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a sentence for an unknown name: the nearest known one if any is near, and what there is."""
+    names = sorted(known)
+    near = get_close_matches(name, names, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    return f"{hint}Known here: {', '.join(names) or 'none'}"
+
+
+def _mistake(details: ErrorDetails, model: type[BaseModel], prefix: Sequence[Key]) -> str:
+    path = tuple(details["loc"])
+    kind, message, found = details["type"], details["msg"], details["input"]
+    place = dotted((*prefix, *_without_tags(model, path))) or "(whole file)"
+    if kind == "extra_forbidden":
+        known = {name for owner in _models(_descend(model, path[:-1])) for name in _names(owner)}
+        return f"{place}: unknown key; {nearest(str(path[-1]), known)}"
+    if kind == "missing":
+        return f"{place}: missing; expected {_wanted(model, path)}"
+    if kind == "quantity":
+        return f"{place}: {message}"
+    if kind in ("value_error", "assertion_error"):
+        return f"{place}: {message.partition(', ')[2]}; found {_short(found)}"
+    expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
+    if expected.startswith(("greater", "less")):
+        expected = f"a value {expected}"
+    hint = ""
+    if kind in ("literal_error", "enum") and isinstance(found, str):
+        near = get_close_matches(found, re.findall(r"'([^']*)'", expected), n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+    return f"{place}: expected {expected}; found {_short(found)}{hint}"
+
+
+def _short(value: Any) -> str:
+    text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _wanted(model: type[BaseModel], path: Sequence[Key]) -> str:
+    """Return in words what belongs at a path."""
+    for owner in _models(_descend(model, path[:-1])):
+        for name, field in owner.model_fields.items():
+            if path[-1] not in (name, field.alias):
+                continue
+            for note in field.metadata:
+                if isinstance(note, Quantity):
+                    return f"{note.kind}, such as '{note.example}'"
+            if field.description:
+                return field.description
+            if _models([field.annotation]) == [field.annotation]:
+                return "a table"
+            kinds = {str: "a string", float: "a number", int: "a whole number", bool: "true or false", Path: "a path"}
+            return kinds.get(field.annotation, "a value") if isinstance(field.annotation, type) else "a value"
+    return "a value"
+
+
+def _names(model: type[BaseModel]) -> list[str]:
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _options(annotation: Any) -> list[Any]:
+    """Return the members of unions and annotated types, flattened."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _options(get_args(annotation)[0])
+    if origin is Union or origin is types.UnionType:
+        return [option for member in get_args(annotation) for option in _options(member)]
+    return [annotation]
+
+
+def _models(annotations: Iterable[Any]) -> list[type[BaseModel]]:
+    options = [option for annotation in annotations for option in _options(annotation)]
+    return [option for option in options if isinstance(option, type) and issubclass(option, BaseModel)]
+
+
+def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
+    """Return what stands below a key; empty if the key is none (pydantic's tag of a union member)."""
+    below: list[Any] = []
+    for option in (option for annotation in annotations for option in _options(annotation)):
+        if isinstance(option, type) and issubclass(option, BaseModel):
+            below += [field.annotation for name, field in option.model_fields.items() if key in (name, field.alias)]
+        elif get_origin(option) in (dict, Mapping):
+            below.append(get_args(option)[1])
+        elif get_origin(option) in (list, tuple, Sequence) and isinstance(key, int):
+            arguments = [argument for argument in get_args(option) if argument is not Ellipsis]
+            below.append(arguments[min(key, len(arguments) - 1)])
+    return below
+
+
+def _descend(model: type[BaseModel], path: Sequence[Key]) -> list[Any]:
+    """Return the annotations that may stand at a path, skipping the tags of unions."""
+    here: list[Any] = [model]
+    for key in path:
+        here = _step(here, key) or here
+    return here
+
+
+def _without_tags(model: type[BaseModel], path: Sequence[Key]) -> list[Key]:
+    """Return a path without the tags that pydantic puts in for members of unions."""
+    here: list[Any] = [model]
+    kept: list[Key] = []
+    for number, key in enumerate(path):
+        below = _step(here, key)
+        options = [option for annotation in here for option in _options(annotation)]
+        if below or len(options) == 1 or number == len(path) - 1:
+            kept.append(key)
+        here = below or here
+    return kept

@@ -1,0 +1,212 @@
+"""Quantities with units: what a person writes at the edge, and the SI numbers inside.
+
+``Length``, ``Angle``, ``Time`` and their sisters are types for pydantic models. The value is a float in SI (spindle
+speed in 1/min, temperature in degC). A string such as ``"5 mm"`` is read everywhere. A bare number is SI when it comes
+from Python, and refused when it comes from a file or a command line (validation context ``{"edge": True}``).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from errormotion.errors import DatasetError
+
+if TYPE_CHECKING:
+    import pint
+
+EDGE = {"edge": True}
+"""Validation context of everything that a person writes: units are compulsory."""
+
+ArrayLike = float | np.ndarray
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,2})?"
+_TERM = r"[^\W\d_]+(?:(?:\^|\*\*)?-?\d+)?|°C?|%"
+_UNIT = rf"(?:1?/)?\s*(?:{_TERM})(?:\s*[*·/ ]\s*(?:{_TERM}))*"
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})\s*")
+
+# A turn is no angle here: pint's rpm carries a factor 2 pi, so spindle speeds have their own table, in 1/min.
+_PER_MINUTE = {
+    **dict.fromkeys(("/min", "1/min", "min^-1", "min-1", "rpm", "rev/min", "U/min"), Fraction(1)),
+    **dict.fromkeys(("/s", "1/s", "s^-1", "s-1", "rps", "rev/s"), Fraction(60)),
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Pydantic annotation of a float that has a unit.
+
+    Parameters
+    ----------
+    kind : str
+        What it is, with its article: "a length".
+    unit : str
+        Unit of the value.
+    example : str
+        How a person writes one.
+    """
+
+    kind: str
+    unit: str
+    example: str
+
+    def parse(self, text: str) -> float:
+        """Return the value of a text such as ``"5 mm"``; ValueError says what was expected."""
+        match = _QUANTITY.fullmatch(text)
+        expected = f"expected {self.kind} with its unit, such as '{self.example}'; found '{text}'"
+        if match is None:
+            hint = " (the decimal sign is a point)" if re.match(r"\s*[+-]?\d+,\d", text) else ""
+            raise ValueError(expected + hint)
+        try:
+            factor, offset = _linear(match[2], self.unit)
+            value = float(Fraction(match[1]) * factor + offset)
+        except DatasetError as error:
+            raise ValueError(f"{expected}: {error}") from error
+        return value
+
+    def _validate(self, value: Any, info: core_schema.ValidationInfo) -> Any:
+        if isinstance(value, str):
+            try:
+                return self.parse(value)
+            except ValueError as error:
+                raise _refusal(str(error)) from error
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+            raise _refusal(f"expected {self.kind} with its unit, such as '{self.example}'; found {value!r}")
+        if (info.context or {}).get("edge"):
+            raise _refusal(f"expected {self.kind} with its unit, such as '{self.example}'; found {value}")
+        if not math.isfinite(value):
+            raise _refusal(f"expected {self.kind} in {self.unit}, a finite number; found {value}")
+        return float(value)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.with_info_before_validator_function(self._validate, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {**handler(schema), "unit": self.unit, "examples": [self.example]}
+
+
+def _refusal(message: str) -> PydanticCustomError:
+    return PydanticCustomError("quantity", "{message}", {"message": message})
+
+
+LENGTH = Quantity("a length", "m", "5 mm")
+ANGLE = Quantity("an angle", "rad", "3 arcsec")
+TIME = Quantity("a time", "s", "104 min")
+SPEED = Quantity("a spindle speed", "1/min", "15000 /min")
+TEMPERATURE = Quantity("a temperature", "degC", "20 degC")
+FREQUENCY = Quantity("a frequency", "Hz", "20 kHz")
+VELOCITY = Quantity("a velocity", "m/s", "1500 mm/min")
+EXPANSION = Quantity("an expansion", "m/K", "2.1 um/K")
+KINDS = (LENGTH, ANGLE, TIME, SPEED, TEMPERATURE, FREQUENCY, VELOCITY, EXPANSION)
+
+Length = Annotated[float, LENGTH]
+Angle = Annotated[float, ANGLE]
+Time = Annotated[float, TIME]
+Speed = Annotated[float, SPEED]
+Temperature = Annotated[float, TEMPERATURE]
+Frequency = Annotated[float, FREQUENCY]
+Velocity = Annotated[float, VELOCITY]
+Expansion = Annotated[float, EXPANSION]
+
+
+@cache
+def _registry() -> pint.UnitRegistry[Any]:
+    import pint  # 0.3 s to load: only when a text has to be read
+
+    return pint.UnitRegistry(non_int_type=Fraction)  # exact: 25 um is 2.5e-5 m to the last bit
+
+
+@cache
+def _unit(text: str) -> pint.Unit:
+    import pint
+
+    if not re.fullmatch(_UNIT, text):
+        raise DatasetError(f"'{text}' is not a known unit")
+    try:
+        return _registry().parse_units("1" + text if text.startswith("/") else text)
+    except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
+        raise DatasetError(f"'{text}' is not a known unit") from error
+
+
+@cache
+def _linear(source: str, target: str) -> tuple[Fraction, Fraction]:
+    """Return (factor, offset) such that ``target = factor * source + offset``."""
+    if source == target:
+        return Fraction(1), Fraction(0)
+    if target in _PER_MINUTE and source in _PER_MINUTE:
+        return _PER_MINUTE[source] / _PER_MINUTE[target], Fraction(0)
+    registry = _registry()
+    from_, to = _unit(source), _unit(target)
+    # Compared in base units, not in dimensions: a per cent is no angle.
+    if registry.get_base_units(from_)[1] != registry.get_base_units(to)[1]:
+        raise DatasetError(f"'{source}' is not convertible to '{target}'")
+    zero, one = (Fraction(registry.Quantity(Fraction(number), from_).to(to).magnitude) for number in (0, 1))
+    return one - zero, zero
+
+
+def convert(values: ArrayLike, source: str, target: str) -> ArrayLike:
+    """Convert numbers from one unit to another.
+
+    Parameters
+    ----------
+    values : float or ndarray
+        Numbers in ``source``.
+    source, target : str
+        Units; ``degC`` is a temperature, not a difference.
+
+    Returns
+    -------
+    float or ndarray
+        Numbers in ``target``.
+
+    Raises
+    ------
+    DatasetError
+        A unit is unknown, or they are of different kinds.
+    """
+    factor, offset = _linear(source, target)
+    # Divided where the factor is 1/n: 25 um is then 2.5e-5 m to the last bit.
+    scaled = values / float(1 / factor) if factor.numerator == 1 else values * float(factor)
+    return scaled + float(offset) if offset else scaled
+
+
+def si_unit(unit: str) -> str:
+    """Return the inside unit (m, rad, s, 1/min, degC, Hz, m/s, m/K) of the kind that ``unit`` belongs to."""
+    if unit in _PER_MINUTE:
+        return SPEED.unit
+    for kind in (kind for kind in KINDS if kind is not SPEED):
+        try:
+            _linear(unit, kind.unit)
+        except DatasetError:
+            continue
+        return kind.unit
+    _unit(unit)
+    raise DatasetError(f"'{unit}' measures none of {', '.join(kind.kind for kind in KINDS)}")
+
+
+def format_quantity(value: float, unit: str, digits: int = 4) -> str:
+    """Return a value in SI as a text in a field unit, ``"19.3 um"``; NaN is ``"unknown"``.
+
+    Parameters
+    ----------
+    value : float
+        In the inside unit: m, rad, s, 1/min, degC.
+    unit : str
+        Unit to write it in.
+    digits : int
+        Significant digits.
+    """
+    if math.isnan(value):
+        return "unknown"
+    number = float(convert(float(value), si_unit(unit), unit))
+    text = np.format_float_positional(number, precision=digits, fractional=False, trim="-")
+    return f"{'0' if text == '-0' else text} {unit}"
