@@ -1,0 +1,85 @@
+"""The six freedoms and what ISO 230-1 calls the errors of an axis in them.
+
+A name is E, the direction, the axis that moves: ``EYX`` is the straightness of X in Y, ``ECX`` its rotation about Z.
+A zero in it marks an error of place, not of motion: ``EC0Y`` is the squareness of Y to X.
+"""
+
+from __future__ import annotations
+
+__all__ = ["DOF", "LINEAR_AXES", "ROTARY_AXES", "direction_of", "iso_names", "location_names"]
+
+DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
+LINEAR_AXES = ("X", "Y", "Z", "U", "V", "W")
+ROTARY_AXES = ("A", "B", "C")
+
+_PARALLEL_TO = {"X": 0, "Y": 1, "Z": 2, "U": 0, "V": 1, "W": 2, "A": 0, "B": 1, "C": 2}
+# Components of error datasets that are no single axis: the standard has no name beyond the freedom's own.
+_NO_AXIS = ("tool", "beam")
+
+
+def iso_names(component: str, *, spindle_axis: str = "C") -> dict[str, str]:
+    """Return the name of each freedom's error.
+
+    Parameters
+    ----------
+    component : str
+        An axis (``X Y Z U V W A B C``), ``spindle``, ``tool`` (the volume) or ``beam``.
+    spindle_axis : str
+        Letter of the axis that the spindle turns about; the usual vertical or gantry spindle is C.
+
+    Returns
+    -------
+    dict
+        Freedom to name, such as ``{"EX": "EXX", "EY": "EYX", ...}``. The volume's and a beam's errors keep the
+        freedom's own name.
+
+    Raises
+    ------
+    ValueError
+        Unknown component.
+    """
+    if component in _NO_AXIS:
+        return {dof: dof for dof in DOF}
+    axis = spindle_axis if component == "spindle" else component
+    direction_of(axis)
+    return {dof: dof + axis for dof in DOF}
+
+
+def direction_of(axis: str) -> int:
+    """Return the index (0 X, 1 Y, 2 Z) of the coordinate that an axis moves along or turns about.
+
+    Raises
+    ------
+    ValueError
+        Unknown axis.
+    """
+    if axis not in _PARALLEL_TO:
+        known = ", ".join([*LINEAR_AXES, *ROTARY_AXES, "spindle", *_NO_AXIS])
+        raise ValueError(f"expected one of {known}; found '{axis}'")
+    return _PARALLEL_TO[axis]
+
+
+def location_names(axis: str, others: tuple[str, ...] = LINEAR_AXES) -> dict[str, str]:
+    """Return the errors of place of an axis on a machine that also has the axes ``others``.
+
+    X is the datum's first axis and Y the second, so a three-axis machine has three: ``EC0Y``, ``EA0Z``, ``EB0Z``. A
+    rotary axis has four: two places and two tilts of its line.
+
+    Parameters
+    ----------
+    axis : str
+    others : tuple of str
+        Axes of the machine; a squareness is to one of them.
+
+    Returns
+    -------
+    dict
+        Freedom to name, such as ``{"EA": "EA0Z", "EB": "EB0Z"}``; empty for X.
+    """
+    along = direction_of(axis)
+    if axis in ROTARY_AXES:
+        return {dof: f"{dof}0{axis}" for i, dof in enumerate(DOF) if i % 3 != along}
+    squareness = {"X": {}, "Y": {"EC": "X"}, "Z": {"EA": "Y", "EB": "X"}}.get(axis)
+    if squareness is None:  # U, V, W: parallel axes, both tilts of their line
+        return {dof: f"{dof}0{axis}" for i, dof in enumerate(DOF[3:]) if i != along}
+    return {dof: f"{dof}0{axis}" for dof, datum in squareness.items() if datum in others}

@@ -1,0 +1,193 @@
+"""Small errors of a rigid body as twists, and what becomes of them at another point or in another frame.
+
+A twist ``(EX, EY, EZ, EA, EB, EC)`` holds the displacement (m) of one point of the body, the functional point, and the
+body's small rotation (rad) about X, Y, Z. A freedom that nobody knows is NaN. It spoils only what depends on it: where
+a coefficient is exactly zero, the unknown freedom does not matter.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RigidTransform, Rotation
+
+__all__ = ["adjoint", "cross_matrix", "move", "to_frame", "transform", "transform_covariance"]
+
+# An entry of a rotation matrix smaller than this is rounding of a zero (a quarter turn leaves cos 90 deg = 6e-17).
+ROUNDING_OF_ROTATION = 1e-15
+
+
+def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
+    """Return the matrix of the cross product: ``cross_matrix(v) @ w`` is ``v x w``.
+
+    Parameters
+    ----------
+    v : array_like, (..., 3)
+
+    Returns
+    -------
+    ndarray, (..., 3, 3)
+
+    Raises
+    ------
+    ValueError
+        The last axis of ``v`` has not length 3.
+    """
+    v = _with_last("vector", v, 3)
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    zero = np.zeros_like(x)
+    return np.stack(
+        [np.stack([zero, -z, y], axis=-1), np.stack([z, zero, -x], axis=-1), np.stack([-y, x, zero], axis=-1)],
+        axis=-2,
+    )
+
+
+def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Return the 6x6 matrix that takes a twist to another functional point and into another frame.
+
+    The twist is moved first, ``E' = E + R x shift`` with ``shift`` in the old frame; then both its parts are rotated
+    into the new frame, ``v_new = rotation @ v_old``.
+
+    Parameters
+    ----------
+    rotation : array_like, (..., 3, 3), or Rotation, optional
+        Turns coordinates of the old frame into coordinates of the new one; default: same frame.
+        Entries below 1e-15 are taken as rounded zeros.
+    shift : array_like, (..., 3), optional
+        From the old functional point to the new one, m, in the old frame; default: same point.
+
+    Returns
+    -------
+    ndarray, (..., 6, 6)
+
+    Raises
+    ------
+    ValueError
+        Wrong shape, or ``rotation`` is no proper rotation.
+    """
+    Q = _rotation_matrix(rotation)
+    S = cross_matrix(np.zeros(3) if shift is None else shift)
+    batch = np.broadcast_shapes(Q.shape[:-2], S.shape[:-2])
+    A = np.zeros((*batch, 6, 6))
+    A[..., :3, :3] = Q
+    A[..., 3:, 3:] = Q
+    A[..., :3, 3:] = -Q @ S
+    return A
+
+
+def transform(twist: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
+    """Return ``A @ twist``; a NaN freedom spoils only what depends on it.
+
+    Parameters
+    ----------
+    twist : array_like, (..., 6)
+    A : array_like, (..., 6, 6)
+        Usually from `adjoint`.
+
+    Returns
+    -------
+    ndarray, (..., 6)
+    """
+    twist, A = _with_last("twist", twist, 6), _six_by_six("matrix", A)
+    unknown = np.isnan(twist)
+    if not unknown.any():
+        return _apply(A, twist)
+    moved = _apply(A, np.where(unknown, 0.0, twist))
+    spoilt = _apply((A != 0).astype(float), unknown.astype(float)) > 0
+    return np.where(spoilt, np.nan, moved)
+
+
+def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
+    """Return ``A @ covariance @ A.T``; NaN rows and columns spoil only what depends on them.
+
+    Parameters
+    ----------
+    covariance : array_like, (..., 6, 6)
+        Symmetric, in m^2, m rad and rad^2.
+    A : array_like, (..., 6, 6)
+        Usually from `adjoint`.
+
+    Returns
+    -------
+    ndarray, (..., 6, 6)
+        Symmetric to the last bit.
+    """
+    C, A = _six_by_six("covariance", covariance), _six_by_six("matrix", A)
+    At = np.swapaxes(A, -1, -2)
+    unknown = np.isnan(C)
+    moved = A @ np.where(unknown, 0.0, C) @ At
+    moved = 0.5 * (moved + np.swapaxes(moved, -1, -2))
+    if not unknown.any():
+        return moved
+    spoilt = ((A != 0).astype(float) @ unknown.astype(float) @ (At != 0).astype(float)) > 0
+    return np.where(spoilt, np.nan, moved)
+
+
+def move(twist: ArrayLike, shift: ArrayLike) -> NDArray[np.float64]:
+    """Return the twist of the same body at another point: ``E' = E + R x shift``.
+
+    Parameters
+    ----------
+    twist : array_like, (..., 6)
+    shift : array_like, (..., 3)
+        From the old functional point to the new one, m.
+
+    Returns
+    -------
+    ndarray, (..., 6)
+    """
+    return transform(twist, adjoint(shift=shift))
+
+
+def to_frame(twist: ArrayLike, pose: RigidTransform) -> NDArray[np.float64]:
+    """Return the twist, at the same functional point, in another frame: both parts are rotated.
+
+    Parameters
+    ----------
+    twist : array_like, (..., 6)
+    pose : RigidTransform
+        Takes coordinates of the old frame to coordinates of the new one. Only its rotation acts on the twist. The
+        functional point stays where it is and has the coordinates ``pose.apply(functional_point)`` in the new frame.
+
+    Returns
+    -------
+    ndarray, (..., 6)
+    """
+    return transform(twist, adjoint(rotation=pose.rotation))
+
+
+def _apply(A: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
+    if A.ndim == 2:
+        return twist @ A.T
+    moved: NDArray[np.float64] = (A @ twist[..., None])[..., 0]
+    return moved
+
+
+def _rotation_matrix(rotation: ArrayLike | Rotation | None) -> NDArray[np.float64]:
+    if rotation is None:
+        return np.eye(3)
+    Q = np.array(rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation, dtype=float)
+    if Q.ndim < 2 or Q.shape[-2:] != (3, 3):
+        raise ValueError(f"expected a rotation of shape (..., 3, 3), found {Q.shape}")
+    if not np.allclose(Q @ np.swapaxes(Q, -1, -2), np.eye(3), rtol=0, atol=1e-6) or np.any(np.linalg.det(Q) < 0):
+        raise ValueError("expected a proper rotation matrix (orthonormal, determinant +1); check the matrix's rows")
+    Q[np.abs(Q) < ROUNDING_OF_ROTATION] = 0.0
+    return Q
+
+
+def _with_last(what: str, value: ArrayLike, length: int) -> NDArray[np.float64]:
+    array = np.asarray(value, dtype=float)
+    if array.ndim == 0 or array.shape[-1] != length:
+        raise ValueError(f"expected a {what} of shape (..., {length}), found {array.shape}")
+    return array
+
+
+def _six_by_six(what: str, value: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(value, dtype=float)
+    if array.ndim < 2 or array.shape[-2:] != (6, 6):
+        raise ValueError(f"expected a {what} of shape (..., 6, 6), found {array.shape}")
+    return array
