@@ -1,0 +1,147 @@
+"""Set-up is pinned, happens once, and says what is missing."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[2]
+PIN = re.compile(r"^([a-z0-9.-]+)==(\S+?)(?: ; (.*?))? \\$")
+
+
+def _pins(name: str) -> set[tuple[str, str, str]]:
+    lines = (ROOT / name).read_text().splitlines()
+    return {(match[1], match[2], match[3] or "") for line in lines if (match := PIN.match(line))}
+
+
+def _wanted() -> tuple[list[Requirement], list[Requirement]]:
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    core = [*data["project"]["dependencies"], *data["dependency-groups"]["build"]]
+    extras = [item for group in data["project"]["optional-dependencies"].values() for item in group]
+    return [Requirement(item) for item in core], [
+        Requirement(item) for item in extras + data["dependency-groups"]["dev"]
+    ]
+
+
+@pytest.mark.parametrize("lock", ["requirements.lock", "requirements-core.lock"])
+def test_every_pin_has_hashes_and_no_address(lock: str) -> None:
+    text = (ROOT / lock).read_text()
+    entries = re.split(r"^(?=[a-zA-Z0-9])", text, flags=re.MULTILINE)
+    unpinned = [entry.splitlines()[0] for entry in entries if entry.strip() and "--hash=sha256:" not in entry]
+    assert not unpinned
+    assert len(_pins(lock)) > 40
+    assert "://" not in text
+    assert "--index" not in text
+    assert "--find-links" not in text
+
+
+def test_core_lock_is_part_of_the_full_one() -> None:
+    full = {(name, version) for name, version, _ in _pins("requirements.lock")}
+    assert {(name, version) for name, version, _ in _pins("requirements-core.lock")} <= full
+
+
+def test_locks_hold_what_pyproject_asks_for() -> None:
+    core, rest = _wanted()
+    for lock, wanted in (("requirements-core.lock", core), ("requirements.lock", core + rest)):
+        pins = _pins(lock)
+        for requirement in wanted:
+            versions = [v for name, v, _ in pins if name == canonicalize_name(requirement.name)]
+            assert versions, f"{requirement} is not in {lock}: run make lock"
+            assert all(requirement.specifier.contains(v) for v in versions), (
+                f"{requirement} against {versions} in {lock}"
+            )
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Path:
+    """Return a copy of the files that set-up uses; its setup only counts how often it is called."""
+    for name in ("Makefile", "pyproject.toml", "requirements.lock", "requirements-core.lock"):
+        shutil.copy2(ROOT / name, tmp_path / name)
+    (tmp_path / "tools").mkdir()
+    setup = tmp_path / "tools" / "setup"
+    setup.write_text(
+        "#!/bin/sh\nmkdir -p .venv\necho $1 >>calls\ntouch .venv/.core\n[ $1 = core ] || touch .venv/.dev\n"
+    )
+    setup.chmod(0o755)
+    return tmp_path
+
+
+def _make(house: Path, target: str) -> list[str]:
+    subprocess.run(["make", target], cwd=house, check=True, capture_output=True)
+    calls = house / "calls"
+    return calls.read_text().split() if calls.exists() else []
+
+
+def _renew(path: Path) -> None:
+    later = path.stat().st_mtime + 3600
+    os.utime(path, (later, later))
+
+
+def test_set_up_happens_once(house: Path) -> None:
+    assert _make(house, ".venv/.core") == ["core"]
+    assert _make(house, ".venv/.core") == ["core"]
+    assert _make(house, "setup") == ["core", "dev"]
+    assert _make(house, "setup") == ["core", "dev"]
+    assert _make(house, ".venv/.core") == ["core", "dev"]
+
+
+@pytest.mark.parametrize("changed", ["requirements.lock", "requirements-core.lock", "pyproject.toml"])
+def test_a_changed_lock_sets_up_again(house: Path, changed: str) -> None:
+    _make(house, "setup")
+    _renew(house / changed)
+    assert _make(house, "setup") == ["dev", "dev"]
+
+
+def _real_setup(tmp_path: Path, path: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    (tmp_path / "tools").mkdir()
+    shutil.copy2(ROOT / "tools" / "setup", tmp_path / "tools" / "setup")
+    return subprocess.run(
+        [tmp_path / "tools" / "setup", "core"], env={"PATH": path, **environment}, capture_output=True, text=True
+    )
+
+
+def _path_with(folder: Path, **commands: str) -> str:
+    """Return a PATH of one folder: the basic tools, and the given commands as shell scripts."""
+    folder.mkdir()
+    for tool in ("sh", "dirname", "cut", "env"):
+        (folder / tool).symlink_to(str(shutil.which(tool)))
+    for name, script in commands.items():
+        (folder / name).write_text(f"#!{shutil.which('sh')}\n{script}\n")
+        (folder / name).chmod(0o755)
+    return str(folder)
+
+
+def test_says_so_when_there_is_no_python(tmp_path: Path) -> None:
+    # A version manager's shim that stands for nothing must not be taken for a Python.
+    done = _real_setup(tmp_path, _path_with(tmp_path / "bin", python3="echo 'no such version' >&2; exit 127"))
+    assert done.returncode == 1
+    assert "no Python 3.11 or newer found" in done.stderr
+    assert "make setup PYTHON=" in done.stderr
+
+
+def test_says_so_when_the_named_python_is_none(tmp_path: Path) -> None:
+    done = _real_setup(tmp_path, _path_with(tmp_path / "bin"), PYTHON="/nowhere/python")
+    assert done.returncode == 1
+    assert "PYTHON=/nowhere/python" in done.stderr
+
+
+def test_says_so_when_the_venv_module_is_missing(tmp_path: Path) -> None:
+    python = f'case "$*" in *venv*) exit 1;; *) exec {sys.executable} "$@";; esac'
+    done = _real_setup(tmp_path, _path_with(tmp_path / "bin", python3=python))
+    assert done.returncode == 1
+    assert "apt install python3-venv" in done.stderr
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 13), reason="open3d has no wheels for this Python")
+def test_open3d_loads_with_the_system_libraries_that_ci_installs() -> None:
+    done = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
+    if "cannot open shared object file" in done.stderr or "No module named" in done.stderr:
+        pytest.skip(f"open3d or a library beneath it is missing: {done.stderr.strip().splitlines()[-1]}")
+    assert done.returncode == 0, done.stderr

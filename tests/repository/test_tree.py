@@ -1,0 +1,80 @@
+"""What holds for the files of the repository as a whole."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import errormotion
+
+ROOT = Path(__file__).parents[2]
+TARGETS = {"setup", "demo", "test", "lint", "docs", "bench", "validate"}
+
+
+def _tracked() -> list[Path]:
+    try:
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"not a git checkout: {error}")
+    return [path for name in listed.split("\0") if name and (path := ROOT / name).is_file()]
+
+
+def _lines(paths: list[Path]) -> list[tuple[str, str]]:
+    found = []
+    for path in paths:
+        data = path.read_bytes()
+        if b"\0" not in data:
+            name = path.relative_to(ROOT)
+            found += [(f"{name}:{n}", line) for n, line in enumerate(data.decode().splitlines(), 1)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("what", "pattern"),
+    [
+        ("a path of one machine", r"(?<![\w.$}])/(?:root|home|work|Users|tmp)/(?!\.\.\.)\w"),
+        ("the address of a package index", r"pypi\.|pythonhosted|(?:--|extra-)index" + "-url=?\\s*\\S*://"),
+        ("the number of an issue", r"(?i)\b(?:issue|ticket|task) ?#?\d"),
+    ],
+)
+def test_no_tracked_file_holds(what: str, pattern: str) -> None:
+    found = [f"{where}: {line.strip()[:100]}" for where, line in _lines(_tracked()) if re.search(pattern, line)]
+    found = [line for line in found if not line.startswith("tests/repository/test_tree.py:")]
+    assert not found, f"{what} stands in\n" + "\n".join(found)
+
+
+def test_version_is_one() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == errormotion.__version__
+
+
+def test_changelog_names_this_version() -> None:
+    headings = re.findall(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert any(heading.startswith(("Unreleased", errormotion.__version__)) for heading in headings)
+
+
+def test_makefile_has_the_targets_that_the_docs_promise() -> None:
+    have = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    promised = {
+        target for page in pages for target in re.findall(r"(?:`|\$ |^)make ([a-z]+)", page.read_text(), re.MULTILINE)
+    }
+    assert have >= TARGETS
+    assert promised <= have
+
+
+def test_every_package_has_tests() -> None:
+    packages = {path.parent.name for path in (ROOT / "errormotion").glob("*/__init__.py")}
+    tested = {path.parent.relative_to(ROOT / "tests").parts[0] for path in (ROOT / "tests").glob("*/**/test_*.py")}
+    assert packages <= tested
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    broken = []
+    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+            if "://" not in target and not (page.parent / target).exists():
+                broken.append(f"{page.relative_to(ROOT)}: {target}")
+    assert not broken
