@@ -28,8 +28,8 @@ docs: .venv/.dev  ## build docs/_build/html; a warning is an error
 	@echo "docs/_build/html/index.html"
 
 bench: .venv/.dev  ## run every benchmark and print its figures
-	@set -e; for script in benchmarks/bench_*.py; do \
-		[ -e "$$script" ] || continue; echo "== $$script"; $(BIN)/python "$$script"; done
+	@set -e; for script in $(filter-out benchmarks/validate.py,$(wildcard benchmarks/*.py)); do \
+		echo "== $$script"; $(BIN)/python $$script; done
 
 validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validation.md
 	$(BIN)/python benchmarks/validate.py $(ARGS)
