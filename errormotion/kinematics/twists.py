@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
 
-__all__ = ["adjoint", "cross_matrix", "move", "to_frame", "transform", "transform_covariance"]
+__all__ = ["adjoint", "cross_matrix", "known_product", "move", "to_frame", "transform", "transform_covariance"]
 
 # An entry of a rotation matrix smaller than this is rounding of a zero (a quarter turn leaves cos 90 deg = 6e-17).
 ROUNDING_OF_ROTATION = 1e-15
@@ -92,13 +92,27 @@ def transform(twist: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
     -------
     ndarray, (..., 6)
     """
-    twist, A = _with_last("twist", twist, 6), _six_by_six("matrix", A)
-    unknown = np.isnan(twist)
+    return known_product(_six_by_six("matrix", A), _with_last("twist", twist, 6))
+
+
+def known_product(A: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``A @ x`` over the last axes, in which a NaN in ``x`` counts only where its coefficient is not zero.
+
+    Parameters
+    ----------
+    A : ndarray, (..., m, n)
+    x : ndarray, (..., n)
+
+    Returns
+    -------
+    ndarray, (..., m)
+    """
+    unknown = np.isnan(x)
     if not unknown.any():
-        return _apply(A, twist)
-    moved = _apply(A, np.where(unknown, 0.0, twist))
-    spoilt = _apply((A != 0).astype(float), unknown.astype(float)) > 0
-    return np.where(spoilt, np.nan, moved)
+        return _product(A, x)
+    known = _product(A, np.where(unknown, 0.0, x))
+    spoilt = _product((A != 0).astype(float), unknown.astype(float)) > 0
+    return np.where(spoilt, np.nan, known)
 
 
 def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
@@ -160,11 +174,11 @@ def to_frame(twist: ArrayLike, pose: RigidTransform) -> NDArray[np.float64]:
     return transform(twist, adjoint(rotation=pose.rotation))
 
 
-def _apply(A: NDArray[np.float64], twist: NDArray[np.float64]) -> NDArray[np.float64]:
+def _product(A: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     if A.ndim == 2:
-        return twist @ A.T
-    moved: NDArray[np.float64] = (A @ twist[..., None])[..., 0]
-    return moved
+        return x @ A.T
+    product: NDArray[np.float64] = (A @ x[..., None])[..., 0]
+    return product
 
 
 def _rotation_matrix(rotation: ArrayLike | Rotation | None) -> NDArray[np.float64]:
