@@ -1,0 +1,207 @@
+"""Bench and campaign files: TOML that a person writes, checked against the plugins that it names.
+
+A bench file says which instruments there are; a campaign file says which tests to make with them. Every mistake of a
+file is told at once, with its key, what was expected and what was found, plugin settings included.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from errormotion import plugins
+from errormotion.datasets import tomlfile
+from errormotion.errors import BenchError, PluginError
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+
+
+class InstrumentTable(BaseModel):
+    """``[instruments.NAME]``: the driver, its address, and the driver's own settings beside them."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str = Field(description='the id of an instrument plugin, such as "optoncdt"')
+    address: str = ""
+
+
+class BenchTable(BaseModel):
+    """A bench file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    schema_: Literal["errormotion.bench/1"] = Field(alias="schema", description='"errormotion.bench/1"')
+    name: str
+    machine: str
+    instruments: dict[str, InstrumentTable] = Field(min_length=1)
+
+
+class TestTable(BaseModel):
+    """``[[test]]``: one measurement."""
+
+    __test__ = False  # pytest: this is no test
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str = Field(pattern=NAME, description="a name of letters, digits, - and _")
+    method: str = Field(description='the id of a method plugin, such as "spindle_drift"')
+    inputs: dict[str, str] = {}
+    settings: dict[str, Any] = {}
+
+
+class CampaignTable(BaseModel):
+    """A campaign file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    schema_: Literal["errormotion.campaign/1"] = Field(alias="schema", description='"errormotion.campaign/1"')
+    name: str
+    bench: str = Field(description="the path of a bench file, relative to this file")
+    runs: str = "runs"
+    test: list[TestTable] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class BenchInstrument:
+    """One instrument of a bench: the driver's class and its checked settings."""
+
+    name: str
+    driver: Any
+    address: str
+    settings: Any
+
+
+@dataclass(frozen=True)
+class BenchPlan:
+    """A checked bench file; nothing is opened yet."""
+
+    name: str
+    machine: str
+    instruments: tuple[BenchInstrument, ...]
+    source: Path
+    text: str
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of instruments on offer."""
+        return tuple(sorted({instrument.driver.info.kind for instrument in self.instruments}))
+
+
+@dataclass(frozen=True)
+class TestPlan:
+    """One checked test of a campaign; ``inputs`` maps the method's name of an input to an earlier test."""
+
+    __test__ = False
+
+    name: str
+    method: Any
+    settings: Any
+    inputs: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """A checked campaign file with its bench."""
+
+    name: str
+    bench: BenchPlan
+    tests: tuple[TestPlan, ...]
+    runs: Path
+    source: Path
+    text: str
+
+    @property
+    def sha256(self) -> str:
+        """Hash of what is to be done: the texts of campaign and bench."""
+        return hashlib.sha256(f"{self.text}\0{self.bench.text}".encode()).hexdigest()
+
+
+def load_bench(path: str | Path) -> BenchPlan:
+    """Read and check a bench file.
+
+    Raises
+    ------
+    BenchError
+        The file cannot be read, or holds mistakes: all of them in one message.
+    """
+    path = Path(path)
+    tomlfile.read_toml(path, error=BenchError)
+    return parse_bench(path.read_text(encoding="utf-8-sig"), path)
+
+
+def load_campaign(path: str | Path) -> CampaignPlan:
+    """Read and check a campaign file and the bench file that it names.
+
+    Raises
+    ------
+    BenchError
+        One of the files cannot be read, or holds mistakes: all of a file's mistakes in one message.
+    """
+    path = Path(path)
+    data = tomlfile.read_toml(path, error=BenchError)
+    table, mistakes = tomlfile.check(data, CampaignTable)
+    if table is None:
+        raise BenchError(tomlfile.report(path, mistakes))
+    return parse_campaign(path.read_text(encoding="utf-8-sig"), path, load_bench(path.parent / table.bench))
+
+
+def parse_bench(text: str, source: Path) -> BenchPlan:
+    """Check the text of a bench file; ``source`` is for the messages."""
+    table, mistakes = tomlfile.check(tomllib.loads(text), BenchTable)
+    instruments = []
+    for name, entry in table.instruments.items() if table else ():
+        settings, found = _settings("instruments", entry.driver, entry.model_extra or {}, ("instruments", name))
+        mistakes += found
+        if settings is not None:
+            driver = plugins.get("instruments", entry.driver)
+            instruments.append(BenchInstrument(name, driver, entry.address, settings))
+    if table is None or mistakes:
+        raise BenchError(tomlfile.report(source, mistakes))
+    return BenchPlan(table.name, table.machine, tuple(instruments), source, text)
+
+
+def parse_campaign(text: str, source: Path, bench: BenchPlan) -> CampaignPlan:
+    """Check the text of a campaign file against its bench; ``source`` is for the messages."""
+    table, mistakes = tomlfile.check(tomllib.loads(text), CampaignTable)
+    tests: list[TestPlan] = []
+    earlier: list[str] = []
+    for number, entry in enumerate(table.test if table else ()):
+        place: tuple[str | int, ...] = ("test", number)
+        if entry.name in earlier:
+            mistakes.append(
+                f"{tomlfile.dotted((*place, 'name'))}: expected a name of its own; found '{entry.name}' again"
+            )
+        for key, test in entry.inputs.items():
+            if test not in earlier:
+                where = tomlfile.dotted((*place, "inputs", key))
+                mistakes.append(f"{where}: expected the name of an earlier test; found '{test}'; "
+                                f"{tomlfile.nearest(test, earlier)}")  # fmt: skip
+        earlier.append(entry.name)
+        settings, found = _settings("methods", entry.method, entry.settings, place)
+        mistakes += found
+        if settings is None:
+            continue
+        method = plugins.get("methods", entry.method)
+        lacking = [kind for kind in method.needs.instruments if kind not in bench.kinds]
+        if lacking:
+            mistakes.append(f"{tomlfile.dotted(place)}: the method '{entry.method}' needs {' and '.join(lacking)}; "
+                            f"the bench {bench.source} offers {', '.join(bench.kinds)}")  # fmt: skip
+        tests.append(TestPlan(entry.name, method, settings, entry.inputs))
+    if table is None or mistakes:
+        raise BenchError(tomlfile.report(source, mistakes))
+    return CampaignPlan(table.name, bench, tuple(tests), Path(table.runs), source, text)
+
+
+def _settings(
+    group: plugins.Group, plugin_id: str, data: Mapping[str, Any], place: tuple[str | int, ...]
+) -> tuple[Any, list[str]]:
+    """Return a plugin's checked settings, or None and the mistakes."""
+    try:
+        cls = plugins.get(group, plugin_id)
+    except PluginError as error:
+        key = "driver" if group == "instruments" else "method"
+        return None, [f"{tomlfile.dotted((*place, key))}: {error}"]
+    prefix = place if group == "instruments" else (*place, "settings")
+    return tomlfile.check(data, cls.Settings, prefix=prefix)

@@ -1,0 +1,181 @@
+"""A run folder: ``runs/<utc>-<test>-<id>/`` and its ``run.json``.
+
+``run.json`` is replaced in one rename, so it is whole at every moment. All paths in it are relative to the folder,
+which can be moved together with its neighbours.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+from errormotion.campaign.store import replace_text
+from errormotion.errors import RunError
+
+SCHEMA = "errormotion.run/1"
+RESERVE_BYTES = 2**18
+"""Kept in the folder while measuring, and given up when the disk is full, so that run.json and the log still fit."""
+
+log = logging.getLogger(__name__)
+
+
+class RunFolder:
+    """One run on disk.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+    data : dict
+        What ``run.json`` says.
+    """
+
+    def __init__(self, path: Path, data: dict[str, Any]) -> None:
+        self.path = path
+        self.data = data
+
+    @classmethod
+    def create(cls, runs: Path, test: str, run_id: str, data: dict[str, Any]) -> Self:
+        """Make a folder with its ``run.json``, in one rename.
+
+        Raises
+        ------
+        RunError
+            The folder exists, or cannot be made.
+        """
+        name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{test}-{run_id}"
+        path, part = runs / name, runs / f".{name}.part"
+        if path.exists():
+            raise RunError(f"{path}: exists already, and a run is never overwritten")
+        try:
+            part.mkdir(parents=True)
+            folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
+            folder.save()
+            part.rename(path)
+        except OSError as error:
+            raise RunError(f"{path}: cannot make the run folder: {error.strerror}") from error
+        folder.path = path
+        return folder
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Read a run folder.
+
+        Raises
+        ------
+        RunError
+            It is none, or its ``run.json`` is broken.
+        """
+        path = Path(path)
+        file = path / "run.json"
+        try:
+            data = json.loads(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
+        except ValueError as error:
+            raise RunError(
+                f"{file}: is no JSON ({error}); restore it from a copy, or identify raw.zarr by hand"
+            ) from error
+        if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+            found = data.get("schema") if isinstance(data, dict) else type(data).__name__
+            raise RunError(f"{file}: expected schema '{SCHEMA}'; found {found!r}")
+        return cls(path, data)
+
+    def save(self, **changes: Any) -> None:
+        """Change fields of ``run.json`` and write it."""
+        self.data |= changes | {"updated": now()}
+        replace_text(self.path / "run.json", json.dumps(strict(self.data), indent=1, ensure_ascii=False) + "\n")
+
+    def step(self, name: str, outcome: str, **details: Any) -> None:
+        """Add one line to what happened to this run."""
+        self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
+
+    @property
+    def raw(self) -> Path:
+        """The raw store."""
+        return self.path / "raw.zarr"
+
+    @property
+    def log(self) -> Path:
+        """The log."""
+        return self.path / "log.jsonl"
+
+    @property
+    def errors(self) -> Path | None:
+        """The error dataset of the last identification; None where there is none."""
+        return self.path / self.data["errors"] if self.data.get("errors") else None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has its result."""
+        return bool(self.data.get("status") == "finished")
+
+    def take_reserve(self) -> None:
+        """Set a little disk space aside."""
+        with suppress(OSError):
+            (self.path / ".reserve").write_bytes(os.urandom(RESERVE_BYTES))
+
+    def give_reserve(self) -> None:
+        """Give the space that was set aside back."""
+        (self.path / ".reserve").unlink(missing_ok=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes out; the lock ends with the process, whatever ends it.
+
+        Raises
+        ------
+        RunError
+            Another process works on this run.
+        """
+        try:
+            import fcntl
+        except ImportError:  # Windows: no lock
+            yield
+            return
+        descriptor = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(
+                    f"{self.path}: another process is working on this run; wait for it, or end it"
+                ) from error
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def list_runs(runs: Path) -> list[RunFolder]:
+    """Return the run folders below a folder, the oldest first; one that cannot be read is logged and left out."""
+    found = []
+    for path in sorted(runs.iterdir()) if runs.is_dir() else []:
+        if path.is_dir() and not path.name.startswith(".") and (path / "run.json").exists():
+            try:
+                found.append(RunFolder.open(path))
+            except RunError as error:
+                log.warning("left out: %s", error)
+    return sorted(found, key=lambda folder: str(folder.data.get("created", "")))
+
+
+def now() -> str:
+    """Return the time now in UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def strict(value: Any) -> Any:
+    """Return a value that strict JSON can hold: numbers that are none become null, and what is unknown its text."""
+    if isinstance(value, dict):
+        return {str(k): strict(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, str | int | bool | None) else str(value)

@@ -1,0 +1,56 @@
+"""The log of a run: one JSON object a line, tracebacks included."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+ROOT = "errormotion"
+
+
+class JsonLines(logging.Formatter):
+    """Turn a record into one line of JSON; fields given as ``extra={"data": {...}}`` ride along."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        line = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "source": record.name,
+            "message": record.getMessage(),
+        }
+        if hasattr(record, "data"):
+            line["data"] = record.data
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False, default=str)
+
+
+class _Handler(logging.FileHandler):
+    """Writes what it can: a full disk must not end a measurement by way of its log."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+
+@contextmanager
+def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
+    """Write everything that errormotion logs to a file, behind what is there, for as long as the context lasts."""
+    logger = logging.getLogger(ROOT)
+    handler = _Handler(path, encoding="utf-8", delay=True)
+    handler.setFormatter(JsonLines())
+    before = logger.level
+    logger.addHandler(handler)
+    if logger.getEffectiveLevel() > level:
+        logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+        with suppress(OSError):
+            handler.close()

@@ -1,0 +1,368 @@
+"""The raw store: a Zarr v3 folder that grows while measuring and is whole at every moment.
+
+Samples go to disk in blocks along one dimension. The order of writing makes the folder safe against ``kill -9``:
+
+1. the chunks of a block are written, each beside its place and renamed;
+2. then the root ``zarr.json`` is replaced in one rename. It carries the metadata of all arrays (Zarr calls it
+   consolidated), so all of them get their new length at once, and whoever opens the store sees whole samples only.
+
+What is dead between 1 and 2 is invisible: the next :meth:`RawStore.open` writes over it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self, cast
+
+import numpy as np
+import xarray as xr
+import zarr
+from xarray.conventions import encode_cf_variable
+from zarr.codecs import BloscCodec
+
+from errormotion.errors import RunError
+
+BLOCK_BYTES = 24 * 2**20
+"""Most that one block of all appended variables takes in memory."""
+
+LONGEST_BLOCK = 2**18
+"""Most samples in one block."""
+
+PER_CHUNK = ("dropped", "invalid", "time_start")
+"""Attributes that a method sets anew on every dataset that it yields."""
+
+
+class RawStore:
+    """Append datasets along one dimension.
+
+    Parameters
+    ----------
+    path : Path
+        The ``.zarr`` folder.
+    dim : str
+        The dimension that grows.
+
+    Attributes
+    ----------
+    count : int
+        Samples appended, those not yet committed included.
+    committed : int
+        Samples that a reader of the folder sees.
+    """
+
+    def __init__(self, path: Path, dim: str) -> None:
+        self.path = path
+        self.dim = dim
+        self._group = zarr.open_group(str(path), mode="r+", use_consolidated=False)
+        self._root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        self._static: dict[str, dict[str, Any]] = {}
+        self._arrays: dict[str, _Column] = {}
+        for name, array in sorted(self._group.arrays()):
+            metadata = json.loads((path / name / "zarr.json").read_text(encoding="utf-8"))
+            if dim in metadata["dimension_names"]:
+                self._arrays[name] = _Column(path / name, array, metadata, dim)
+            else:
+                self._static[name] = metadata
+        if not self._arrays:
+            raise RunError(f"{path}: expected at least one variable along '{dim}'; found none")
+        self.block = next(iter(self._arrays.values())).block
+        self.count = self.committed = self._known_length()
+        for column in self._arrays.values():
+            column.load(self.count)
+        self._unsynced: set[Path] = set()
+
+    @classmethod
+    def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
+        """Make a store that fits a dataset, without its samples.
+
+        Parameters
+        ----------
+        path : Path
+            The folder to make; it must not exist.
+        first : Dataset
+            The first dataset to append. What has not the dimension ``dim`` is stored once, here. A variable whose
+            ``encoding`` has ``dtype`` (an integer), ``scale_factor``, ``add_offset`` and ``_FillValue`` is packed
+            so if that loses nothing.
+        dim : str
+            The dimension that grows.
+        expected : float
+            Expected total length, to size the chunks.
+        """
+        if dim not in first.dims:
+            raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
+        growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}
+        packings = {name: _packing(variable) for name, variable in growing.items()}
+        block = _block_length(growing, packings, dim, expected)
+        skeleton = first.isel({dim: slice(0, 0)}).drop_vars(
+            [n for n in first.variables if n not in _stored(first, dim)]
+        )
+        skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
+        encoding: dict[str, dict[str, Any]] = {}
+        for name, stored in skeleton.variables.items():
+            if stored.dtype.kind == "U":
+                skeleton[name] = stored.astype(object)
+            skeleton[name].encoding = {}
+        for name, variable in growing.items():
+            chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
+            encoding[name] = {"chunks": chunks} | packings[name]
+            if variable.dtype.kind in "fiub":
+                encoding[name]["compressors"] = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")]
+            if variable.dtype.kind == "f":
+                encoding[name] |= {"fill_value": packings[name].get("_FillValue", np.nan)}
+        part = path.with_name(path.name + ".part")
+        # xarray's stub says nothing of zarr_format=3 with encodings per variable
+        cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
+        part.rename(path)
+        store = cls(path, dim)
+        store.commit()
+        return store
+
+    def append(self, chunk: xr.Dataset) -> None:
+        """Add samples; whole blocks go to disk, the rest waits for :meth:`commit`.
+
+        Raises
+        ------
+        RunError
+            The dataset does not go on where the store ends, or does not have its variables.
+        OSError
+            The disk does not take it.
+        """
+        if self.dim not in chunk.dims:
+            raise RunError(f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}")
+        length = chunk.sizes[self.dim]
+        self._check_continues(chunk)
+        values = {name: self._encoded(name, variable) for name, variable in _stored(chunk, self.dim).items()
+                  if self.dim in variable.dims}  # fmt: skip
+        if set(values) != set(self._arrays):
+            raise RunError(
+                f"{self.path}: expected the variables {', '.join(sorted(self._arrays))} along '{self.dim}'; "
+                f"the method yielded {', '.join(sorted(values))}"
+            )
+        taken = 0
+        while taken < length:
+            fill = self.count % self.block
+            take = min(self.block - fill, length - taken)
+            for name, column in self._arrays.items():
+                column.put(fill, values[name], taken, take)
+            self.count += take
+            taken += take
+            if self.count % self.block == 0:
+                self._write_block()
+        self._add_counts(chunk.attrs)
+
+    def commit(self) -> None:
+        """Bring every sample to the disk, and then to the readers, in this order."""
+        if self.count % self.block:
+            self._write_block()
+        for path in self._unsynced:
+            _sync(path)
+        self._unsynced.clear()
+        root = dict(self._root)
+        root["consolidated_metadata"] = {
+            "kind": "inline",
+            "must_understand": False,
+            "metadata": self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()},
+        }
+        replace_text(self.path / "zarr.json", json.dumps(root, indent=1))
+        self.committed = self.count
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        """Attributes of the dataset; written with the next :meth:`commit`."""
+        return cast(dict[str, Any], self._root["attributes"])
+
+    def _known_length(self) -> int:
+        """Return the length that the root knows, 0 before the first commit."""
+        known = self._root.get("consolidated_metadata", {}).get("metadata", {})
+        lengths = {known[name]["shape"][column.axis] for name, column in self._arrays.items() if name in known}
+        return int(lengths.pop()) if lengths else 0
+
+    def _write_block(self) -> None:
+        """Write the current block of every array."""
+        start = (self.count - 1) // self.block * self.block
+        for column in self._arrays.values():
+            self._unsynced.add(column.write(start, self.count))
+
+    def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
+        if name not in self._arrays:
+            raise RunError(f"{self.path}: the method yielded the variable '{name}', which its first dataset lacked")
+        column = self._arrays[name]
+        expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != self.dim}
+        found = {str(d): n for d, n in variable.sizes.items() if d != self.dim}
+        if found != expected:
+            raise RunError(f"{self.path}: '{name}' has the sizes {found}; expected {expected}")
+        packed = _encode(variable.transpose(*column.dims), column.packing)
+        if packed is None:
+            raise RunError(
+                f"{self.path}: '{name}' promised to be integers of {column.packing['scale_factor']!r} and holds other "
+                "values; the instrument or method that sets this encoding must keep to it or leave it out"
+            )
+        return packed
+
+    def _check_continues(self, chunk: xr.Dataset) -> None:
+        rate, start = chunk.attrs.get("sample_rate"), chunk.attrs.get("time_start")
+        origin = self.attrs.get("time_start", 0.0)
+        if self.dim != "time" or rate is None or start is None:
+            return
+        expected = origin + self.count / rate
+        if self.count and abs(start - expected) * rate > 0.5:
+            raise RunError(
+                f"{self.path}: expected the next samples at {expected:.6f} s; the method yielded samples from "
+                f"{start:.6f} s. A gap is to be filled with NaN."
+            )
+
+    def _add_counts(self, attrs: Mapping[Any, Any]) -> None:
+        """Add up what was lost and why: numbers for a person, no part of the samples."""
+        self.attrs["dropped"] = int(self.attrs.get("dropped", 0)) + int(attrs.get("dropped", 0))
+        total: dict[str, int] = _counts(self.attrs.get("invalid"))
+        for reason, count in _counts(attrs.get("invalid")).items():
+            total[reason] = total.get(reason, 0) + count
+        self.attrs["invalid"] = json.dumps(total)
+
+
+class _Column:
+    """One array along the growing dimension, with its current block in memory."""
+
+    def __init__(self, path: Path, array: Any, metadata: dict[str, Any], dim: str) -> None:
+        self.path = path
+        self.array = array
+        self.dims = tuple(metadata["dimension_names"])
+        self.axis = self.dims.index(dim)
+        self.block = int(array.chunks[self.axis])
+        self.packing = {
+            key: metadata["attributes"][key] for key in ("scale_factor", "add_offset") if key in metadata["attributes"]
+        }
+        if self.packing:
+            self.packing |= {"dtype": array.dtype.name, "_FillValue": metadata["fill_value"]}
+        self._metadata = metadata
+        shape = list(array.shape)
+        shape[self.axis] = self.block
+        self._values = np.empty(shape, dtype=array.dtype)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.array.shape)
+
+    def _at(self, start: int, stop: int) -> tuple[slice, ...]:
+        return tuple(slice(start, stop) if axis == self.axis else slice(None) for axis in range(len(self.dims)))
+
+    def load(self, count: int) -> None:
+        """Fetch the block that is not full yet, and forget what a crash left behind it."""
+        self._resize(count)
+        start = count // self.block * self.block
+        if count > start:
+            self._values[self._at(0, count - start)] = self.array[self._at(start, count)]
+
+    def put(self, fill: int, values: np.ndarray, first: int, length: int) -> None:
+        self._values[self._at(fill, fill + length)] = values[self._at(first, first + length)]
+
+    def write(self, start: int, stop: int) -> Path:
+        """Write one block; return the file of its chunk."""
+        self._resize(stop)
+        self.array[self._at(start, stop)] = self._values[self._at(0, stop - start)]
+        place = tuple(start // self.block if axis == self.axis else 0 for axis in range(len(self.dims)))
+        return self.path / str(self.array.metadata.encode_chunk_key(place))
+
+    def _resize(self, length: int) -> None:
+        if self.array.shape[self.axis] != length:
+            shape = list(self.array.shape)
+            shape[self.axis] = length
+            self.array.resize(tuple(shape))
+
+    def metadata(self, count: int) -> dict[str, Any]:
+        shape = list(self._metadata["shape"])
+        shape[self.axis] = count
+        return self._metadata | {"shape": shape}
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file beside its place, bring it to the disk and rename it."""
+    part = path.with_name(f"{path.name}.part")
+    with part.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def _sync(path: Path) -> None:
+    if not path.exists():  # a chunk of nothing but NaN has no file
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _stored(dataset: xr.Dataset, dim: str) -> dict[str, xr.Variable]:
+    """Return what is stored: all but the times of evenly spaced samples, which a rate and a start say better."""
+    regular = dim == "time" and "sample_rate" in dataset.attrs
+    return {str(n): v for n, v in dataset.variables.items() if not (regular and n == "time")}
+
+
+def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes as JSON has them, without those of one chunk; ``time_start`` stays, as that of the whole."""
+    kept = {str(k): v for k, v in attrs.items() if k not in PER_CHUNK or k == "time_start"}
+    return {k: v.tolist() if isinstance(v, np.generic | np.ndarray) else v for k, v in kept.items()}
+
+
+def _counts(value: Any) -> dict[str, int]:
+    if not value:
+        return {}
+    return {str(k): int(v) for k, v in (json.loads(value) if isinstance(value, str) else value).items()}
+
+
+def _packing(variable: xr.Variable) -> dict[str, Any]:
+    """Return the integer packing that a variable's encoding asks for, if it loses nothing; else an empty one."""
+    keys = ("dtype", "scale_factor", "add_offset", "_FillValue")
+    wanted = variable.encoding
+    if variable.dtype.kind != "f" or any(key not in wanted for key in keys):
+        return {}
+    dtype = np.dtype(wanted["dtype"])
+    packing = {
+        "dtype": dtype.name,
+        "scale_factor": float(wanted["scale_factor"]),
+        "add_offset": float(wanted["add_offset"]),
+        "_FillValue": int(wanted["_FillValue"]),
+    }
+    return packing if dtype.kind in "iu" and _encode(variable, packing) is not None else {}
+
+
+def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | None:
+    """Return the numbers to store, or None if the packing would lose more than rounding error."""
+    values = variable.values
+    if not packing:
+        if values.dtype.kind == "U":
+            return values.astype(object)
+        return np.asarray(encode_cf_variable(xr.Variable(variable.dims, values)).values)
+    scale, offset, fill = packing["scale_factor"], packing["add_offset"], packing["_FillValue"]
+    limits = np.iinfo(packing["dtype"])
+    steps = (values - offset) / scale
+    whole = np.rint(steps)
+    missing = np.isnan(values)
+    with np.errstate(invalid="ignore"):
+        # 1e-6 of a step is far above the rounding of float64 (and that of 16 bit steps), far below half a step
+        good = (np.abs(steps - whole) < 1e-6) & (whole >= limits.min) & (whole <= limits.max) & (whole != fill)
+    if not np.all(good | missing):
+        return None
+    whole[missing] = fill
+    packed: np.ndarray = whole.astype(packing["dtype"])
+    return packed
+
+
+def _block_length(
+    growing: Mapping[str, xr.Variable], packings: Mapping[str, Mapping[str, Any]], dim: str, expected: float
+) -> int:
+    """Return the samples of one block: a power of two that fits the memory and is not far beyond the expected total."""
+    per_sample = 0
+    for name, variable in growing.items():
+        size = np.dtype(packings[name].get("dtype", variable.dtype)).itemsize
+        per_sample += max(size, 1) * int(np.prod([n for d, n in variable.sizes.items() if d != dim], dtype=np.int64))
+    most = min(LONGEST_BLOCK, max(BLOCK_BYTES // max(per_sample, 1), 1))
+    if np.isfinite(expected) and expected >= 1:
+        most = min(most, 1 << int(np.ceil(np.log2(expected))))
+    return 1 << int(np.log2(max(most, 1)))
