@@ -1,0 +1,124 @@
+"""The bar in the spindle: where its axis lies, how it runs out, and what its surface looks like to a laser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.twin import intersections
+
+Array = NDArray[np.float64]
+
+RADIUS = 5e-3
+#: angles in the table of what repeats every turn, and the highest harmonic in it
+ANGLES = 1024
+HARMONICS = 36
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A check bar on a spindle that turns about its own axis.
+
+    Attributes
+    ----------
+    radius : float
+        True radius, m.
+    point, axis : ndarray, (3,)
+        Cold axis of rotation: where it meets the end of the bar, m, and its unit direction.
+    eccentricity : float
+        Distance of the bar's axis from the axis of rotation at the end of the bar, m: its runout is twice that.
+    eccentricity_angle : float
+        rad, at turn 0.
+    wobble : ndarray, (2,)
+        Inclination of the bar's axis to the axis of rotation about x and y at turn 0, rad.
+    face_tilt : ndarray, (2,)
+        Inclination of the end face to the plane across the axis of rotation, at turn 0, rad.
+    axial_runout : float
+        Amplitude of the axial motion once per turn, m.
+    texture : ndarray, (channel, ANGLES)
+        Roughness and speckle along the track of each beam, m, without a mean.
+    """
+
+    radius: float
+    point: Array
+    axis: Array
+    eccentricity: float
+    eccentricity_angle: float
+    wobble: Array
+    face_tilt: Array
+    axial_runout: float
+    texture: Array
+
+    def still_readings(self, origin: Array, direction: Array, point: Array, axis: Array) -> Array:
+        """Return the distances to a perfect bar that turns without runout, m, shape (channel, n).
+
+        Parameters
+        ----------
+        origin : (channel, n, 3)
+            m.
+        direction : (channel, 3)
+            Unit directions; the last channel looks at the end face.
+        point, axis : (n, 3)
+            Axis of rotation, m, unit.
+        """
+        beams = direction[:, None, :]
+        side = intersections.to_cylinder(origin[:-1], beams[:-1], point, axis, self.radius)
+        end = intersections.to_plane(origin[-1:], beams[-1:], point, axis)
+        return np.concatenate([side, end])
+
+    def pattern(self, origin: Array, direction: Array, point: Array, axis: Array) -> Array:
+        """Return what runout and texture add to the readings over one turn, m, shape (channel, ANGLES + 1).
+
+        Parameters
+        ----------
+        origin, direction : (channel, 3)
+            m, unit.
+        point, axis : (3,)
+            Axis of rotation, m, unit.
+        """
+        angle = 2 * np.pi * np.arange(ANGLES) / ANGLES
+        turned = np.stack([np.cos(angle), np.sin(angle), np.zeros(ANGLES)], axis=-1)
+        ahead = np.stack([-np.sin(angle), np.cos(angle), np.zeros(ANGLES)], axis=-1)
+
+        def leaning(tilt: Array) -> Array:  # unit z tilted by two angles, turning with the spindle, about the axis
+            lean = axis + tilt[1] * turned - tilt[0] * ahead
+            return np.asarray(lean / np.linalg.norm(lean, axis=-1, keepdims=True))
+
+        start = np.cos(self.eccentricity_angle) * turned + np.sin(self.eccentricity_angle) * ahead
+        centre = point + self.eccentricity * start
+        face = point + self.axial_runout * np.cos(angle)[:, None] * axis
+        o, u = origin[:, None, :], direction[:, None, :]
+        side = intersections.to_cylinder(o[:-1], u[:-1], centre, leaning(self.wobble), self.radius)
+        end = intersections.to_plane(o[-1:], u[-1:], face, leaning(self.face_tilt))
+        readings = np.concatenate([side, end])
+        pattern = readings - self.still_readings(o, direction, point[None], axis[None]) + self.texture
+        return np.concatenate([pattern, pattern[:, :1]], axis=1)
+
+
+def seeded_texture(rng: np.random.Generator, channels: int, sigma: float) -> Array:
+    """Return a band-limited pattern around the bar with this standard deviation and no mean, (channels, ANGLES)."""
+    harmonic = np.zeros((channels, ANGLES // 2 + 1), dtype=complex)
+    harmonic[:, 1 : HARMONICS + 1] = rng.normal(size=(channels, HARMONICS)) + 1j * rng.normal(
+        size=(channels, HARMONICS)
+    )
+    pattern = np.fft.irfft(harmonic, ANGLES, axis=1)
+    return np.asarray(pattern * (sigma / pattern.std(axis=1, keepdims=True)))
+
+
+def seeded_bar(rng: np.random.Generator, channels: int) -> Bar:
+    """Return a bar of 5 mm radius with the flaws of a good one."""
+    tilt = rng.normal(0, 50e-6, 2).clip(-120e-6, 120e-6)
+    axis = np.array([tilt[1], -tilt[0], 1.0])
+    return Bar(
+        radius=RADIUS + rng.uniform(-0.8e-6, 0.8e-6),
+        point=np.array([*rng.normal(0, 20e-6, 2).clip(-40e-6, 40e-6), 0.0]),
+        axis=axis / np.linalg.norm(axis),
+        eccentricity=rng.uniform(1e-6, 2.5e-6),
+        eccentricity_angle=rng.uniform(0, 2 * np.pi),
+        wobble=rng.normal(0, 15e-6, 2),
+        face_tilt=rng.normal(0, 50e-6, 2),
+        axial_runout=rng.uniform(0.2e-6, 0.6e-6),
+        texture=seeded_texture(rng, channels, 0.3e-6),
+    )

@@ -1,0 +1,217 @@
+"""What the machine is told to do: spindle speeds, compensation, and the steps of a sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.errors import BenchError
+
+Array = NDArray[np.float64]
+
+#: Time in which the control takes a compensation away or brings it back, s.
+SLEW = 0.5
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that is commanded at a time.
+
+    Attributes
+    ----------
+    time : float
+        Seconds after the start.
+    spindle_speed : float, optional
+        New spindle speed, 1/min; None leaves it.
+    compensation : mapping of str to bool, optional
+        Thermal compensation of the axes X, Y, Z on or off; what is not named stays.
+    """
+
+    time: float
+    spindle_speed: float | None = None
+    compensation: Mapping[str, bool] | None = None
+
+
+@dataclass(frozen=True)
+class StepProgram:
+    """A sphere on the spindle, stepped along a line with a rest at each place.
+
+    At ``begin`` the sphere leaves ``home`` and reaches ``start`` after ``approach`` seconds; it rests ``dwell`` seconds
+    at each of ``count`` places, travels ``travel`` seconds between two, and goes home in ``approach`` seconds.
+
+    Attributes
+    ----------
+    start : (3,) array_like
+        Commanded centre of the sphere at the first place, m, in machine coordinates.
+    direction : (3,) array_like
+        Direction of the steps; normalised here.
+    step : float
+        Distance of two places, m.
+    count : int
+        Number of places.
+    dwell, travel, approach : float
+        Times, s.
+    begin : float
+        Time of the machine at which the program begins, s.
+    home : (3,) array_like, optional
+        Where the sphere is before and after; the middle of the line where not given.
+    """
+
+    start: Any
+    direction: Any
+    step: float
+    count: int
+    dwell: float = 1.0
+    travel: float = 0.1
+    begin: float = 0.0
+    approach: float = 0.5
+    home: Any = None
+    places: Array = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        start, direction = _vector(self.start, "start"), _vector(self.direction, "direction")
+        length = float(np.linalg.norm(direction))
+        if length == 0:
+            raise BenchError("The steps need a direction; found (0, 0, 0).")
+        if self.count < 1 or self.dwell <= 0 or self.travel <= 0 or self.approach <= 0:
+            raise BenchError(
+                "A step program needs at least one place and positive dwell, travel and approach times; found "
+                f"count = {self.count}, dwell = {self.dwell} s, travel = {self.travel} s, approach = {self.approach} s."
+            )
+        line = start + np.arange(self.count)[:, None] * self.step * (direction / length)
+        home = (line[0] + line[-1]) / 2 if self.home is None else _vector(self.home, "home")
+        object.__setattr__(self, "places", np.vstack([home, line, home]))
+
+    @property
+    def arrivals(self) -> Array:
+        """Times at which the sphere comes to rest at each of ``places``, s, shape (count + 2,); the first is -inf."""
+        steps = self.begin + self.approach + np.arange(self.count) * (self.dwell + self.travel)
+        return np.concatenate([[-np.inf], steps, [self.end]])
+
+    @property
+    def departures(self) -> Array:
+        """Times at which the sphere leaves each of ``places``, s, shape (count + 2,); the last is inf."""
+        return np.concatenate([[self.begin], self.arrivals[1:-1] + self.dwell, [np.inf]])
+
+    @property
+    def end(self) -> float:
+        """Time at which the sphere is home again, s."""
+        return self.begin + 2 * self.approach + self.count * self.dwell + (self.count - 1) * self.travel
+
+    @property
+    def duration(self) -> float:
+        """Time from ``begin`` to ``end``, s."""
+        return self.end - self.begin
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Events in order, with what follows from them: the speed, the angle of the spindle, and the compensation.
+
+    Attributes
+    ----------
+    events : sequence of Event
+    spin_up : float
+        Acceleration of the spindle, turns / s^2.
+    top_speed : float
+        Highest spindle speed, 1/min.
+    """
+
+    events: tuple[Event, ...]
+    spin_up: float
+    top_speed: float
+    #: times and speeds (1/min) from which a commanded speed holds; the first is (0, 0) or an event at 0
+    speed_times: Array = field(init=False, repr=False)
+    speeds: Array = field(init=False, repr=False)
+    #: times of the spindle's phases, and (turns, turns/s, turns/s^2 / 2) at their begin
+    phase_times: Array = field(init=False, repr=False)
+    phases: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._check()
+        changes = {0.0: 0.0} | {
+            float(e.time): float(e.spindle_speed) for e in self.events if e.spindle_speed is not None
+        }
+        object.__setattr__(self, "speed_times", np.array(list(changes)))
+        object.__setattr__(self, "speeds", np.array(list(changes.values())))
+        self._spin()
+
+    def _check(self) -> None:
+        times = [event.time for event in self.events]
+        if any(time < 0 or not np.isfinite(time) for time in times) or sorted(times) != times:
+            raise BenchError(f"The events of a schedule need finite times from 0 on, in order; found {times} s.")
+        for event in self.events:
+            speed = event.spindle_speed
+            if speed is not None and not 0 <= speed <= self.top_speed:
+                raise BenchError(f"The spindle turns at 0 to {self.top_speed:g} /min; commanded were {speed:g} /min.")
+            unknown = set(event.compensation or {}) - {"X", "Y", "Z"}
+            if unknown:
+                raise BenchError(f"The axes with compensation are X, Y and Z; found {', '.join(sorted(unknown))}.")
+
+    def _spin(self) -> None:
+        """Lay out the phases: constant acceleration up to each commanded speed, then constant speed."""
+        times, phases = [0.0], [(0.0, 0.0, 0.0)]
+        for time, speed in zip(self.speed_times, self.speeds / 60, strict=True):
+            while times[-1] > time:  # a change while the spindle still accelerates
+                del times[-1], phases[-1]
+            turns, rate = self._after(times[-1], phases[-1], time)
+            if times[-1] == time:
+                del times[-1], phases[-1]
+            acceleration = np.copysign(self.spin_up, speed - rate)
+            ramp = (speed - rate) / acceleration
+            if ramp > 0:
+                times.append(float(time))
+                phases.append((turns, rate, acceleration / 2))
+                turns += ramp * (rate + speed) / 2
+            times.append(float(time + ramp))
+            phases.append((turns, float(speed), 0.0))
+        object.__setattr__(self, "phase_times", np.array(times))
+        object.__setattr__(self, "phases", np.array(phases))
+
+    @staticmethod
+    def _after(begin: float, phase: tuple[float, float, float], time: float) -> tuple[float, float]:
+        turns, rate, half = phase
+        dt = time - begin
+        return turns + dt * (rate + dt * half), rate + 2 * dt * half
+
+    def turning(self, t: ArrayLike) -> Array:
+        """Return (turns, turns/s, half the acceleration) at times t, shape (n, 3)."""
+        t = np.asarray(t, dtype=float)
+        at = np.maximum(np.searchsorted(self.phase_times, t, side="right") - 1, 0)
+        turns, rate, half = self.phases[at].T
+        dt = t - self.phase_times[at]
+        return np.stack([turns + dt * (rate + dt * half), rate + 2 * dt * half, half], axis=-1)
+
+    def speed(self, t: ArrayLike) -> Array:
+        """Return the spindle's true speed at times t, 1/min, shape (n,)."""
+        return self.turning(t)[..., 1] * 60
+
+    def compensation(self, t: ArrayLike) -> Array:
+        """Return how much of the compensation of X, Y, Z is in effect at times t, 0 to 1, shape (n, 3)."""
+        t = np.asarray(t, dtype=float)
+        share = np.ones((*t.shape, 3))
+        for axis, name in enumerate("XYZ"):
+            state = 1.0
+            for event in self.events:
+                target = (event.compensation or {}).get(name)
+                if target is not None and float(target) != state:
+                    share[..., axis] += (float(target) - state) * np.clip((t - event.time) / SLEW, 0, 1)
+                    state = float(target)
+        return share
+
+    @property
+    def kinks(self) -> Array:
+        """Times at which something has a kink, s, sorted."""
+        slews = [e.time + shift for e in self.events if e.compensation for shift in (0.0, SLEW)]
+        return np.unique(np.concatenate([self.phase_times, self.speed_times, np.array(slews, dtype=float)]))
+
+
+def _vector(value: Any, name: str) -> Array:
+    vector = np.asarray(value, dtype=float)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise BenchError(f"'{name}' needs three finite numbers (x, y, z) in m; found {value!r}.")
+    return vector

@@ -1,0 +1,106 @@
+"""How warm the machine is, and what that does to the spindle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.twin.kinds import MachineKind
+from errormotion.twin.schedule import Schedule
+from errormotion.twin.thermal import Ambient, ThermalNetwork, lag_response
+
+Array = NDArray[np.float64]
+
+_DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
+
+
+@dataclass(frozen=True)
+class ThermalState:
+    """One machine under one schedule: temperatures and the thermal error of its spindle at any time.
+
+    Attributes
+    ----------
+    kind : MachineKind
+        The tables.
+    network : ThermalNetwork
+        Bodies.
+    ambient : Ambient
+        Air.
+    growth : ndarray, (6, body)
+        Twist of the spindle at the end of the bar per kelvin of each body, m/K and rad/K.
+    correction : ndarray, (3,)
+        Steady correction of X, Y, Z by the control at top speed, m.
+    schedule : Schedule
+        What is commanded.
+    """
+
+    kind: MachineKind
+    network: ThermalNetwork
+    ambient: Ambient
+    growth: Array
+    correction: Array
+    schedule: Schedule
+    _cold: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_cold", self.bodies(np.zeros(1))[0])
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Places with a temperature: the bodies, the middle of the column, and the air."""
+        return (*self.network.names, "column", "ambient")
+
+    def power(self, speed: ArrayLike) -> Array:
+        """Return the spindle's heat at a speed in 1/min, W."""
+        n = np.asarray(speed, dtype=float)
+        return self.kind.heat_linear * n + self.kind.heat_square * n**2
+
+    def bodies(self, t: ArrayLike) -> Array:
+        """Return the bodies' temperatures at times t, degC, shape (n, body)."""
+        heated = self.network.heating(t, self.schedule.speed_times, self.power(self.schedule.speeds))
+        return self.network.air_response(t, self.ambient) + heated
+
+    def temperatures(self, t: ArrayLike) -> Array:
+        """Return the temperatures at times t, degC, shape (n, sensor)."""
+        bodies = self.bodies(t)
+        front, rear = (self.network.names.index(f"column_{side}") for side in ("front", "rear"))
+        column = (bodies[:, front] + bodies[:, rear]) / 2
+        return np.column_stack([bodies, column, self.ambient(t)])
+
+    def warming(self, body: str, t: ArrayLike) -> Array:
+        """Return by how much a body has become warmer since the cold state, K, shape (n,)."""
+        place = self.network.names.index(body)
+        return np.asarray(self.bodies(t)[:, place] - self._cold[place])
+
+    def correction_at(self, t: ArrayLike) -> Array:
+        """Return how far the control's model would shift X, Y, Z, were it on, m, shape (n, 3)."""
+        load = self.power(self.schedule.speeds) / self.power(self.kind.top_speed)
+        rates = np.array([1 / self.kind.compensation[axis][1] for axis in "XYZ"])
+        return np.asarray(lag_response(t, rates, self.schedule.speed_times, load) * rates * self.correction)
+
+    def twist(self, t: ArrayLike) -> Array:
+        """Return the spindle's thermal error at the end of the bar, m and rad, shape (n, 6), 0 in the cold state."""
+        warming = self.bodies(t) - self._cold
+        twist = np.zeros((warming.shape[0], 6))
+        for body in range(warming.shape[1]):
+            twist += warming[:, body, None] * self.growth[:, body]
+        twist[:, :3] -= self.correction_at(t) * self.schedule.compensation(t)
+        return twist
+
+
+def seeded_ambient(rng: np.random.Generator) -> Ambient:
+    """Return the air of a good workshop: a daily wave of 0.2 K and a wander of some hundredths of a kelvin."""
+    period = np.array([86400.0, *(rng.uniform(*span) for span in ((9000, 15000), (4000, 7000), (1500, 3000)))])
+    amplitude = np.array([0.2, 0.06, 0.04, 0.02]) * rng.uniform(0.8, 1.2, 4)
+    return Ambient(20.0 + rng.uniform(-0.5, 0.5), amplitude, 2 * np.pi / period, rng.uniform(0, 2 * np.pi, 4))
+
+
+def seeded_state(kind: MachineKind, rng: np.random.Generator, schedule: Schedule) -> ThermalState:
+    """Return the thermal side of one machine: the tables, with amplitudes off by up to two percent."""
+    network = ThermalNetwork.of(kind.capacity, kind.links, kind.to_air, kind.heat_share)
+    growth = np.array([[kind.growth[dof].get(body, 0.0) * 1e-6 for body in network.names] for dof in _DOF])
+    growth *= rng.uniform(0.98, 1.02, (6, 1))
+    correction = np.array([kind.compensation[axis][0] for axis in "XYZ"]) * rng.uniform(0.99, 1.01, 3)
+    return ThermalState(kind, network, seeded_ambient(rng), growth, correction, schedule)

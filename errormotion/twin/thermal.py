@@ -1,0 +1,145 @@
+"""Heat in the machine: a network of lumped bodies, solved in closed form.
+
+The bodies obey ``C dT/dt = -G T + g T_ambient + h P``: C heat capacities (J/K), G conductances among the bodies and to
+the air (W/K), g conductances to the air, h the share of each body in the spindle's heat P (W). The eigenvectors of
+C^-1/2 G C^-1/2 take it apart into first-order lags, for which the answer to a piecewise constant P and to a sinusoidal
+T_ambient is known exactly: temperatures at any time need no stepping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def lag_response(t: ArrayLike, rates: Array, times: Array, inputs: Array) -> Array:
+    """Return z(t) of dz/dt = -rate z + u, at rest before times[0], for a piecewise constant input u.
+
+    Parameters
+    ----------
+    t : (n,)
+        Times, s.
+    rates : (mode,)
+        Reciprocal time constants, 1/s.
+    times, inputs : (piece,)
+        The input is inputs[i] from times[i] on.
+
+    Returns
+    -------
+    ndarray, (n, mode)
+    """
+    t = np.asarray(t, dtype=float)
+    begin = np.zeros((times.size, rates.size))
+    for i in range(1, times.size):
+        decay = np.exp(-rates * (times[i] - times[i - 1]))
+        begin[i] = begin[i - 1] * decay + inputs[i - 1] * (1 - decay) / rates
+    at = np.searchsorted(times, t, side="right") - 1
+    early = at < 0
+    at = np.maximum(at, 0)
+    exponent = -rates * np.where(early, 0.0, t - times[at])[:, None]
+    z = begin[at] * np.exp(exponent) - inputs[at][:, None] * np.expm1(exponent) / rates
+    return np.asarray(np.where(early[:, None], 0.0, z))
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Air temperature: a mean and waves, ``mean + sum amplitude sin(omega t + phase)``, degC.
+
+    Attributes
+    ----------
+    mean : float
+        degC.
+    amplitude, omega, phase : ndarray, (wave,)
+        K, rad/s, rad.
+    """
+
+    mean: float
+    amplitude: Array
+    omega: Array
+    phase: Array
+
+    def __call__(self, t: ArrayLike) -> Array:
+        """Return the air's temperature at times t, degC."""
+        t = np.asarray(t, dtype=float)
+        waves = self.amplitude * np.sin(self.omega * t[..., None] + self.phase)
+        return np.asarray(self.mean + np.sum(waves, axis=-1))
+
+
+@dataclass(frozen=True)
+class ThermalNetwork:
+    """Bodies that heat one another.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Bodies.
+    capacity : ndarray, (body,)
+        Heat capacities, J/K.
+    conductance : ndarray, (body, body)
+        Between bodies, W/K; symmetric, zero diagonal.
+    to_air : ndarray, (body,)
+        W/K.
+    heat_share : ndarray, (body,)
+        Share of each body in the spindle's heat; the sum is at most 1.
+    """
+
+    names: tuple[str, ...]
+    capacity: Array
+    conductance: Array
+    to_air: Array
+    heat_share: Array
+    rates: Array = field(init=False, repr=False)
+    _modes: Array = field(init=False, repr=False)
+    _heat: Array = field(init=False, repr=False)
+    _air: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        root = np.sqrt(self.capacity)
+        total = np.diag(self.conductance.sum(axis=1) + self.to_air) - self.conductance
+        rates, vectors = np.linalg.eigh(total / np.outer(root, root))
+        object.__setattr__(self, "rates", rates)
+        object.__setattr__(self, "_modes", vectors / root[:, None])  # T = modes @ z
+        object.__setattr__(self, "_heat", vectors.T @ (self.heat_share / root))
+        object.__setattr__(self, "_air", vectors.T @ (self.to_air / root))
+
+    @classmethod
+    def of(
+        cls,
+        capacity: Mapping[str, float],
+        links: Sequence[tuple[str, str, float]],
+        to_air: Mapping[str, float],
+        heat_share: Mapping[str, float],
+    ) -> ThermalNetwork:
+        """Build from tables by name (J/K, W/K, W/K, 1)."""
+        names = tuple(capacity)
+        conductance = np.zeros((len(names), len(names)))
+        for one, other, value in links:
+            i, j = names.index(one), names.index(other)
+            conductance[i, j] = conductance[j, i] = value
+        vectors = (np.array([table.get(name, 0.0) for name in names]) for table in (capacity, to_air, heat_share))
+        c, g, h = vectors
+        return cls(names, c, conductance, g, h)
+
+    def heating(self, t: ArrayLike, times: Array, power: Array) -> Array:
+        """Return the rise of each body by the spindle's heat ``power`` (W, from ``times`` on), K, shape (n, body)."""
+        return _combine(lag_response(t, self.rates, times, power) * self._heat, self._modes)
+
+    def air_response(self, t: ArrayLike, ambient: Ambient) -> Array:
+        """Return each body's temperature in a long used machine that stands still, degC, shape (n, body)."""
+        t = np.asarray(t, dtype=float)
+        transfer = self._modes @ (self._air[:, None] / (self.rates[:, None] + 1j * ambient.omega))  # body, wave
+        wave = ambient.amplitude * np.exp(1j * (ambient.omega * t[:, None] + ambient.phase))
+        return ambient.mean + _combine(wave.imag, transfer.real) + _combine(wave.real, transfer.imag)
+
+
+def _combine(values: Array, weights: Array) -> Array:
+    """Return values @ weights.T, (n, k) with (m, k), in an order of summation that does not depend on n."""
+    out = np.zeros((values.shape[0], weights.shape[0]))
+    for k in range(values.shape[1]):
+        out += values[:, k, None] * weights[:, k]
+    return out
