@@ -8,11 +8,12 @@ only when it is asked for, and keeps a broken one in its list together with its 
 from __future__ import annotations
 
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, distributions
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
@@ -202,26 +203,62 @@ class Plugin:
     @property
     def distribution(self) -> str:
         """Name and version of the distribution that brought the plugin."""
-        dist = self.entry_point.dist
+        return _name_and_version(self.entry_point.dist)
+
+
+#: What the registry asks of a class before it hands it out; the conformance kit asks for the rest.
+_REQUIRED: Mapping[Group, tuple[type[InstrumentInfo] | type[MethodInfo], tuple[str, ...]]] = {
+    "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
+    "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
+}
+
+
+def _name_and_version(dist: Distribution | None) -> str:
+    try:
         return f"{dist.name} {dist.version}" if dist is not None else "unknown"
+    except (AttributeError, KeyError, TypeError):  # a distribution without readable metadata
+        return "unknown"
 
 
 @cache
 def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
-    return {group: tuple(entry_points(group=f"errormotion.{group}")) for group in GROUPS}
+    """Read the entry points of every distribution.
+
+    Where a distribution's list cannot be read, an entry point without a value stands for it.
+    """
+    found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
+    seen: set[str] = set()
+    for dist in distributions():
+        name = _name_and_version(dist).partition(" ")[0]
+        if name in seen:  # an older copy further down the path
+            continue
+        if name != "unknown":
+            seen.add(name)
+        try:
+            points = tuple(dist.entry_points)
+        except Exception:  # noqa: BLE001 - a list of whatever form harms nobody else
+            text = dist.read_text("entry_points.txt") or ""
+            points = tuple(EntryPoint(name, "", f"errormotion.{group}") for group in GROUPS if group in text)
+        for group in GROUPS:
+            found[group].extend(point for point in points if point.group == f"errormotion.{group}")
+    return {group: tuple(points) for group, points in found.items()}
 
 
 @cache
 def _loaded(group: Group, point: EntryPoint) -> Plugin:
-    required = ("info", "Settings", "identify")
+    kind, required = _REQUIRED[group]
     try:
+        if not point.value:
+            raise PluginError("entry_points.txt cannot be read; expected sections with lines 'id = module:Class'")
         cls = point.load()
-        missing = [name for name in required if not hasattr(cls, name)]
-        if missing:
+        info = getattr(cls, "info", None)
+        if not isinstance(info, kind):
+            raise PluginError(f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}")
+        if missing := [name for name in required if not hasattr(cls, name)]:
             raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
-        if cls.info.id != point.name:
-            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{cls.info.id}'")
-    except Exception as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
+        if info.id != point.name:
+            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{info.id}'")
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
         return Plugin(
             point.name,
             group,
@@ -233,8 +270,20 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
 
 
 def available(group: Group) -> list[Plugin]:
-    """Return every plugin of a group, broken ones included, sorted by id."""
-    return [_loaded(group, point) for point in sorted(_found()[group], key=lambda point: point.name)]
+    """Return every plugin of a group, broken ones and rival claims to one id included, sorted by id."""
+    points = sorted(_found()[group], key=lambda point: point.name)
+    claims = Counter(point.name for point in points)
+    return [
+        _loaded(group, point)
+        if claims[point.name] == 1
+        else Plugin(point.name, group, point, error=_rivals(group, point.name))
+        for point in points
+    ]
+
+
+def _rivals(group: Group, plugin_id: str) -> str:
+    sources = ", ".join(_name_and_version(point.dist) for point in _found()[group] if point.name == plugin_id)
+    return f"Several distributions claim the {group.rstrip('s')} '{plugin_id}': {sources}. Remove all but one."
 
 
 def get(group: Group, plugin_id: str) -> Any:
@@ -254,8 +303,7 @@ def get(group: Group, plugin_id: str) -> Any:
         hint = f" Did you mean '{near[0]}'?" if near else ""
         raise PluginError(f"No {what} plugin '{plugin_id}'; there are: {', '.join(names) or 'none'}.{hint}")
     if len(points) > 1:
-        sources = ", ".join(_loaded(group, point).distribution for point in points)
-        raise PluginError(f"Several distributions claim the {what} '{plugin_id}': {sources}. Remove all but one.")
+        raise PluginError(_rivals(group, plugin_id))
     plugin = _loaded(group, points[0])
     if plugin.error:
         raise PluginError(f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}")

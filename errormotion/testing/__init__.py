@@ -1,1 +1,45 @@
-"""To be filled."""
+"""The conformance kit: what every instrument and every method plugin has to show, ours and others'.
+
+``check_plugin(group, plugin_id)`` runs it on a plugin of the registry. In a plugin's own tests, subclass
+``InstrumentConformance`` or ``MethodConformance`` and state the subject; pytest then collects one test a check.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from errormotion.testing.kit import Check, CheckResult
+    from errormotion.testing.pytest_classes import InstrumentConformance, MethodConformance
+    from errormotion.testing.run import check_plugin, run_checks
+    from errormotion.testing.subjects import InstrumentSubject, MethodSubject
+
+_HOME = {
+    "Check": "kit",
+    "CheckResult": "kit",
+    "InstrumentConformance": "pytest_classes",
+    "InstrumentSubject": "subjects",
+    "MethodConformance": "pytest_classes",
+    "MethodSubject": "subjects",
+    "check_plugin": "run",
+    "run_checks": "run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+__all__ = [
+    "Check",
+    "CheckResult",
+    "InstrumentConformance",
+    "InstrumentSubject",
+    "MethodConformance",
+    "MethodSubject",
+    "check_plugin",
+    "run_checks",
+]

@@ -1,0 +1,320 @@
+"""What every instrument plugin has to show."""
+# ruff: noqa: D401 - the docstring of a check is its claim
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import asdict
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, get_args
+
+import numpy as np
+from pydantic import ValidationError
+
+from errormotion.errors import ErrormotionError, InstrumentError
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings, Samples, Status
+from errormotion.testing.kit import Checks, require
+from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
+from errormotion.testing.subjects import InstrumentSubject, load_object
+
+INSTRUMENT_CHECKS: Checks[InstrumentSubject] = Checks()
+
+
+def _no_stream(subject: InstrumentSubject) -> str:
+    return "" if subject.streams else "the driver has no stream()"
+
+
+def _no_faults(subject: InstrumentSubject) -> str:
+    return "" if subject.menu else "the simulator has no faults"
+
+
+def _no_bounds(subject: InstrumentSubject) -> str:
+    return "" if subject.bounds else f"nothing is known of believable readings of a '{subject.plugin.info.kind}'"
+
+
+def _no_splitting(subject: InstrumentSubject) -> str:
+    return "" if subject.split_fault in subject.menu else f"the simulator has no fault '{subject.split_fault}'"
+
+
+def _no_dropping(subject: InstrumentSubject) -> str:
+    if subject.drop_fault not in subject.menu:
+        return f"the simulator has no fault '{subject.drop_fault}'"
+    return _no_stream(subject)
+
+
+@INSTRUMENT_CHECKS.add()
+def info_complete(subject: InstrumentSubject) -> str:
+    """Class attribute ``info`` tells id, kind, summary, status and version, and its simulator loads."""
+    info = subject.plugin.info
+    require(isinstance(info, InstrumentInfo), f"expected an InstrumentInfo, found {type(info).__name__}")
+    for name in ("id", "kind"):
+        value = getattr(info, name)
+        require(
+            isinstance(value, str) and value.isidentifier() and value == value.lower(),
+            f"info.{name}: expected lower case letters, digits and _, found {value!r}",
+        )
+    require(len(info.summary.strip()) >= 10, f"info.summary: expected a sentence, found {info.summary!r}")
+    require(info.status in get_args(Status), f"info.status: expected one of {get_args(Status)}, found {info.status!r}")
+    require(bool(info.version), "info.version is empty")
+    if info.simulator is not None:
+        load_object(info.simulator)
+    return f"{info.id} ({info.kind}), {info.status}"
+
+
+@INSTRUMENT_CHECKS.add()
+def settings_strict(subject: InstrumentSubject) -> str:
+    """Settings are a PluginSettings, refuse unknown keys, and come back from their JSON unchanged."""
+    return check_settings(subject.plugin.Settings, subject.build().settings)
+
+
+def check_settings(cls: Any, settings: Any) -> str:
+    """Check a plugin's class of settings with one set of them; shared with the methods."""
+    require(issubclass(cls, PluginSettings), f"expected a subclass of PluginSettings, found {cls.__name__}")
+    require(isinstance(settings, cls), f"the plugin holds a {type(settings).__name__} instead of its own Settings")
+    stored = json.loads(settings.model_dump_json())
+    require(cls.model_validate(stored) == settings, f"settings come back from JSON changed: {stored}")
+    try:
+        cls.model_validate(stored | {"no_such_setting": 1})
+    except ValidationError:
+        return f"{len(cls.model_fields)} settings"
+    require(False, "an unknown key 'no_such_setting' was accepted")
+    return ""
+
+
+@INSTRUMENT_CHECKS.add()
+def identify(subject: InstrumentSubject) -> str:
+    """The instrument tells maker, model and serial number, the same each time, and admits to be a simulator."""
+    with subject.build() as instrument:
+        first, second = instrument.identify(), instrument.identify()
+    require(isinstance(first, Identity), f"expected an Identity, found {type(first).__name__}")
+    for name in ("manufacturer", "model", "serial_number"):
+        require(bool(str(getattr(first, name)).strip()), f"identity.{name} is empty")
+    require(first == second, f"two answers differ: {first} and {second}")
+    require(first.simulated == subject.simulated, f"identity.simulated is {first.simulated} at {subject.address}")
+    json.dumps(asdict(first))
+    return f"{first.manufacturer} {first.model} {first.serial_number}"
+
+
+@INSTRUMENT_CHECKS.add()
+def open_and_close_twice(subject: InstrumentSubject) -> str:
+    """Opening and closing are idempotent, closing an unopened one is harmless, and a closed one opens again."""
+    instrument = subject.build()
+    try:
+        instrument.close()
+        instrument.open()
+        instrument.open()
+        instrument.identify()
+        instrument.close()
+        instrument.close()
+        with instrument as entered:
+            require(entered is instrument, "'with instrument as x' does not give the instrument itself")
+            instrument.identify()
+    finally:
+        instrument.close()
+    return "opened and closed twice"
+
+
+@INSTRUMENT_CHECKS.add()
+def use_before_open(subject: InstrumentSubject) -> str:
+    """Used before it is opened, or after it is closed, the instrument raises an InstrumentError."""
+    instrument = subject.build()
+    _require_refusal(instrument, "before open", subject.streams)
+    with instrument:
+        pass
+    _require_refusal(instrument, "after close", subject.streams)
+    return "refused before open and after close"
+
+
+def _require_refusal(instrument: Any, when: str, streams: bool) -> None:
+    uses = {"identify": instrument.identify, "read": instrument.read}
+    if streams:
+        uses["stream"] = lambda: next(iter(instrument.stream()))
+    for name, use in uses.items():
+        try:
+            use()
+        except InstrumentError:
+            continue
+        except Exception as error:  # noqa: BLE001 - named in the verdict
+            require(False, f"{name}() {when}: expected an InstrumentError, found {type(error).__name__}: {error}")
+        require(False, f"{name}() {when}: expected an InstrumentError, but it answered")
+
+
+@INSTRUMENT_CHECKS.add()
+def nobody_there(subject: InstrumentSubject) -> str:
+    """With nobody at the address, making the driver is free, and opening it raises a typed error within the limit."""
+    instrument = subject.build(address=subject.dead_address)
+    start = time.perf_counter()
+    try:
+        with instrument:
+            instrument.identify()
+    except ErrormotionError as error:
+        seconds = time.perf_counter() - start
+        require(seconds <= subject.time_limit, f"the error took {seconds:.1f} s, limit {subject.time_limit:g} s")
+        return f"{type(error).__name__} after {seconds:.2f} s"
+    finally:
+        instrument.close()
+    require(False, f"somebody answered at {subject.dead_address}")
+    return ""
+
+
+@INSTRUMENT_CHECKS.add()
+def readings(subject: InstrumentSubject) -> str:
+    """A reading holds numbers, as many each time; an unknown one is NaN, never None."""
+    with subject.build() as instrument:
+        three = [instrument.read() for _ in range(3)]
+    require(
+        all(leaf is not None for reading in three for leaf in leaves(reading)), "a reading holds None, expected NaN"
+    )
+    values = [numbers(reading) for reading in three]
+    require(bool(values[0]), "read() returned no numbers")
+    require(all(len(value) == len(values[0]) for value in values), "readings differ in their number of values")
+    require(any(math.isfinite(value) for value in values[-1]), "a sound instrument gave no finite value")
+    return f"{len(values[0])} values a reading"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_bounds)
+def plausible_magnitudes(subject: InstrumentSubject) -> str:
+    """Readings and samples are in SI units: finite ones lie within believable bounds."""
+    low, high = subject.bounds or (-math.inf, math.inf)
+    with subject.build() as instrument:
+        values = np.array(numbers(instrument.read()))
+        if subject.streams:
+            values = np.concatenate([values, *(block.values.ravel() for block in first_blocks(instrument, 2))])
+    values = values[np.isfinite(values)]
+    require(values.size > 0, "no finite value at all")
+    worst = values[np.argmax(np.maximum(low - values, values - high))]
+    require(low <= worst <= high, f"expected {low:g} to {high:g} in SI units, found {worst:g}")
+    return f"{values.min():g} to {values.max():g}"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_stream)
+def stream_blocks(subject: InstrumentSubject) -> str:
+    """A stream yields Samples: float64 of shape (channel, n), the same channels each time, a positive rate."""
+    with subject.build() as instrument:
+        blocks = first_blocks(instrument, subject.blocks)
+    require(len(blocks) == subject.blocks, f"expected {subject.blocks} blocks, the stream ended after {len(blocks)}")
+    for block in blocks:
+        require(isinstance(block, Samples), f"expected Samples, found {type(block).__name__}")
+        values = block.values
+        require(values.dtype == np.float64, f"expected float64, found {values.dtype}")
+        require(values.ndim == 2 and values.shape[1] > 0, f"expected shape (channel, n), found {values.shape}")
+        require(values.shape[0] == blocks[0].values.shape[0], "the number of channels changes from block to block")
+        require(block.rate > 0 and block.rate == blocks[0].rate, f"rates {blocks[0].rate} and {block.rate} /s")
+    return f"{blocks[0].values.shape[0]} channels at {blocks[0].rate:g} /s"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_stream)
+def monotonic_time(subject: InstrumentSubject) -> str:
+    """Device counters go on without a gap from block to block, host times never go back nor lie ahead."""
+    before = time.monotonic()
+    with subject.build() as instrument:
+        blocks = first_blocks(instrument, subject.blocks)
+    after = time.monotonic()
+    for block, following in pairwise(blocks):
+        expected = block.first + block.values.shape[1]
+        require(following.first == expected, f"a block starts at sample {following.first}, expected {expected}")
+    times = [before, *(block.host_time for block in blocks), after]
+    require(times == sorted(times), f"host times go back, or are not of time.monotonic(): {times}")
+    return f"{sum(block.values.shape[1] for block in blocks)} samples without a gap"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_splitting)
+def split_reads(subject: InstrumentSubject) -> str:
+    """Frames that arrive in pieces give the same values as whole ones."""
+    whole, pieces = (run_session(subject, fault=fault) for fault in ("", subject.split_fault))
+    require(whole.error is None, f"without a fault: {whole.error!r}")
+    require(pieces.error is None, f"split frames raised {pieces.error!r}")
+    require_same(whole, pieces, "split frames changed the values")
+    return f"{whole.values.size} values alike"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_dropping)
+def counted_drops(subject: InstrumentSubject) -> str:
+    """Samples that the device left out are NaN at their places, and counted; the others stay where they belong."""
+    whole, holes = (run_session(subject, fault=fault) for fault in ("", subject.drop_fault))
+    if isinstance(holes.error, InstrumentError):
+        return f"the driver stops: {type(holes.error).__name__}"
+    require(holes.error is None, f"{holes.error!r}")
+    missing = int(np.isnan(holes.stream).all(axis=0).sum())
+    require(holes.dropped > 0, f"no drop was counted; {missing} samples are NaN")
+    require(missing >= holes.dropped, f"{holes.dropped} drops counted, but only {missing} samples are NaN")
+    n = min(whole.stream.shape[1], holes.stream.shape[1])
+    seen = np.isfinite(holes.stream[:, :n]) & np.isfinite(whole.stream[:, :n])
+    same = whole.stream[:, :n][seen] == holes.stream[:, :n][seen]
+    require(bool(same.all()), f"{(~same).sum()} of {same.size} samples are not those that the device counter says")
+    return f"{holes.dropped} of {holes.stream.shape[1]} samples lost and counted"
+
+
+@INSTRUMENT_CHECKS.add(limit=90.0, why_not=_no_faults)
+def faults(subject: InstrumentSubject) -> str:
+    """Each fault of the menu becomes a typed error within the time limit, or a counted loss where data go on."""
+    seen: list[str] = []
+    wrong: list[str] = []
+    sound = run_session(subject)
+    for fault in subject.menu:
+        outcome = run_session(subject, fault=fault)
+        complaint = _complaint(outcome, sound, subject, harmless=fault in subject.harmless)
+        (wrong if complaint else seen).append(f"{fault}: {complaint or outcome.summary}")
+    require(not wrong, "; ".join(wrong))
+    return "; ".join(seen)
+
+
+def _complaint(outcome: Session, sound: Session, subject: InstrumentSubject, harmless: bool) -> str:
+    if outcome.error is not None and not isinstance(outcome.error, InstrumentError):
+        return f"expected an InstrumentError, found {outcome.error!r}"
+    if outcome.seconds > subject.time_limit:
+        return f"{outcome.summary}, limit {subject.time_limit:g} s"
+    noticed = outcome.error is not None or outcome.lost > sound.lost or outcome.unread > sound.unread
+    if harmless and noticed:
+        return f"should do no harm, but {outcome.summary}"
+    if not harmless and not noticed:
+        return "passed unnoticed: no error, and no loss counted"
+    if outcome.unexplained:
+        return f"{outcome.unexplained} values are NaN without a count or a reason"
+    return ""
+
+
+@INSTRUMENT_CHECKS.add()
+def record_and_replay(subject: InstrumentSubject) -> str:
+    """A recorded session, replayed, gives the same identity, readings and samples; what was not recorded is refused."""
+    with TemporaryDirectory() as folder:
+        record = Path(folder) / "session.rec"
+        original = run_session(subject, record=record)
+        require(original.error is None, f"recording: {original.error!r}")
+        require(record.exists() and record.stat().st_size > 0, "nothing was recorded")
+        replayed = run_session(subject, address=f"replay://{record}")
+        require(replayed.error is None, f"replaying: {replayed.error!r}")
+        a, b = original.identity, replayed.identity
+        same = (a.manufacturer, a.model, a.serial_number) == (b.manufacturer, b.model, b.serial_number)
+        require(same, f"the identity changed from {a} to {b}")
+        require_same(original, replayed, "the replay differs from the recording")
+        record.unlink()
+        gone = run_session(subject, address=f"replay://{record}")
+        require(isinstance(gone.error, InstrumentError), f"without its recording the replay gave {gone.summary}")
+    return f"{original.values.size} values alike"
+
+
+@INSTRUMENT_CHECKS.add()
+def nothing_left(subject: InstrumentSubject) -> str:
+    """Closed, also in the middle of a stream or after an error, the instrument leaves no thread, socket or port."""
+    before = open_things()
+    run_session(subject)
+    if subject.streams:
+        instrument = subject.build()
+        with instrument:
+            stream = iter(instrument.stream())
+            next(stream)
+        del stream
+    for fault in subject.menu[:1]:
+        run_session(subject, fault=fault)
+    left = open_things() - before
+    deadline = time.monotonic() + 2.0  # a simulator beyond the wire may need a moment to see that the line is cut
+    while left and time.monotonic() < deadline:
+        time.sleep(0.01)
+        left = open_things() - before
+    require(not left, f"still there: {', '.join(sorted(left))}")
+    return "no thread, no socket"

@@ -1,0 +1,48 @@
+"""The kit as test classes: one test a check. Plain classes: pytest collects their subclasses called ``Test...``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from errormotion.testing.kit import Check, CheckFailedError, run_check
+from errormotion.testing.run import checks_for
+from errormotion.testing.subjects import InstrumentSubject, MethodSubject
+
+
+def _as_test(check: Check[Any]) -> Callable[[Any], None]:
+    def test(self: Any) -> None:
+        __tracebackhide__ = True
+        result = run_check(check, self.subject)
+        if not result.ok:
+            raise CheckFailedError(f"{check.claim}\n{result.message}\n{result.trace}".rstrip())
+
+    test.__doc__ = check.function.__doc__
+    test.__name__ = f"test_{check.name}"
+    return test
+
+
+def _give_tests(cls: type, subject: Any) -> None:
+    for check in checks_for(subject):
+        if not check.why_not(subject):
+            setattr(cls, f"test_{check.name}", _as_test(check))
+
+
+class InstrumentConformance:
+    """One test for every check that applies to the instrument which a subclass states as its ``subject``."""
+
+    subject: ClassVar[InstrumentSubject]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        _give_tests(cls, cls.subject)
+
+
+class MethodConformance:
+    """One test for every check that applies to the method which a subclass states as its ``subject``."""
+
+    subject: ClassVar[MethodSubject]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        _give_tests(cls, cls.subject)

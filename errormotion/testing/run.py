@@ -1,0 +1,87 @@
+"""Run the kit on a plugin of the registry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from errormotion import plugins
+from errormotion.errors import PluginError
+from errormotion.plugins import Group
+from errormotion.testing.builtin import builtin_subjects
+from errormotion.testing.kit import Check, CheckResult, run_check
+from errormotion.testing.subjects import InstrumentSubject, MethodSubject, load_object
+
+
+def check_plugin(group: Group, plugin_id: str, *, address: str | None = None) -> list[CheckResult]:
+    """Run every check on one plugin of the registry.
+
+    Parameters
+    ----------
+    group : "instruments" or "methods"
+    plugin_id : str
+    address : str, optional
+        Where to find the instrument; default: its own simulator.
+
+    Returns
+    -------
+    list of CheckResult
+        In the order in which the checks ran; where a plugin states several subjects, their name stands in brackets.
+
+    Raises
+    ------
+    PluginError
+        Unknown id, a plugin that does not load, or one that states no subject to check.
+    """
+    results = []
+    for subject in subjects_of(group, plugin_id, address=address):
+        for result in run_checks(subject):
+            results.append(replace(result, name=f"{result.name}[{subject.name}]") if subject.name else result)
+    return results
+
+
+def run_checks(subject: InstrumentSubject | MethodSubject) -> list[CheckResult]:
+    """Run every check of the kit on one subject."""
+    return [run_check(check, subject) for check in checks_for(subject)]
+
+
+def checks_for(subject: InstrumentSubject | MethodSubject) -> Sequence[Check[Any]]:
+    """Return the checks for a subject of this kind, in the order in which they run."""
+    if isinstance(subject, InstrumentSubject):
+        from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+
+        return INSTRUMENT_CHECKS
+    from errormotion.testing.method_checks import METHOD_CHECKS
+
+    return METHOD_CHECKS
+
+
+def subjects_of(
+    group: Group, plugin_id: str, *, address: str | None = None
+) -> Sequence[InstrumentSubject | MethodSubject]:
+    """Return what the kit examines of one plugin.
+
+    A plugin names its subject, or a tuple of subjects, in the class attribute ``conformance`` as ``module:name``. An
+    instrument without one is examined at ``sim://`` (or at ``address``) with its default settings.
+
+    Raises
+    ------
+    PluginError
+        Nothing is stated and nothing can be guessed.
+    """
+    cls = plugins.get(group, plugin_id)
+    stated = load_object(cls.conformance) if hasattr(cls, "conformance") else builtin_subjects(group, plugin_id, cls)
+    if not stated:
+        if group == "methods":
+            raise PluginError(
+                f"The method '{plugin_id}' does not say how to check it; give its class an attribute "
+                "conformance = 'module:name' that names a MethodSubject."
+            )
+        if address is None and not cls.info.simulator:
+            raise PluginError(f"The instrument '{plugin_id}' has no simulator; give the address of a real one.")
+        stated = InstrumentSubject(cls, address or f"sim://cframe/{plugin_id}?seed=3")
+    subjects = stated if isinstance(stated, tuple) else (stated,)
+    if address is None:
+        return subjects
+    return tuple(replace(subject, address=address) for subject in subjects)

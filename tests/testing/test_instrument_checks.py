@@ -1,0 +1,318 @@
+"""The kit passes a sound instrument, and each broken one fails exactly the check that is made for its fault."""
+
+import json
+import math
+import socket
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+from pydantic import ConfigDict
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings, Samples
+from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks
+from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+from errormotion.testing.kit import run_check
+
+BLOCK = 8
+
+
+class Settings(PluginSettings):
+    offset: float = 0.0
+
+
+class Sound:
+    """A sensor behind a wire of text lines 'counter value', made of Python lists instead of sockets."""
+
+    info = InstrumentInfo("sound", "point_lds", "A sensor that exists in this test only", "simulated_only")
+    Settings = Settings
+
+    def __init__(self, address, settings=None, *, record=None):
+        self.address, self.settings, self.record = address, settings or Settings(), record
+        self.lines = None
+        self.log = []
+
+    def open(self):
+        if self.lines is None:
+            self.lines = self.connect()
+
+    def connect(self):
+        parts = urlsplit(self.address)
+        if parts.scheme == "replay":
+            path = Path(self.address.removeprefix("replay://"))
+            if not path.exists():
+                raise ReplayError(f"no recording {path}")
+            return iter(json.loads(path.read_text()))
+        if parts.scheme != "sim":
+            raise InstrumentError(f"nobody at {self.address}")
+        return wire(parse_qs(parts.query).get("fault", [""])[0])
+
+    def close(self):
+        if self.lines is not None and self.record:
+            self.record.write_text(json.dumps(self.log))
+        self.lines = None
+
+    def __enter__(self):
+        self.open()
+        return self
+
+    def __exit__(self, *exc):
+        self.close()
+
+    def line(self):
+        if self.lines is None:
+            raise InstrumentError("the sensor is not open; use 'with'")
+        text = ""
+        while not text.endswith("\n"):
+            piece = next(self.lines, None)
+            if piece is None:
+                raise InstrumentTimeoutError("the sensor is silent")
+            self.log.append(piece)
+            text += piece
+        return text
+
+    def value(self, text):
+        try:
+            return float(text) + self.settings.offset
+        except ValueError:
+            return math.nan
+
+    def identify(self):
+        if self.lines is None:
+            raise InstrumentError("the sensor is not open; use 'with'")
+        return Identity("Nobody", "Sound 1", "0001", simulated=not self.address.startswith("tcp"))
+
+    def read(self):
+        return self.value(self.line().split()[1])
+
+    def stream(self):
+        first = None
+        while True:
+            values, invalid, dropped = [], 0, 0
+            while len(values) < BLOCK:
+                counter, text = self.line().split()
+                first = int(counter) if first is None else first
+                missing = int(counter) - first - len(values)
+                values += [math.nan] * missing
+                dropped += missing
+                values.append(self.value(text))
+                invalid += math.isnan(values[-1])
+            yield self.block(values, first, dropped, invalid)
+            first += len(values)
+
+    def block(self, values, first, dropped, invalid):
+        return Samples(np.array([values]), first, 100.0, time.monotonic(), dropped, {"no number": invalid})
+
+
+def wire(fault):
+    """Yield what comes off the wire: 'counter value' in m, from the fourth line on with a fault."""
+    for counter in range(1000):
+        text = f"{counter} {1e-3 + 1e-6 * math.sin(counter):.9f}\n"
+        if fault == "split":
+            yield from text
+        elif fault == "silence" and counter >= 3:
+            return
+        elif fault == "garbage" and counter == 6:
+            yield "6 0.x\n"
+        elif not (fault == "drop" and 9 <= counter < 12):
+            yield text
+
+
+SOUND = InstrumentSubject(Sound, "sim://bench/sound", faults=("silence", "garbage", "drop", "split"), time_limit=0.5)
+
+
+class TestSound(InstrumentConformance):
+    subject = SOUND
+
+
+class SaysNothingOfItself(Sound):
+    info = replace(Sound.info, summary="")
+
+
+class SwallowsUnknownSettings(Sound):
+    class Settings(Settings):
+        model_config = ConfigDict(extra="ignore")
+
+    def __init__(self, address, settings=None, *, record=None):
+        super().__init__(address, settings or self.Settings(), record=record)
+
+
+class HidesItsSerialNumber(Sound):
+    def identify(self):
+        return replace(super().identify(), serial_number="")
+
+
+class PassesAsReal(Sound):
+    def identify(self):
+        return replace(super().identify(), simulated=False)
+
+
+class OpensOnce(Sound):
+    def open(self):
+        if self.lines is not None:
+            raise InstrumentError("open already")
+        super().open()
+
+
+class AttributeErrorBeforeOpen(Sound):
+    def identify(self):
+        return self.lines and super().identify()
+
+
+class WaitsForever(Sound):
+    def connect(self):
+        if not self.address.startswith(("sim", "replay")):
+            time.sleep(1.0)
+        return super().connect()
+
+
+class ReadsText(Sound):
+    def read(self):
+        value = super().read()
+        return {"distance": None if value > 1e-3 else value}
+
+
+class ReadsMillimetres(Sound):
+    def value(self, text):
+        return 1e3 * super().value(text)
+
+
+class StreamsSinglePrecision(Sound):
+    def block(self, values, first, dropped, invalid):
+        sound = super().block(values, first, dropped, invalid)
+        return replace(sound, values=sound.values.astype(np.float32))
+
+
+class StartsEveryBlockAtZero(Sound):
+    def block(self, values, first, dropped, invalid):
+        return replace(super().block(values, first, dropped, invalid), first=0)
+
+
+class TakesAPieceForALine(Sound):
+    def line(self):
+        if "fault=split" not in self.address:
+            return super().line()
+        return super().line().replace("9", "8")
+
+
+class ClosesTheGap(Sound):
+    """Puts the samples behind a gap where the lost ones belong, and counts the loss at the block's end."""
+
+    def block(self, values, first, dropped, invalid):
+        kept = [value for value in values if not math.isnan(value)] if dropped else values
+        return super().block(kept + [math.nan] * dropped if dropped else kept, first, dropped, invalid)
+
+
+class TakesGarbageForNumbers(Sound):
+    def value(self, text):
+        value = super().value(text)
+        return 1e-3 if math.isnan(value) else value
+
+
+class RaisesIndexErrors(Sound):
+    def line(self):
+        try:
+            return super().line()
+        except InstrumentTimeoutError:
+            raise IndexError("list index out of range") from None
+
+
+class ReplaysFromMemory(Sound):
+    """Does not look at the recording at all."""
+
+    def connect(self):
+        return wire("") if self.address.startswith("replay") else super().connect()
+
+
+class LeavesAThread(Sound):
+    ended = threading.Event()
+
+    def open(self):
+        super().open()
+        threading.Thread(target=self.ended.wait, daemon=True).start()
+
+
+class LeavesASocket(Sound):
+    kept: ClassVar = deque()
+
+    def open(self):
+        super().open()
+        self.kept.append(socket.socket())
+
+
+BROKEN = [
+    ("info_complete", SaysNothingOfItself),
+    ("settings_strict", SwallowsUnknownSettings),
+    ("identify", HidesItsSerialNumber),
+    ("identify", PassesAsReal),
+    ("open_and_close_twice", OpensOnce),
+    ("use_before_open", AttributeErrorBeforeOpen),
+    ("nobody_there", WaitsForever),
+    ("readings", ReadsText),
+    ("plausible_magnitudes", ReadsMillimetres),
+    ("stream_blocks", StreamsSinglePrecision),
+    ("monotonic_time", StartsEveryBlockAtZero),
+    ("split_reads", TakesAPieceForALine),
+    ("counted_drops", ClosesTheGap),
+    ("faults", TakesGarbageForNumbers),
+    ("faults", RaisesIndexErrors),
+    ("record_and_replay", ReplaysFromMemory),
+    ("nothing_left", LeavesAThread),
+    ("nothing_left", LeavesASocket),
+]
+
+
+@pytest.fixture(autouse=True)
+def clean_up():
+    LeavesAThread.ended.clear()
+    yield
+    LeavesAThread.ended.set()
+    for line in LeavesASocket.kept:
+        line.close()
+    LeavesASocket.kept.clear()
+
+
+@pytest.mark.parametrize(("check", "plugin"), BROKEN, ids=lambda value: getattr(value, "__name__", value))
+def test_a_broken_instrument_fails_exactly_its_check(check, plugin):
+    results = run_checks(replace(SOUND, plugin=plugin))
+    failed = {result.name: result.message for result in results if not result.ok}
+    assert failed.keys() == {check}
+
+
+def test_every_check_has_a_plugin_that_fails_it():
+    assert {check for check, _ in BROKEN} == {check.name for check in INSTRUMENT_CHECKS}
+
+
+def test_every_check_says_what_it_claims():
+    assert all(len(check.claim) > 30 for check in INSTRUMENT_CHECKS)
+
+
+def test_a_check_that_hangs_fails_at_its_time_limit():
+    class Hangs(Sound):
+        def identify(self):
+            time.sleep(0.6)
+            return super().identify()
+
+    check = next(check for check in INSTRUMENT_CHECKS if check.name == "identify")
+    result = run_check(replace(check, limit=0.2), replace(SOUND, plugin=Hangs))
+    assert not result.ok
+    assert "still running after 0.2 s" in result.message
+
+
+def test_checks_without_a_stream_do_not_apply_to_a_driver_without_one():
+    ReadsOnly = type("ReadsOnly", (), {k: v for k, v in vars(Sound).items() if k != "stream"})
+    results = run_checks(InstrumentSubject(ReadsOnly, "sim://bench/sound", faults=()))
+    assert [result.message for result in results if not result.ok] == []
+    skipped = {result.name for result in results if result.skipped}
+    assert skipped == {"stream_blocks", "monotonic_time", "split_reads", "counted_drops", "faults"}
+
+
+def test_a_real_device_is_spared_the_faults():
+    assert replace(SOUND, address="serial:///dev/ttyUSB0").menu == ()
