@@ -1,1 +1,24 @@
-"""To be filled."""
+"""What flows between the parts: raw datasets and error datasets, their units and where they come from.
+
+Importing this package registers the accessor ``ds.em``.
+"""
+
+from errormotion.datasets.accessor import Combination, ErrorMotion
+from errormotion.datasets.error_dataset import build_errors
+from errormotion.datasets.provenance import hash_dataset
+from errormotion.datasets.schemas import DOF, SCHEMA
+from errormotion.datasets.storage import load, save
+from errormotion.datasets.validation import validate, violations
+
+__all__ = [
+    "DOF",
+    "SCHEMA",
+    "Combination",
+    "ErrorMotion",
+    "build_errors",
+    "hash_dataset",
+    "load",
+    "save",
+    "validate",
+    "violations",
+]

@@ -1,0 +1,272 @@
+"""``ds.em``: what can be asked of an error dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.datasets.schemas import DOF, SCHEMA
+from errormotion.errors import DatasetError
+from errormotion.kinematics import iso, twists
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import RigidTransform
+
+INDEPENDENT = "independent"
+"""Name of the rest in a budget: what is drawn anew at every value."""
+
+
+class Combination(NamedTuple):
+    """A linear combination of errors: ``value(..., dof)`` and ``covariance(..., dof, dof_)``, SI."""
+
+    value: xr.DataArray
+    covariance: xr.DataArray
+
+
+@xr.register_dataset_accessor("em")  # type: ignore[no-untyped-call]
+class ErrorMotion:
+    """The accessor ``ds.em`` of error datasets.
+
+    Raises
+    ------
+    DatasetError
+        On first use, if the dataset has not the error schema.
+    """
+
+    def __init__(self, ds: xr.Dataset) -> None:
+        if ds.attrs.get("schema") != SCHEMA:
+            raise DatasetError(
+                f"'.em' belongs to error datasets (attribute schema = '{SCHEMA}'); "
+                f"found schema = {ds.attrs.get('schema')!r}. Identify a raw dataset first"
+            )
+        self._ds = ds
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of the errors, without ``dof``."""
+        return tuple(str(dim) for dim in self._ds["EX"].dims)
+
+    def twist(self) -> xr.DataArray:
+        """Return all six freedoms in one array.
+
+        Returns
+        -------
+        DataArray, (..., dof)
+            m and rad; NaN where not seen.
+        """
+        values = np.stack([self._ds[name].values for name in DOF], axis=-1)
+        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="twist")
+
+    def expanded(self, k: float = 2.0) -> xr.DataArray:
+        """Return the expanded uncertainty ``k u`` of every freedom.
+
+        Returns
+        -------
+        DataArray, (..., dof)
+            m and rad.
+        """
+        variance = np.diagonal(self._ds["covariance"].values, axis1=-2, axis2=-1)
+        values = k * np.sqrt(np.maximum(variance, 0.0))
+        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="uncertainty")
+
+    def iso_names(self) -> dict[str, str]:
+        """Return the ISO 230-1 name of each freedom, such as ``{"EX": "EXX", ...}``."""
+        return iso.iso_names(self._ds.attrs["component"])
+
+    def at(self, point: ArrayLike) -> xr.Dataset:
+        """Return the same errors at another functional point.
+
+        Values, covariance and influence move: ``E' = E + R x r``. Further results of the method stay as it computed
+        them, for its own point.
+
+        Parameters
+        ----------
+        point : array_like, (3,)
+            m, in the dataset's frame.
+
+        Raises
+        ------
+        DatasetError
+            Not three finite coordinates.
+        """
+        target = _point(point)
+        moved = self._transformed(twists.adjoint(shift=target - _point(self._ds.attrs["functional_point"])))
+        return moved.assign_attrs(functional_point=target)
+
+    def in_frame(self, pose: RigidTransform, name: str) -> xr.Dataset:
+        """Return the same errors, at the same physical point, in another frame.
+
+        Values, covariance, influence, functional point and the commanded ``x y z`` change their coordinates. Further
+        results of the method stay as it computed them, in its own frame.
+
+        Parameters
+        ----------
+        pose : RigidTransform
+            Takes coordinates of the present frame to coordinates of the new one.
+        name : str
+            Of the new frame.
+
+        Raises
+        ------
+        DatasetError
+            Only some of ``x y z`` are known, so that they cannot be transformed.
+        """
+        ds = self._transformed(twists.adjoint(rotation=pose.rotation))
+        present = [axis for axis in "xyz" if axis in ds.variables]
+        if len(present) == 3:
+            before = np.stack(np.broadcast_arrays(*(ds[axis].values for axis in "xyz")), axis=-1)
+            after = pose.apply(before.reshape(-1, 3)).reshape(before.shape)
+            for k, axis in enumerate("xyz"):
+                ds[axis] = ds[axis].copy(data=after[..., k])
+        elif present:
+            raise DatasetError(
+                f"A change of frame needs the commanded x, y and z together; found {', '.join(present)} alone. "
+                "Add the others as coordinates, or drop them"
+            )
+        return ds.assign_attrs(functional_point=pose.apply(_point(ds.attrs["functional_point"])), frame=name)
+
+    def covariance_between(self, i: Any, j: Any) -> xr.DataArray:
+        """Return the covariance of the errors at two places.
+
+        The sum over sources of ``influence_i influence_j``; the independent rest comes in where i = j.
+
+        Parameters
+        ----------
+        i, j : int, sequence of int or mapping of str to int
+            Index of each place along the dims.
+
+        Returns
+        -------
+        DataArray, (dof, dof_)
+            m^2, m rad, rad^2.
+        """
+        first, second = self._index(i), self._index(j)
+        if first == second:
+            covariance = self._ds["covariance"].values[first]
+        else:
+            F = np.moveaxis(self._influence(), 0, -1)
+            covariance = F[first] @ F[second].T
+            if not F.size:  # no shared source: known to be 0 where both values are known
+                covariance = covariance + 0 * np.add.outer(self._values()[first], self._values()[second])
+        return xr.DataArray(covariance, dims=("dof", "dof_"), coords={"dof": list(DOF), "dof_": list(DOF)})
+
+    def combine(self, weights: ArrayLike, dim: str) -> Combination:
+        """Return a linear combination of the errors along a dimension, with its covariance.
+
+        A mean, a difference, a slope: ``sum_k w_k E_k``. Sources of influence add up with their signs before they are
+        squared, the independent rest adds in squares. A NaN value with weight 0 does not matter.
+
+        Parameters
+        ----------
+        weights : array_like, (n,)
+            One for each place along ``dim``; finite.
+        dim : str
+
+        Returns
+        -------
+        Combination
+            ``value`` (..., dof) and ``covariance`` (..., dof, dof_) over the other dims.
+
+        Raises
+        ------
+        DatasetError
+            No such dim, or weights that do not fit.
+        """
+        if dim not in self.dims:
+            raise DatasetError(f"Expected one of the dims {', '.join(self.dims) or '(none)'}; found '{dim}'")
+        w = np.asarray(weights, dtype=float)
+        if w.shape != (self._ds.sizes[dim],) or not np.isfinite(w).all():
+            raise DatasetError(f"Expected {self._ds.sizes[dim]} finite weights along '{dim}'; found shape {w.shape}")
+        axis = self.dims.index(dim)
+        used = np.flatnonzero(w)
+        w = w[used]
+        E = np.moveaxis(self._values().take(used, axis), axis, -1) @ w if used.size else self._nothing(axis)
+        F = np.moveaxis(self._influence().take(used, axis + 1), axis + 1, -1) @ w
+        independent = self._independent().take(used, axis)
+        C = np.moveaxis(independent, axis, -1) @ w**2 + np.einsum("s...i,s...j->...ij", F, F)
+        rest = tuple(name for name in self.dims if name != dim)
+        return Combination(
+            xr.DataArray(E, dims=(*rest, "dof"), coords=self._coords("dof", without=dim), name="value"),
+            xr.DataArray(C, dims=(*rest, "dof", "dof_"), coords=self._coords("dof", "dof_", without=dim)),
+        )
+
+    def budget(self) -> xr.DataArray:
+        """Return the uncertainty budget: standard uncertainty (k = 1) by group of sources, and the independent rest.
+
+        The groups' root sum of squares is the total.
+
+        Returns
+        -------
+        DataArray, (group, ..., dof)
+            m and rad; the last group is ``independent``.
+        """
+        F = self._influence()
+        groups = [str(group) for group in self._ds["source_group"].values] if F.shape[0] else []
+        names = list(dict.fromkeys(groups))
+        rows = [np.sqrt((F[[group == name for group in groups]] ** 2).sum(axis=0)) for name in names]
+        rest = np.sqrt(np.maximum(np.diagonal(self._independent(), axis1=-2, axis2=-1), 0.0))
+        coords = {"group": [*names, INDEPENDENT], **self._coords("dof")}
+        return xr.DataArray(np.stack([*rows, rest]), dims=("group", *self.dims, "dof"), coords=coords, name="budget")
+
+    def plot(self) -> Figure:
+        """Return a figure: displacements in um and rotations in arcsec, with their k = 2 bands."""
+        from errormotion.datasets.plotting import plot_errors  # matplotlib only when something is drawn
+
+        return plot_errors(self._ds)
+
+    def _values(self) -> NDArray[np.float64]:
+        return np.asarray(self.twist().values, dtype=float)
+
+    def _influence(self) -> NDArray[np.float64]:
+        if "influence" in self._ds.variables:
+            return np.asarray(self._ds["influence"].values, dtype=float)
+        return np.zeros((0, *self._values().shape))
+
+    def _independent(self) -> NDArray[np.float64]:
+        F = self._influence()
+        C: NDArray[np.float64] = self._ds["covariance"].values - np.einsum("s...i,s...j->...ij", F, F, optimize=True)
+        return C
+
+    def _nothing(self, axis: int) -> NDArray[np.float64]:
+        return np.zeros(np.delete(self._values().shape, axis))
+
+    def _coords(self, *dof: str, without: str = "") -> dict[str, Any]:
+        kept = {name: self._ds.coords[name] for name in self.dims if name != without and name in self._ds.coords}
+        return {**kept, **{name: list(DOF) for name in dof}}
+
+    def _index(self, place: int | Sequence[int] | Mapping[str, int]) -> tuple[int, ...]:
+        if isinstance(place, Mapping):
+            if set(place) != set(self.dims):
+                raise DatasetError(f"Expected an index for each of {', '.join(self.dims)}; found {dict(place)}")
+            place = [place[dim] for dim in self.dims]
+        index = (int(place),) if isinstance(place, (int, np.integer)) else tuple(int(number) for number in place)
+        if len(index) != len(self.dims):
+            raise DatasetError(f"Expected an index for each of {', '.join(self.dims)}; found {index}")
+        sizes = [self._ds.sizes[dim] for dim in self.dims]
+        for number, size in zip(index, sizes, strict=True):
+            if not -size <= number < size:
+                raise DatasetError(f"Expected an index below {size}; found {number}")
+        return tuple(number % size for number, size in zip(index, sizes, strict=True))
+
+    def _transformed(self, A: NDArray[np.float64]) -> xr.Dataset:
+        """Return a copy with twist, covariance and influence under a 6x6 matrix."""
+        ds = self._ds.copy()
+        E = twists.transform(self._values(), A)
+        for k, name in enumerate(DOF):
+            ds[name] = ds[name].copy(data=np.ascontiguousarray(E[..., k]))
+        ds["covariance"] = ds["covariance"].copy(data=twists.transform_covariance(ds["covariance"].values, A))
+        if "influence" in ds.variables:
+            ds["influence"] = ds["influence"].copy(data=twists.transform(ds["influence"].values, A))
+        return ds
+
+
+def _point(point: ArrayLike) -> NDArray[np.float64]:
+    array = np.array(point, dtype=float)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise DatasetError(f"Expected a point: three finite coordinates in m; found {point!r}")
+    return array

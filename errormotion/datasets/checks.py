@@ -1,0 +1,155 @@
+"""Checks that every schema shares: units, magnitudes, attributes, labels.
+
+Each returns sentences, none if all is well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.datasets.sampling import sample, steps
+from errormotion.datasets.schemas import Row
+from errormotion.datasets.units import convert
+from errormotion.errors import DatasetError
+
+_MISTAKES = {
+    "m": ((1e-3, 0.0, "mm"), (1e-6, 0.0, "um"), (0.0254, 0.0, "inches")),
+    "rad": ((np.pi / 180 / 3600, 0.0, "arcsec"), (1e-6, 0.0, "urad"), (np.pi / 180, 0.0, "deg")),
+    "degC": ((1.0, -273.15, "K"),),
+}
+
+
+def number(value: float) -> str:
+    """Return a number as a person writes it."""
+    return f"{value:.6g}"
+
+
+def magnitude_violations(name: str, variable: xr.Variable, row: Row) -> list[str]:
+    """Return what is wrong with the type, unit and size of a variable's values; looks at a sample of a big one."""
+    if variable.dtype.kind not in "fiu":
+        return [f"{name}: expected numbers (float64); found {_dtype(variable)}"]
+    found = unit_violations(name, variable.attrs, row.unit)
+    values = sample(variable).astype(float)
+    if np.isinf(values).any():
+        found.append(f"{name}: expected finite numbers, NaN where unknown; found an infinite one")
+    values = values[np.isfinite(values)]
+    outside = values[(values < row.low) | (values > row.high)]
+    if outside.size and not found:
+        worst = float(outside[np.argmax(np.abs(outside))])
+        unit = f" {row.unit}" if row.unit not in ("", "1") else ""
+        found.append(f"{name} = {number(worst)}{unit}: expected {_range(row)}{unit}{_guess(worst, row)}")
+    return found
+
+
+def _range(row: Row) -> str:
+    return f"{number(row.low)}..{number(row.high)}"
+
+
+def _guess(value: float, row: Row) -> str:
+    for factor, offset, unit in _MISTAKES.get(row.unit, ()):
+        if row.low <= value * factor + offset <= row.high:
+            return f"; is it in {unit}?"
+    return ""
+
+
+def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]:
+    """Return a sentence if the attribute ``units`` is there and is not the inside unit."""
+    found = attrs.get("units")
+    if found is None or not unit or found == unit:
+        return []
+    if unit == "1":
+        if str(found).strip().lower() in ("", "dimensionless", "none"):
+            return []
+        return [f"{name}: expected units '1' (a pure number); found '{found}'"]
+    try:
+        same = convert(1.0, str(found), unit) == 1.0 and convert(0.0, str(found), unit) == 0.0
+    except DatasetError as error:
+        return [f"{name}: expected units '{unit}'; found '{found}': {error}"]
+    if same:
+        return []
+    return [f"{name}: expected units '{unit}'; found '{found}'. Convert the values and set the attribute"]
+
+
+def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, needed: bool) -> list[str]:
+    """Return what is wrong with the labels of a dimension; the order is free for channels, not for directions."""
+    if dim not in ds.variables:
+        return [f"{dim}: expected a coordinate with the labels {' '.join(labels)}; found none"] if needed else []
+    variable = ds.variables[dim]
+    if variable.dims != (dim,):
+        return [f"{dim}: expected a coordinate along '{dim}'; found dims {dims(variable)}"]
+    found = tuple(label.decode() if isinstance(label, bytes) else str(label) for label in variable.values.tolist())
+    missing = [label for label in labels if label not in found]
+    unknown = [label for label in found if label not in labels]
+    twice = sorted({label for label in found if found.count(label) > 1})
+    what = f"{dim}: expected {' '.join(labels)}; found {' '.join(found) or 'nothing'}"
+    complaints = [
+        f"{word} {' '.join(names)}"
+        for word, names in (("missing", missing), ("unknown", unknown), ("twice", twice))
+        if names
+    ]
+    if complaints:
+        return [f"{what}: {', '.join(complaints)}"]
+    if needed or found == labels:
+        return []
+    return [f"{what}: in another order"]
+
+
+def time_violations(name: str, variable: xr.Variable) -> list[str]:
+    """Return a sentence if times are not finite, or do not increase."""
+    if variable.dtype.kind not in "fiu":
+        return [f"{name}: expected seconds (float64); found {_dtype(variable)}"]
+    last = -np.inf
+    for run in steps(variable):
+        values = run.astype(float)
+        if not np.isfinite(values).all():
+            return [f"{name}: expected finite seconds; found {number(values[~np.isfinite(values)][0])}"]
+        wrong = np.flatnonzero(np.diff(values) <= 0)
+        if wrong.size:
+            before, after = values[wrong[0]], values[wrong[0] + 1]
+            return [f"{name}: expected increasing seconds; found {number(after)} s after {number(before)} s"]
+        if values.size and values[0] < last:
+            return [f"{name}: expected increasing seconds; found {number(values[0])} s after {number(last)} s"]
+        last = values[-1] if values.size else last
+    return []
+
+
+def storable_violations(ds: xr.Dataset) -> list[str]:
+    """Return attributes that a NetCDF file cannot hold: it knows text, numbers and flat arrays of numbers."""
+    owners: list[tuple[str, Mapping[Any, Any]]] = [("", ds.attrs)]
+    owners += [(f"{name}: ", variable.attrs) for name, variable in ds.variables.items()]
+    return [
+        f"{owner}attribute '{name}': expected text, a number or a flat array of them; found {_what(value)}"
+        for owner, attrs in owners
+        for name, value in attrs.items()
+        if not _storable(value)
+    ]
+
+
+def _storable(value: Any) -> bool:
+    if isinstance(value, (str, int, float, np.integer, np.floating)):
+        return not isinstance(value, bool)
+    if isinstance(value, np.ndarray):
+        return value.ndim <= 1 and value.dtype.kind in "fiuU"
+    if isinstance(value, (list, tuple)):
+        kinds = {str if isinstance(item, str) else float for item in value}
+        return len(kinds) == 1 and all(not isinstance(item, (list, tuple)) and _storable(item) for item in value)
+    return False
+
+
+def _what(value: Any) -> str:
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return str(value)
+    return type(value).__name__
+
+
+def _dtype(variable: xr.Variable) -> str:
+    return "text" if variable.dtype.kind in "UTSO" else str(variable.dtype)
+
+
+def dims(variable: xr.Variable) -> str:
+    """Return the dimensions of a variable as text."""
+    return f"({', '.join(map(str, variable.dims))})"

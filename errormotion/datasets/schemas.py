@@ -1,0 +1,314 @@
+"""The schemas as data: one row a variable. Validation and the reference page both follow this table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from errormotion.kinematics.iso import DOF
+
+SCHEMA = "errormotion.errors/1"
+"""Schema of every error dataset."""
+
+SIGN = "actual minus commanded, tool side relative to workpiece side"
+"""The one sign convention, as it stands in the attribute ``sign``."""
+
+ERROR_DIMS = ("time", "position", "target", "beam")
+"""Dimensions that errors may have."""
+
+CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
+"""Channels of the five-sensor frame."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One variable of a schema.
+
+    Attributes
+    ----------
+    name : str
+    dims : tuple of str
+        ``...`` stands for the dimensions of the errors themselves.
+    unit : str
+        Inside unit; "1" for a pure number, "" where elements differ in unit or the values are text.
+    low, high : float
+        Plausible range, both ends allowed; infinite where there is none.
+    meaning : str
+    required : bool
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    unit: str
+    low: float
+    high: float
+    meaning: str
+    required: bool = True
+
+
+@dataclass(frozen=True)
+class RawSchema:
+    """What the raw dataset of one method holds; a method with two procedures has two.
+
+    Attributes
+    ----------
+    id : str
+        Value of the attribute ``schema``.
+    variant : str
+        Which procedure; empty where there is only one.
+    marker : str
+        Variable or dimension that only this variant has.
+    rows : tuple of Row
+    sizes : mapping of str to int
+        Dimensions of fixed length.
+    labels : mapping of str to tuple of str
+        Labels that a dimension must have, all of them and no other.
+    """
+
+    id: str
+    variant: str
+    marker: str
+    rows: tuple[Row, ...]
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Id and variant for people."""
+        return f"{self.id}, {self.variant}" if self.variant else self.id
+
+
+NO_LIMIT = float("inf")
+_PLACE = (-20.0, 20.0)  # m; the largest machine tools, and a place written in mm shows
+_READING = (-0.1, 0.1)  # m; point sensors
+_RADIUS = (0.0005, 0.1)  # m; bars and spheres
+_NOISE = (0.0, 1e-3)  # m
+_UNIT_VECTOR = (-1.000001, 1.000001)
+
+ERROR_ROWS = (
+    *(
+        Row(f"E{letter}", ("...",), "m", -0.1, 0.1, f"displacement of the functional point along {letter}")
+        for letter in "XYZ"
+    ),
+    *(
+        Row(f"E{letter}", ("...",), "rad", -0.2, 0.2, f"small rotation about {axis}")
+        for letter, axis in zip("ABC", "XYZ", strict=True)
+    ),
+    Row(
+        "covariance",
+        ("...", "dof", "dof_"),
+        "",
+        -NO_LIMIT,
+        NO_LIMIT,
+        "total covariance of the six freedoms at one place, influences included; m^2, m rad, rad^2",
+    ),
+    Row(
+        "influence",
+        ("source", "...", "dof"),
+        "",
+        -NO_LIMIT,
+        NO_LIMIT,
+        "signed effect of one standard uncertainty of a source that is one draw for many values; m, rad",
+        required=False,
+    ),
+    Row("source_group", ("source",), "", -NO_LIMIT, NO_LIMIT, "what a source belongs to in the budget", required=False),
+    Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "since the reference state, increasing", required=False),
+    *(
+        Row(name, ("position|target",), "m", *_PLACE, f"commanded {name.upper()}", required=False)
+        for name in ("x", "y", "z")
+    ),
+)
+
+ERROR_ATTRIBUTES = {
+    "schema": f"`{SCHEMA}`",
+    "component": "what moves wrongly: an axis (X, Y, Z, A, B, C, U, V, W), `spindle`, `tool` (the volume) or `beam`",
+    "machine": "which machine",
+    "frame": "coordinate system of the components",
+    "functional_point": "three coordinates in that frame, m",
+    "reference": "the state that the errors are relative to",
+    "method": "id of the method",
+    "method_version": "its version",
+    "sign": f"`{SIGN}`",
+    "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software, seed, steps",
+}
+
+_DIRECTION = {"direction": 3}
+_XYZ = {"direction": ("x", "y", "z")}
+
+RAW_SCHEMAS = (
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
+        "drift",
+        "time",
+        (
+            Row("distance", ("channel", "time"), "m", *_READING, "reading along the beam from its origin; NaN = none"),
+            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "increasing; or the attribute `sample_rate` (Hz)"),
+            Row("beam_origin", ("channel", "direction"), "m", *_PLACE, "where the reading is zero"),
+            Row("beam_direction", ("channel", "direction"), "1", *_UNIT_VECTOR, "unit vector from sensor to bar"),
+            Row(
+                "beam_covariance",
+                ("channel", "p", "p_"),
+                "",
+                -1e-2,
+                1e-2,
+                "of (origin, direction), one draw for the record; m^2, m, 1",
+                required=False,
+            ),
+            Row("bar_radius", (), "m", *_RADIUS, "of the bar at the side beams"),
+            Row("distance_noise", (), "m", *_NOISE, "standard deviation of one sample of `distance`"),
+            Row("level", ("height",), "m", *_PLACE, "z of the levels L1 and L2"),
+            Row("temperature", ("time", "sensor"), "degC", -60.0, 200.0, "NaN = unknown", required=False),
+            Row("spindle_speed", ("time",), "1/min", -5e5, 5e5, "NaN = unknown", required=False),
+        ),
+        sizes={**_DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
+        labels={**_XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
+    ),
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
+        "beam detection",
+        "step",
+        (
+            Row("distance", ("channel", "profile", "step"), "m", *_READING, "mean reading at rest; NaN = none"),
+            Row(
+                "sphere_centre",
+                ("channel", "profile", "step", "direction"),
+                "m",
+                *_PLACE,
+                "commanded centre of the sphere",
+            ),
+            Row("sphere_radius", (), "m", *_RADIUS, "of the calibrated sphere"),
+            Row("scan_direction", ("channel", "profile", "direction"), "1", *_UNIT_VECTOR, "of the steps"),
+            Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "of the beam, from the drawing"),
+            Row("nominal_direction", ("channel", "direction"), "1", *_UNIT_VECTOR, "of the beam, from the drawing"),
+            Row(
+                "distance_noise",
+                (),
+                "m",
+                *_NOISE,
+                "standard deviation of one value of `distance`",
+                required=False,
+            ),
+        ),
+        sizes={**_DIRECTION, "channel": 5},
+        labels={**_XYZ, "channel": CHANNELS},
+    ),
+    RawSchema(
+        "errormotion.raw.crossbeam_scan/1",
+        "",
+        "height",
+        (
+            Row(
+                "height",
+                ("cycle", "artefact", "profile", "point"),
+                "m",
+                -1.0,
+                1.0,
+                "surface in the profiler frame, float32 allowed; NaN = no value",
+            ),
+            Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
+            Row("y", ("cycle", "artefact", "profile"), "m", *_PLACE, "along the feed, profiler frame"),
+            Row("time", ("cycle",), "s", -NO_LIMIT, NO_LIMIT, "of the scan; cycle 0 is the cold one"),
+            Row("position", ("artefact",), "m", *_PLACE, "of the axis"),
+            Row("profiler_pose", ("row", "column"), "", *_PLACE, "homogeneous, profiler to tool frame; m, 1"),
+            Row("lever", ("direction",), "m", *_PLACE, "(x_y, 0, z_y): carriage to tool frame"),
+            Row("height_noise", (), "m", *_NOISE, "standard deviation of one height"),
+        ),
+        sizes={**_DIRECTION, "row": 4, "column": 4},
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.beam_direction/1",
+        "",
+        "stage",
+        (
+            Row("distance", ("plane", "reading"), "m", -2.0, 2.0, "reading along the beam; NaN = none"),
+            Row("stage", ("plane", "reading", "direction"), "m", *_PLACE, "place of the stage"),
+            Row("nominal_direction", ("direction",), "1", *_UNIT_VECTOR, "of the beam"),
+            Row("distance_noise", (), "m", *_NOISE, "standard deviation of one reading"),
+            Row(
+                "nominal_normal",
+                ("plane", "direction"),
+                "1",
+                *_UNIT_VECTOR,
+                "of each plane, for the inclination compensation",
+                required=False,
+            ),
+            Row(
+                "triangulation_normal",
+                ("direction",),
+                "1",
+                *_UNIT_VECTOR,
+                "of the sensor's triangulation plane, for the inclination compensation",
+                required=False,
+            ),
+        ),
+        sizes=_DIRECTION,
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.multilateration/1",
+        "",
+        "displacement",
+        (
+            Row("displacement", ("station", "target"), "m", -100.0, 100.0, "interferometer reading; NaN = beam broken"),
+            Row("target_nominal", ("target", "direction"), "m", -100.0, 100.0, "commanded place of the reflector"),
+            Row("station_nominal", ("station", "direction"), "m", -100.0, 100.0, "rough place of the tracker"),
+            Row("displacement_noise", (), "m", *_NOISE, "standard deviation of one reading"),
+        ),
+        sizes=_DIRECTION,
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.normal_vector/1",
+        "centres",
+        "centre",
+        (
+            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "of the probing, increasing"),
+            Row("centre", ("time", "ball", "direction"), "m", *_PLACE, "of each ball; NaN = not probed"),
+            Row(
+                "centre_covariance",
+                ("time", "ball", "direction", "direction_"),
+                "m^2",
+                -1e-4,
+                1e-4,
+                "of each centre",
+                required=False,
+            ),
+        ),
+        sizes={**_DIRECTION, "direction_": 3},
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.normal_vector/1",
+        "touches",
+        "touch",
+        (
+            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "of the probing, increasing"),
+            Row("touch", ("time", "ball", "touch", "direction"), "m", *_PLACE, "centre of the tip at each contact"),
+            Row("tip_radius", (), "m", 1e-4, 0.05, "of the probe"),
+        ),
+        sizes=_DIRECTION,
+        labels=_XYZ,
+    ),
+)
+"""Every raw schema; `variants` finds those of one id."""
+
+
+def variants(schema: str) -> tuple[RawSchema, ...]:
+    """Return the raw schemas of one id, none for an unknown id."""
+    return tuple(raw for raw in RAW_SCHEMAS if raw.id == schema)
+
+
+__all__ = [
+    "CHANNELS",
+    "DOF",
+    "ERROR_ATTRIBUTES",
+    "ERROR_DIMS",
+    "ERROR_ROWS",
+    "RAW_SCHEMAS",
+    "SCHEMA",
+    "SIGN",
+    "RawSchema",
+    "Row",
+    "variants",
+]
