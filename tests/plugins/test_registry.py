@@ -1,0 +1,134 @@
+"""The registry finds plugins of any distribution, and a broken one harms nobody."""
+
+import sys
+
+import pytest
+
+from errormotion import plugins
+from errormotion.errors import PluginError
+
+GOOD = """
+from errormotion.plugins import InstrumentInfo, PluginSettings
+
+class Good:
+    info = InstrumentInfo("{id}", "point_lds", "A sensor from elsewhere", "simulated_only")
+    Settings = PluginSettings
+    def open(self): ...
+    def close(self): ...
+    def identify(self): ...
+    def read(self): ...
+"""
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Put a distribution on the path, as pip would leave it: a dist-info folder and a module."""
+
+    names = []
+
+    def install(name, entry_points, module=""):
+        names.append(name)
+        folder = tmp_path / name
+        info = folder / f"{name}-1.2.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.2\n")
+        (info / "entry_points.txt").write_text(entry_points)
+        (folder / f"{name}.py").write_text(module)
+        monkeypatch.syspath_prepend(folder)
+        plugins.refresh()
+        return folder
+
+    yield install
+    monkeypatch.undo()
+    for name in names:
+        sys.modules.pop(name, None)
+    plugins.refresh()
+
+
+def instrument(plugin_id, target):
+    return f"[errormotion.instruments]\n{plugin_id} = {target}\n"
+
+
+def by_id(group="instruments"):
+    return {plugin.id: plugin for plugin in plugins.available(group)}
+
+
+def test_the_built_in_plugins_come_through_the_same_door():
+    assert {"optoncdt", "five_sensor_frame", "virtual_controller", "dcon_temperature"} <= by_id().keys()
+    assert "spindle_drift" in by_id("methods")
+    assert by_id()["optoncdt"].distribution.startswith("errormotion ")
+
+
+def test_a_foreign_plugin_stands_beside_them_with_its_distribution(install):
+    install("elsewhere", instrument("good", "elsewhere:Good"), GOOD.format(id="good"))
+    plugin = by_id()["good"]
+    assert (plugin.error, plugin.distribution) == ("", "elsewhere 1.2")
+    assert plugins.get("instruments", "good") is plugin.cls
+
+
+@pytest.mark.parametrize(
+    ("module", "complaint"),
+    [
+        ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("class Good: pass", "expected a class with an `info` of type InstrumentInfo, found None"),
+        ("Worse = 1", "AttributeError"),
+        (GOOD.format(id="better"), "the entry point is called 'broken' but the class calls itself 'better'"),
+        (GOOD.format(id="broken").replace("def read", "def reed"), "class Good lacks read"),
+        ("def", "SyntaxError"),
+    ],
+)
+def test_a_broken_plugin_is_listed_with_its_error_and_harms_nobody(install, module, complaint):
+    install("elsewhere", instrument("good", "elsewhere:Good"), GOOD.format(id="good"))
+    install("wreck", instrument("broken", "wreck:Good"), module)
+    listed = by_id()
+    assert listed["good"].error == ""
+    assert complaint in listed["broken"].error
+    assert listed["broken"].traceback.startswith("Traceback")
+    with pytest.raises(PluginError, match=r"'broken' \(wreck 1.2\) does not load"):
+        plugins.get("instruments", "broken")
+
+
+def test_a_list_of_entry_points_that_cannot_be_read_is_named_and_harms_nobody(install):
+    install("scrawl", "[errormotion.instruments]\nthis line has no equals sign\n")
+    assert "entry_points.txt cannot be read" in by_id()["scrawl"].error
+    assert "optoncdt" in by_id()
+
+
+def test_a_folder_without_metadata_harms_nobody(install):
+    folder = install("bare", instrument("good", "bare:Good"), GOOD.format(id="good"))
+    (folder / "bare-1.2.dist-info" / "METADATA").unlink()
+    plugins.refresh()
+    assert by_id()["good"].error == ""
+    assert "optoncdt" in by_id()
+
+
+def test_two_distributions_that_claim_one_id_are_both_named(install):
+    install("one", instrument("good", "one:Good"), GOOD.format(id="good"))
+    install("two", instrument("good", "two:Good"), GOOD.format(id="good"))
+    rivals = [plugin for plugin in plugins.available("instruments") if plugin.id == "good"]
+    assert len(rivals) == 2
+    assert all("one 1.2" in plugin.error and "two 1.2" in plugin.error for plugin in rivals)
+    with pytest.raises(PluginError, match="Several distributions claim the instrument 'good'"):
+        plugins.get("instruments", "good")
+
+
+def test_an_unknown_id_names_the_nearest():
+    with pytest.raises(PluginError, match=r"Did you mean 'optoncdt'\?"):
+        plugins.get("instruments", "optonct")
+
+
+def test_getting_one_plugin_loads_no_other(install):
+    install("elsewhere", instrument("good", "elsewhere:Good"), GOOD.format(id="good"))
+    install("bystander", instrument("other", "bystander:Good"), GOOD.format(id="other"))
+    plugins.get("instruments", "good")
+    assert "bystander" not in sys.modules
+
+
+def test_what_was_installed_meanwhile_is_seen_after_a_refresh(install, tmp_path):
+    folder = install("elsewhere", "", GOOD.format(id="late"))
+    assert "late" not in by_id()
+    (folder / "elsewhere-1.2.dist-info" / "entry_points.txt").write_text(instrument("late", "elsewhere:Good"))
+    assert "late" not in by_id()
+    plugins.refresh()
+    assert by_id()["late"].error == ""
