@@ -1,0 +1,213 @@
+"""Drawing for the page: one style, curves thinned to what the eye sees, and SVG that can stand inside HTML."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+#: Okabe and Ito's colours, told apart with every kind of colour vision; the lightest is left out.
+BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
+    "#0072B2",
+    "#56B4E9",
+    "#D55E00",
+    "#E69F00",
+    "#009E73",
+    "#CC79A7",
+    "#222222",
+)
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE, BLACK)
+DASHES: tuple[tuple[float, ...] | None, ...] = (None, (5, 2), (1.5, 1.5), (6, 2, 1.5, 2))
+WIDTH = 6.9  # inch: the text width of an A4 page
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "errormotion",
+    "text.parse_math": False,
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "#444444",
+    "axes.labelcolor": "#222222",
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.1,
+    "lines.solid_joinstyle": "round",
+    "legend.frameon": False,
+    "legend.fontsize": 7.5,
+    "path.simplify": False,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Hold the report's style; foreign glyphs and mathematics in names are shown as they are."""
+    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
+        yield
+
+
+def draw(paint: Callable[[Figure], None], key: str, height: float, width: float = WIDTH) -> Markup:
+    """Return the SVG of a figure that ``paint`` fills; ``key`` keeps its identifiers apart from other figures'."""
+    with style():
+        figure = Figure(figsize=(width, height), layout="constrained")
+        paint(figure)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return inline(buffer.getvalue(), key)
+
+
+def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.ndarray, np.ndarray]:
+    """Return (t, y) with at most two points a bin, the lowest and the highest in their order.
+
+    Parameters
+    ----------
+    time, values : ndarray, (n,)
+        ``values`` may hold NaN; a bin of nothing else stays as one NaN, so that the gap is seen.
+    """
+    if values.size <= 2 * bins:
+        return time, values
+    t, y = [], []
+    for part in np.array_split(np.arange(values.size), bins):
+        known = part[np.isfinite(values[part])]
+        if known.size == 0:
+            picks = part[:1]
+        else:
+            picks = np.unique([known[np.argmin(values[known])], known[np.argmax(values[known])]])
+        t.append(time[picks])
+        y.append(values[picks])
+    return np.concatenate(t), np.concatenate(y)
+
+
+def envelope(
+    time: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int = 300
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (t, lowest, highest) of a band in each bin; NaN where a bin holds nothing."""
+    if time.size <= bins:
+        return time, low, high
+    parts = np.array_split(np.arange(time.size), bins)
+    below, above = np.where(np.isnan(low), np.inf, low), np.where(np.isnan(high), -np.inf, high)
+    lowest = np.array([below[part].min() for part in parts])
+    highest = np.array([above[part].max() for part in parts])
+    middle = np.array([time[part].mean() for part in parts])
+    middle[0], middle[-1] = time[0], time[-1]
+    return middle, np.where(np.isinf(lowest), np.nan, lowest), np.where(np.isinf(highest), np.nan, highest)
+
+
+def curve(
+    axes: Axes,
+    time: np.ndarray,
+    values: np.ndarray,
+    expanded: np.ndarray | None = None,
+    *,
+    colour: str,
+    dash: tuple[float, ...] | None = None,
+    width: float = 1.1,
+) -> None:
+    """Draw one curve and, where an expanded uncertainty is given, its band."""
+    if expanded is not None and np.isfinite(expanded).any():
+        t, low, high = envelope(time, values - expanded, values + expanded)
+        axes.fill_between(t, low, high, color=colour, alpha=0.22, linewidth=0)
+    t, y = decimate(time, values)
+    axes.plot(t, y, color=colour, linewidth=width, linestyle=(0, dash) if dash else "-")
+
+
+def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
+    """Write the names of curves at their right ends, kept apart from one another.
+
+    Parameters
+    ----------
+    ends : list of (y, name, colour)
+        y in data units; NaN is set at the middle.
+    """
+    low, high = axes.get_ylim()
+    bounds = axes.get_position().height * axes.figure.get_figheight() * 72  # type: ignore[union-attr]
+    least = 9.5 / max(bounds, 1.0) * (high - low)
+    placed: list[float] = []
+    ordered = sorted(((y if np.isfinite(y) else (low + high) / 2), name, colour) for y, name, colour in ends)
+    for y, _, _ in ordered:
+        placed.append(max(y, placed[-1] + least) if placed else y)
+    shift = (sum(placed) - sum(y for y, _, _ in ordered)) / max(len(placed), 1)
+    for y, (_, name, colour) in zip(placed, ordered, strict=True):
+        axes.annotate(
+            name,
+            (1.0, y - shift),
+            xycoords=("axes fraction", "data"),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            color=colour,
+            fontweight="bold",
+            annotation_clip=False,
+        )
+
+
+def inline(svg: str, key: str) -> Markup:
+    """Return an SVG file as an element for HTML: no namespaces, metadata, style sheet, foreign fonts or loose ids."""
+    root = ElementTree.fromstring(svg)
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+        element.attrib = {name.rpartition("}")[2]: value for name, value in element.attrib.items()}
+    for parent in list(root.iter()):
+        for child in [child for child in parent if child.tag in ("metadata", "style")]:
+            parent.remove(child)
+    text = ElementTree.tostring(root, encoding="unicode")
+    wanted = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
+    for element in root.iter():
+        attributes = element.attrib
+        if "id" in attributes:
+            name = attributes.pop("id")
+            if name in wanted:
+                attributes["id"] = f"{key}-{name}"
+        if "href" in attributes:
+            attributes["href"] = f"#{key}-{attributes['href'].lstrip('#')}"
+        if "d" in attributes:
+            attributes["d"] = _short(attributes["d"])
+        for name in ("clip-path", "style"):
+            if name in attributes:
+                attributes[name] = attributes[name].replace("url(#", f"url(#{key}-")
+        if "style" in attributes:
+            attributes["style"] = _font(attributes["style"])
+    for name in ("width", "height", "version"):
+        root.attrib.pop(name, None)
+    root.set("aria-hidden", "true")
+    return Markup(ElementTree.tostring(root, encoding="unicode"))
+
+
+def _short(path: str) -> str:
+    """Path data with a hundredth of a point, which is finer than any printer."""
+    numbers = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), path)
+    return re.sub(r"\s+", " ", numbers).strip()
+
+
+def _font(text: str) -> str:
+    """Return a style whose font family is left to the page."""
+    return re.sub(
+        r"font: ((?:(?:bold|italic|\d+) )*)([\d.]+px) [^;]*",
+        lambda found: (
+            f"font-size: {found[2]}"
+            + ("; font-weight: bold" if re.search(r"bold|[6-9]00", found[1]) else "")
+            + ("; font-style: italic" if "italic" in found[1] else "")
+        ),
+        text,
+    )

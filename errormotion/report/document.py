@@ -1,0 +1,132 @@
+"""What a report is made of: parts, sections and blocks, free of any look.
+
+Builders make these from datasets; the templates turn them into a page. Text is plain text: the template escapes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import xarray as xr
+from markupsafe import Markup
+
+from errormotion.report.text import DASH, rounded
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table: text, perhaps an expanded uncertainty, or the reason why there is nothing."""
+
+    text: str | Markup
+    uncertainty: str = ""
+    reason: str = ""
+
+
+def estimate(
+    value: float, expanded: float, *, reason: str = "", signed: bool = True, unit: str = "", digits: int = 4
+) -> Cell:
+    """Return a value with its expanded uncertainty, both rounded together; a dash with its reason where it is NaN."""
+    text, uncertainty = rounded(value, expanded, signed=signed, digits=digits)
+    if text == DASH:
+        return Cell(DASH, reason=reason or "not determined")
+    suffix = f" {unit}" if unit else ""
+    if uncertainty == DASH:
+        return Cell(text + suffix, reason="no uncertainty is stated for this value")
+    return Cell(text, uncertainty + suffix)
+
+
+def or_dash(text: str, reason: str) -> Cell:
+    """Return a cell of this text; where the text is a dash, with the reason for it."""
+    return Cell(text, reason=reason if text == DASH else "")
+
+
+@dataclass(frozen=True)
+class Text:
+    """One paragraph; ``kind`` is ``plain``, ``note`` or ``warning``."""
+
+    text: str
+    kind: str = "plain"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a head (one or two rows), a caption, and footnotes collected from its cells."""
+
+    caption: str
+    head: Sequence[str | Markup]
+    rows: Sequence[Sequence[Cell | str]]
+    groups: Sequence[tuple[str | Markup, int]] = ()
+    numeric: bool = True
+    notes: Sequence[str] = ()
+
+    @property
+    def footnotes(self) -> dict[str, str]:
+        """Mark of every reason that stands in a cell, in reading order: a, b, c ..."""
+        reasons = (cell.reason for row in self.rows for cell in row if isinstance(cell, Cell) and cell.reason)
+        return {reason: _mark(i) for i, reason in enumerate(dict.fromkeys(reasons))}
+
+
+def _mark(index: int) -> str:
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    more, last = divmod(index, 26)
+    return (letters[more - 1] if more else "") + letters[last]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A drawing as inline SVG, with a caption and with words for those who cannot see it."""
+
+    svg: Markup
+    caption: str
+    alt: str
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One of the few numbers that matter, for the head of the report."""
+
+    label: str
+    value: Cell
+    unit: str
+    note: str = ""
+
+
+Block = Text | Table | Figure
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled run of blocks; ``name`` is its anchor in the page."""
+
+    name: str
+    title: str
+    blocks: Sequence[Block]
+    page_break: bool = False
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one error dataset contributes."""
+
+    title: str
+    key_figures: Sequence[KeyFigure]
+    summary: Sequence[str]
+    sections: Sequence[Section]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a builder works from: one error dataset, and what else is known of the measurement."""
+
+    errors: xr.Dataset
+    raw: xr.Dataset | None = None
+    run: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Effective settings of the method, as the provenance holds them; empty where it holds none."""
+        settings = self.provenance.get("settings")
+        return settings if isinstance(settings, Mapping) else {}

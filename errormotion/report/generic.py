@@ -1,0 +1,201 @@
+"""The chapter of any error dataset: its six error motions over its dims, with their bands."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+
+from errormotion.kinematics.iso import iso_names
+from errormotion.report import budget, canvas, provenance, quality
+from errormotion.report.document import (
+    Block,
+    Cell,
+    Figure,
+    KeyFigure,
+    Part,
+    Section,
+    Source,
+    Table,
+    Text,
+    estimate,
+    or_dash,
+)
+from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, listed, percent
+
+_MOST = 5  # curves drawn of a further dim
+
+
+def part(source: Source, key: str) -> Part:
+    """Return the chapter of one error dataset of any component; ``key`` keeps its figures' identifiers apart."""
+    errors = source.errors
+    component = str(errors.attrs.get("component", "unknown"))
+    return Part(
+        f"Errors of component {component}",
+        _key_figures(errors),
+        _summary(errors),
+        [
+            Section("errors", "Error motions", _curves(errors, key)),
+            Section("uncertainty", "Uncertainty", _uncertainty(errors)),
+            Section("quality", "Data quality", [*quality.sentences(errors, source.raw), _further(errors)]),
+            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
+        ],
+    )
+
+
+def names_of(errors: xr.Dataset) -> dict[str, str]:
+    """Return the ISO 230-1 names of the component's freedoms; the freedoms' own where the standard has none."""
+    try:
+        return iso_names(str(errors.attrs.get("component", "")))
+    except ValueError:
+        return {name: name for name in budget.FREEDOMS}
+
+
+def unit_at(index: int) -> tuple[str, float]:
+    """Return the field unit of a freedom by its index, and its size in SI."""
+    return UM if index < 3 else SECOND_OF_ARC
+
+
+def _dims(errors: xr.Dataset) -> tuple[str, ...]:
+    return tuple(str(dim) for dim in errors["EX"].dims)
+
+
+def _sigma(errors: xr.Dataset, index: int) -> np.ndarray:
+    variance = errors["covariance"].isel(dof=index, dof_=index).transpose(*_dims(errors)).values
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
+def _worst(errors: xr.Dataset, index: int) -> tuple[float, float]:
+    """Value and standard uncertainty in SI where a freedom's error is largest; NaN where it is unknown."""
+    values = errors[budget.FREEDOMS[index]].values.ravel()
+    if not np.isfinite(values).any():
+        return math.nan, math.nan
+    place = int(np.nanargmax(np.abs(values)))
+    return float(values[place]), float(_sigma(errors, index).ravel()[place])
+
+
+def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
+    names, found = names_of(errors), []
+    for i, freedom in enumerate(budget.FREEDOMS):
+        unit, size = unit_at(i)
+        value, sigma = _worst(errors, i)
+        if math.isfinite(value):
+            found.append(KeyFigure(names[freedom], estimate(value / size, 2 * sigma / size), unit, "largest"))
+    return found
+
+
+def _summary(errors: xr.Dataset) -> list[str]:
+    names = names_of(errors)
+    seen = [name for name in budget.FREEDOMS if np.isfinite(errors[name].values).any()]
+    unseen = [name for name in budget.FREEDOMS if name not in seen]
+    places = " × ".join(f"{errors.sizes[dim]} ({dim})" for dim in _dims(errors)) or "one place"
+    words = [f"Observed: {listed([names[name] for name in seen]) or 'nothing'}, at {places}."]
+    if unseen:
+        words.append(f"Not observed: {listed([names[name] for name in unseen])}. Reported as unknown, not as zero.")
+    return words
+
+
+def _abscissa(errors: xr.Dataset, dim: str) -> tuple[np.ndarray, str]:
+    """Return what the errors are drawn over along a dim, and its name with the unit."""
+    size = errors.sizes[dim]
+    if dim == "time" and "time" in errors.coords:
+        return np.asarray(errors["time"].values, float) / 60, "time / min"
+    for axis in (str(errors.attrs.get("component", "")).lower(), "x", "y", "z"):
+        if axis in errors.coords and errors[axis].dims == (dim,) and np.ptp(errors[axis].values) > 0:
+            return 1e3 * np.asarray(errors[axis].values, float), f"{axis} / mm"
+    if dim in errors.coords and errors[dim].dtype.kind in "iuf":
+        scale, unit = (1e3, "mm") if dim == "position" else (1.0, "1")
+        return scale * np.asarray(errors[dim].values, float), f"{dim} / {unit}"
+    return np.arange(1.0, size + 1), f"number of {dim}"
+
+
+def _curves(errors: xr.Dataset, key: str) -> list[Block]:
+    dims = _dims(errors)
+    if not dims:
+        return [budget.twist_table(errors, {"value": errors}, names_of(errors))]
+    along = max(dims, key=lambda dim: (dim == "time", errors.sizes[dim]))
+    others = [dim for dim in dims if dim != along]
+    flat = errors[[*budget.FREEDOMS, "covariance"]]
+    flat = flat.stack(other_=others, create_index=False) if others else flat.expand_dims("other_", -1)
+    picks = np.unique(np.linspace(0, flat.sizes["other_"] - 1, _MOST).astype(int))
+    x, label = _abscissa(errors, along)
+    if np.any(np.diff(x) < 0):
+        order = np.argsort(x, kind="stable")
+        x, flat = x[order], flat.isel({along: order})
+    names = names_of(errors)
+
+    def paint(figure: Canvas) -> None:
+        panels = figure.subplots(3, 2, sharex=True)
+        for i, freedom in enumerate(budget.FREEDOMS):
+            axes: Axes = panels[i % 3, i // 3]
+            unit, size = unit_at(i)
+            values = flat[freedom].transpose("other_", along).values / size
+            variance = flat["covariance"].isel(dof=i, dof_=i).transpose("other_", along).values
+            expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan)) / size
+            axes.set_title(names[freedom])
+            axes.set_ylabel(unit)
+            if not np.isfinite(values).any():
+                axes.text(0.5, 0.5, "not observed", transform=axes.transAxes, ha="center", va="center", color="#555555")
+                continue
+            for place, pick in enumerate(picks):
+                canvas.curve(axes, x, values[pick], expanded[pick], colour=canvas.COLOURS[place % len(canvas.COLOURS)])
+            if x.size == 1:
+                axes.errorbar(x, values[picks[0]], expanded[picks[0]], fmt="o", markersize=3, color=canvas.BLUE)
+        for axes in panels[-1]:
+            axes.set_xlabel(label)
+
+    shown = f" {len(picks)} of {flat.sizes['other_']} curves over {listed(others)} are shown." if others else ""
+    caption = f"Error motions over {along}, actual minus commanded. Bands: expanded uncertainty, k = 2.{shown}"
+    spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(budget.FREEDOMS))
+    return [Figure(canvas.draw(paint, f"{key}-errors", 5.2), caption, f"Error motions over {along}: {spans}.")]
+
+
+def _span(errors: xr.Dataset, name: str, index: int) -> str:
+    unit, size = unit_at(index)
+    values = errors[name].values / size
+    if not np.isfinite(values).any():
+        return "not observed"
+    return f"{fixed(finite(np.min, values), 2)} to {fixed(finite(np.max, values), 2)} {unit}"
+
+
+def _uncertainty(errors: xr.Dataset) -> list[Block]:
+    names = names_of(errors)
+    rows: list[list[Cell | str]] = []
+    for i, freedom in enumerate(budget.FREEDOMS):
+        unit, size = unit_at(i)
+        values, expanded = errors[freedom].values / size, 2 * _sigma(errors, i) / size
+        spans = (finite(np.min, values), finite(np.max, values), finite(np.median, expanded), finite(np.max, expanded))
+        cells = [or_dash(fixed(value, 2, signed=j < 2), "not observed by this method") for j, value in enumerate(spans)]
+        rows.append([names[freedom], unit, *cells, percent(float(np.isfinite(values).mean()))])
+    blocks: list[Block] = [
+        Table(
+            "Span of the error motions and their expanded uncertainty, k = 2.",
+            ["error", "unit", "lowest", "highest", "U, median", "U, largest", "determined"],
+            rows,
+        )
+    ]
+    dims = _dims(errors)
+    if "influence" in errors:
+        blocks.append(budget.table(errors.isel(dict.fromkeys(dims, -1)), "at the last place" if dims else ""))
+    return blocks
+
+
+def _further(errors: xr.Dataset) -> Block:
+    """List what else the dataset holds, so that nothing rides along unseen."""
+    known = {*budget.FREEDOMS, "covariance", "influence"}
+    rows: list[list[Cell | str]] = []
+    for name, variable in errors.data_vars.items():
+        if name in known:
+            continue
+        span = ""
+        if variable.dtype.kind in "iuf" and np.isfinite(np.asarray(variable.values, float)).any():
+            values = np.asarray(variable.values, float)
+            span = f"{finite(np.min, values):.4g} to {finite(np.max, values):.4g}"
+        shape = ", ".join(f"{dim} {variable.sizes[dim]}" for dim in variable.dims) or "scalar"
+        rows.append([str(name), shape, str(variable.attrs.get("units", "")), span])
+    if not rows:
+        return Text("The result holds nothing beyond the six error motions and their covariance.", "note")
+    return Table("Further results in the dataset, in SI units.", ["name", "dims", "unit", "span"], rows, numeric=False)

@@ -1,0 +1,134 @@
+"""Where the numbers come from: instruments, settings, software, hashes; and whether any of it was simulated."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import xarray as xr
+
+from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.text import DASH
+
+_ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
+_INSTRUMENT = ("name", "manufacturer", "model", "serial_number", "firmware", "address", "calibration")
+
+
+def read(errors: xr.Dataset) -> dict[str, Any]:
+    """Return the provenance of a dataset; what is no JSON object comes back under ``text``."""
+    text = errors.attrs.get("provenance", "{}")
+    if isinstance(text, Mapping):
+        return dict(text)
+    try:
+        found = json.loads(text)
+    except (TypeError, ValueError):
+        return {"text": str(text)}
+    return found if isinstance(found, dict) else {"text": str(text)}
+
+
+def simulated(*sources: Any) -> str:
+    """Return why the data count as simulated, from anything nested; empty where nothing says so."""
+    for source in sources:
+        for path, value in walk(source):
+            if isinstance(value, str) and value.strip().lower().startswith("sim://"):
+                return f"instrument address {value.strip()}"
+            if path and path[-1] == "simulated" and (value is True or value == 1 or str(value).lower() == "true"):
+                return "the provenance marks them as simulated"
+    return ""
+
+
+def replayed(*sources: Any) -> str:
+    """Return the address of a recording that was played back; empty where there is none."""
+    for source in sources:
+        for _, value in walk(source):
+            if isinstance(value, str) and value.strip().lower().startswith("replay://"):
+                return value.strip()
+    return ""
+
+
+def walk(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield every leaf of nested mappings and sequences with its path; long lists of numbers are one leaf."""
+    if isinstance(value, Mapping) and value:
+        for key, entry in value.items():
+            yield from walk(entry, (*path, str(key)))
+    elif isinstance(value, (list, tuple)) and any(isinstance(entry, (Mapping, list, tuple, str)) for entry in value):
+        for i, entry in enumerate(value):
+            yield from walk(entry, (*path, str(i + 1)))
+    else:
+        yield path, value
+
+
+def instruments(provenance: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the instruments as flat rows of text; channels of a frame follow the frame itself."""
+    entries = provenance.get("instruments")
+    if isinstance(entries, Mapping):
+        entries = [{"name": name, **entry} for name, entry in entries.items() if isinstance(entry, Mapping)]
+    if not isinstance(entries, (list, tuple)):
+        return []
+    rows = []
+    for entry in entries:
+        if isinstance(entry, Mapping):
+            flat = {**entry, **(entry["identity"] if isinstance(entry.get("identity"), Mapping) else {})}
+            flat.setdefault("name", flat.get("id", flat.get("driver", flat.get("kind", ""))))
+            flat.setdefault("serial_number", flat.get("serial", ""))
+            rows.append({name: text(flat[name]) if flat.get(name) else "" for name in _INSTRUMENT})
+    return rows
+
+
+def instrument_table(provenance: Mapping[str, Any]) -> Table | None:
+    """Return the table of instruments; None where the provenance names none."""
+    rows = instruments(provenance)
+    if not rows:
+        return None
+    none = Cell(DASH, reason="not recorded")
+    return Table(
+        "Instruments.",
+        ["instrument", "manufacturer", "model", "serial number", "firmware", "address", "calibration"],
+        [[row[name] or none for name in _INSTRUMENT] for row in rows],
+        numeric=False,
+    )
+
+
+def blocks(errors: xr.Dataset, provenance: Mapping[str, Any]) -> list[Block]:
+    """Return the provenance as tables: instruments, settings, and the rest."""
+    found: list[Block] = []
+    table = instrument_table(provenance)
+    found.append(table if table is not None else Text("The provenance names no instrument.", "note"))
+    settings = [[name, value] for name, value in _flat(provenance.get("settings", {}))]
+    if settings:
+        found.append(
+            Table(
+                "Effective settings of the method, defaults included, in SI units.",
+                ["setting", "value"],
+                settings,
+                numeric=False,
+            )
+        )
+    attributes = [[name.replace("_", " "), text(errors.attrs[name])] for name in _ATTRIBUTES if name in errors.attrs]
+    rest = {name: value for name, value in provenance.items() if name not in ("settings", "instruments")}
+    found.append(
+        Table("Result, software and data.", ["item", "value"], [*attributes, *map(list, _flat(rest))], numeric=False)
+    )
+    return found
+
+
+def _flat(value: Any) -> list[tuple[str, str]]:
+    return [(".".join(path) or "value", text(leaf)) for path, leaf in walk(value)]
+
+
+def text(value: Any) -> str:
+    """Return a leaf of the provenance in words; an absent one as a dash."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if value is None or value == "" or (isinstance(value, (list, tuple, dict)) and not value):
+        return DASH
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(text(entry) for entry in value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {text(entry)}" for key, entry in value.items())
+    return str(value)

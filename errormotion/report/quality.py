@@ -1,0 +1,118 @@
+"""Data quality: what share of the samples was valid, what is missing, and where the gaps are."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.series import minutes_of
+from errormotion.report.text import DASH, finite, fixed, integer, minutes, percent
+
+
+def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
+    """Return the number of gaps and the length of the longest in the unit of time.
+
+    Parameters
+    ----------
+    valid : ndarray of bool, (n,)
+        Whether an instant has any valid sample.
+    time : ndarray, (n,)
+    """
+    if valid.size < 2 or valid.all():
+        return 0, 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], valid, [True]]).astype(np.int8)))
+    starts, ends = edges[::2], edges[1::2]
+    step = float(np.median(np.diff(time)))
+    longest = max(time[stop - 1] - time[start] for start, stop in zip(starts, ends, strict=True))
+    return len(starts), float(longest) + step
+
+
+def table(errors: xr.Dataset) -> Table | None:
+    """Return the table of validity and residuals by channel; None where the dataset holds neither."""
+    if "valid_fraction" not in errors and "fit_residual" not in errors:
+        return None
+    holder = errors["valid_fraction" if "valid_fraction" in errors else "fit_residual"]
+    time = minutes_of(errors)
+    rows: list[list[Cell | str]] = []
+    for i, name in enumerate(holder["channel"].values):
+        rows.append([str(name), *_validity(errors, i, time), *_residual(errors, i)])
+    return Table(
+        "Validity of the samples and residuals of the fit, by channel. A gap is a run of instants without one valid "
+        "sample. Residual: reading minus the reading that the fitted bar predicts.",
+        ["channel", "valid samples", "lowest instant", "gaps", "longest gap", "rms / µm", "largest / µm"],
+        rows,
+        [("", 1), ("validity", 4), ("residual", 2)],
+    )
+
+
+def _validity(errors: xr.Dataset, i: int, time: np.ndarray) -> list[Cell | str]:
+    if "valid_fraction" not in errors:
+        return [Cell(DASH, reason="validity is not part of this result")] * 4
+    fraction = errors["valid_fraction"].transpose("channel", "time").values[i]
+    count, longest = gaps(np.nan_to_num(fraction) > 0, time)
+    lowest = finite(np.min, fraction)
+    return [
+        percent(finite(np.mean, fraction)),
+        percent(lowest),
+        integer(count),
+        minutes(60 * longest) if count else "none",
+    ]
+
+
+def _residual(errors: xr.Dataset, i: int) -> list[Cell | str]:
+    if "fit_residual" not in errors:
+        return [Cell(DASH, reason="residuals are not part of this result")] * 2
+    residual = errors["fit_residual"].transpose("channel", "time").values[i] * 1e6
+    if not np.isfinite(residual).any():
+        return [Cell(DASH, reason="no instant with a residual")] * 2
+    return [fixed(math.sqrt(finite(np.mean, residual**2)), 3), fixed(finite(np.max, np.abs(residual)), 3)]
+
+
+def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
+    """Return what is to be said of completeness: instants, gaps in time, and what the raw dataset counted."""
+    blocks: list[Block] = []
+    time = np.asarray(errors["time"].values, float) if "time" in errors.coords else np.array([])
+    if time.size > 2:
+        step = np.diff(time)
+        usual = float(np.median(step))
+        holes = np.flatnonzero(step > 1.5 * usual)
+        words = f"{integer(time.size)} instants, one every {fixed(usual, 3).rstrip('0').rstrip('.')} s"
+        if holes.size:
+            words += f"; the time axis has {len(holes)} gap(s), the longest {minutes(float(step[holes].max()))}"
+        blocks.append(Text(f"{words}."))
+    seen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if np.isfinite(errors[name].values).any()]
+    for name in seen:
+        known = float(np.isfinite(errors[name].values).mean())
+        if known < 1:
+            blocks.append(Text(f"{name} is determined at {percent(known)} of the instants.", "warning"))
+    counted = counts(raw) if raw is not None else {}
+    if counted:
+        words = ", ".join(f"{name} {number}" for name, number in counted.items())
+        blocks.append(Text(f"Counted while measuring: {words}."))
+    return blocks
+
+
+def counts(raw: xr.Dataset) -> dict[str, str]:
+    """Return what a raw dataset says of dropped, missing and invalid samples, by name."""
+    found = {}
+    if "dropped" in raw.attrs:
+        found["dropped samples"] = integer(float(raw.attrs["dropped"]))
+    for reason, number in _reasons(raw.attrs.get("invalid")).items():
+        found[f"invalid because of {str(reason).replace('_', ' ')}"] = integer(float(number))
+    return found
+
+
+def _reasons(invalid: Any) -> Mapping[str, Any]:
+    """Return reason to count, from a mapping or its JSON text."""
+    if isinstance(invalid, str):
+        try:
+            invalid = json.loads(invalid)
+        except ValueError:
+            return {}
+    return invalid if isinstance(invalid, Mapping) else {}

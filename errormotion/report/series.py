@@ -1,0 +1,133 @@
+"""The seven quantities of a spindle test as curves: displacements at two levels, Z, and two tilts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.report.document import Source
+from errormotion.report.text import SECOND_OF_ARC, UM
+
+QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")
+WHAT = {
+    "X1": "displacement in X at level L1",
+    "X2": "displacement in X at level L2",
+    "Y1": "displacement in Y at level L1",
+    "Y2": "displacement in Y at level L2",
+    "Z": "displacement in Z at the end face",
+    "A": "tilt about X",
+    "B": "tilt about Y",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One quantity over time in SI, with its standard uncertainty; both (time,), NaN where not determined."""
+
+    name: str
+    values: np.ndarray
+    uncertainty: np.ndarray
+
+    @property
+    def unit(self) -> tuple[str, float]:
+        """Field unit and its size in SI."""
+        return unit_of(self.name)
+
+
+def unit_of(quantity: str) -> tuple[str, float]:
+    """Return the field unit of an ISO 230-3 quantity and its size in SI."""
+    return SECOND_OF_ARC if quantity in ("A", "B") else UM
+
+
+def curves(errors: xr.Dataset) -> dict[str, Curve]:
+    """Return the seven quantities by name; NaN where the dataset does not hold one."""
+    n = errors.sizes.get("time", 0)
+    nothing = np.full(n, np.nan)
+    found = dict.fromkeys(QUANTITIES, (nothing, nothing))
+    if "displacement" in errors:
+        moved = errors["displacement"].transpose("level", "lateral", "time")
+        sigma = errors["displacement_u"].transpose("level", "lateral", "time") if "displacement_u" in errors else None
+        for i in range(min(moved.sizes["level"], 2)):
+            for j, axis in enumerate("XY"):
+                u = nothing if sigma is None else sigma.values[i, j]
+                found[f"{axis}{i + 1}"] = (moved.values[i, j], u)
+    for name, freedom, index in (("Z", "EZ", 2), ("A", "EA", 3), ("B", "EB", 4)):
+        if freedom in errors:
+            variance = errors["covariance"].isel(dof=index, dof_=index).values
+            found[name] = (errors[freedom].values, np.sqrt(np.where(variance >= 0, variance, np.nan)))
+    return {name: Curve(name, *both) for name, both in found.items()}
+
+
+def minutes_of(errors: xr.Dataset) -> np.ndarray:
+    """Return the instants in minutes since the reference state, (time,)."""
+    return np.asarray(errors["time"].values, float) / 60
+
+
+def running(errors: xr.Dataset) -> np.ndarray | None:
+    """Return where the spindle turns, bool (time,); None where the speed is not known."""
+    if "spindle_speed" not in errors or errors["spindle_speed"].dims != ("time",):
+        return None
+    speed = np.asarray(errors["spindle_speed"].values, float)
+    return np.nan_to_num(np.abs(speed)) > 0 if np.isfinite(speed).any() else None
+
+
+def end_of_running(errors: xr.Dataset) -> int | None:
+    """Return the index of the last instant at which the spindle turns; None where it never does or is not known."""
+    turning = running(errors)
+    return int(np.flatnonzero(turning)[-1]) if turning is not None and turning.any() else None
+
+
+def last_known(values: np.ndarray, index: int | None = None) -> int | None:
+    """Return the last index at or before ``index`` with a finite value; None where there is none."""
+    known = np.flatnonzero(np.isfinite(values[: None if index is None else index + 1]))
+    return int(known[-1]) if known.size else None
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that was done to the machine, at a time in minutes."""
+
+    minute: float
+    what: str
+
+
+def events(source: Source) -> list[Event]:
+    """Return what the schedule in the settings says was done after the start, in order of time."""
+    schedule = source.settings.get("schedule")
+    if not isinstance(schedule, (list, tuple)):
+        return []
+    found = []
+    for entry in schedule:
+        if isinstance(entry, Mapping):
+            at = _seconds(entry.get("at", entry.get("time")))
+            what = _done(entry)
+            if math.isfinite(at) and what:
+                found.append(Event(at / 60, what))
+    return sorted(found, key=lambda event: event.minute)
+
+
+def _seconds(value: Any) -> float:
+    if isinstance(value, (int, float)):
+        return float(value)
+    words = str(value).split()
+    sizes = {"s": 1.0, "min": 60.0, "h": 3600.0}
+    try:
+        return float(words[0]) * sizes[words[1]]
+    except (IndexError, KeyError, ValueError):
+        return math.nan
+
+
+def _done(entry: Mapping[str, Any]) -> str:
+    words = []
+    speed = entry.get("spindle_speed")
+    if speed is not None:
+        words.append(f"{speed:g} /min" if isinstance(speed, (int, float)) else str(speed))
+    compensation = entry.get("compensation")
+    if isinstance(compensation, Mapping):
+        words += [f"{axis} compensation {'on' if state else 'off'}" for axis, state in compensation.items()]
+    return ", ".join(words)

@@ -1,0 +1,226 @@
+"""The chapter of a spindle test: values, curves, temperatures, set-up, uncertainty, quality."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from errormotion.kinematics.iso import iso_names
+from errormotion.report import budget, iso230_3, provenance, quality, setup_drawing, spindle_figures
+from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Text, estimate
+from errormotion.report.series import (
+    QUANTITIES,
+    WHAT,
+    Curve,
+    curves,
+    end_of_running,
+    events,
+    last_known,
+    minutes_of,
+    unit_of,
+)
+from errormotion.report.text import fixed, integer, minutes
+
+
+def part(source: Source, key: str) -> Part:
+    """Return the chapter of one spindle drift dataset; ``key`` keeps its figures' identifiers apart."""
+    errors = source.errors
+    return Part(
+        "Thermal drift of the spindle",
+        _key_figures(errors),
+        _summary(errors),
+        [
+            Section("iso", "Thermal drift values (ISO 230-3)", _values(errors)),
+            Section("drift", "Drift over time", _drift(source, key), page_break=True),
+            Section("temperatures", "Temperatures", _temperatures(source, key)),
+            Section("setup", "Set-up", _setup(errors, key), page_break=True),
+            Section("uncertainty", "Uncertainty", _uncertainty(errors)),
+            Section("quality", "Residuals and data quality", _quality(source, key), page_break=True),
+            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
+        ],
+    )
+
+
+def _at(line: Curve, index: int | None) -> Cell:
+    """Return a curve's value at an instant, or at the last valid one before it, relative to the reference state."""
+    place = last_known(line.values, index)
+    size = line.unit[1]
+    if place is None:
+        return Cell("—", reason="could not be determined from this record")
+    return estimate(line.values[place] / size, 2 * line.uncertainty[place] / size)
+
+
+def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
+    found, stop, time = curves(errors), end_of_running(errors), minutes_of(errors)
+    if not time.size:
+        return []
+    when = f"after {fixed(time[stop if stop is not None else -1], 1)} min"
+    return [
+        KeyFigure(label, _at(found[name], stop), unit_of(name)[0], when)
+        for name, label in (
+            ("X1", "X at L1"),
+            ("Y1", "Y at L1"),
+            ("Z", "Z"),
+            ("A", "tilt about X"),
+            ("B", "tilt about Y"),
+        )
+    ]
+
+
+def _summary(errors: xr.Dataset) -> list[str]:
+    time, found, stop = minutes_of(errors), curves(errors), end_of_running(errors)
+    if time.size < 2:
+        return ["The record holds fewer than two instants: there is no drift to report."]
+    words = [_what_was_done(errors)]
+    by_size = sorted(
+        (name for name in ("X1", "X2", "Y1", "Y2", "Z") if np.isfinite(found[name].values).any()),
+        key=lambda name: -float(np.nanmax(np.abs(found[name].values))),
+    )
+    if by_size:
+        words += _largest(errors, found[by_size[0]], by_size[0])
+    first = [(name, iso230_3.cell(errors, name, "range_60min")) for name in QUANTITIES]
+    known = [f"d({name}) {_with_uncertainty(value)} {unit_of(name)[0]}" for name, value in first if value.text != "—"]
+    if known:
+        words.append(f"Range within the first 60 min: {', '.join(known)}.")
+    words += _still_moving(errors, by_size)
+    place = stop if stop is not None else time.size - 1
+    largest = budget.largest(errors.isel(time=place), "EZ")
+    if largest:
+        words.append(f"The largest share in the variance of Z {_when(errors)}: {largest[0]}, {largest[1]}.")
+    unseen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if not np.isfinite(errors[name].values).any()]
+    if unseen:
+        names = iso_names("spindle")
+        words.append(
+            f"Not observed by this test: {', '.join(f'{name} ({names[name]})' for name in unseen)}. "
+            "It is reported as unknown, not as zero."
+        )
+    return words
+
+
+def _what_was_done(errors: xr.Dataset) -> str:
+    time, stop = minutes_of(errors), end_of_running(errors)
+    length = f"The record is {fixed(time[-1] - time[0], 1)} min long"
+    if stop is None:
+        known = "spindle_speed" in errors
+        return f"{length}; {'the spindle stood still' if known else 'the spindle speed was not recorded'}."
+    speed = np.asarray(errors["spindle_speed"].values, float)
+    turning = speed[np.abs(np.nan_to_num(speed)) > 0]
+    low, high = float(turning.min()), float(turning.max())
+    at = f"{integer(high)} /min" if high - low < 1e-3 * high else f"{integer(low)} to {integer(high)} /min"
+    return f"{length}; the spindle turned at {at} until {fixed(time[stop], 1)} min."
+
+
+def _with_uncertainty(value: Cell) -> str:
+    return f"{value.text} ± {value.uncertainty}" if value.uncertainty else str(value.text)
+
+
+def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
+    unit, size = line.unit
+    time = minutes_of(errors)
+    place = int(np.nanargmax(np.abs(line.values)))
+    value = estimate(line.values[place] / size, 2 * line.uncertainty[place] / size)
+    return [
+        f"The largest displacement is {WHAT[name].removeprefix('displacement ')}: {_with_uncertainty(value)} {unit}, "
+        f"reached after {fixed(time[place], 1)} min."
+    ]
+
+
+def _still_moving(errors: xr.Dataset, by_size: list[str]) -> list[str]:
+    if not by_size:
+        return []
+    name = by_size[0]
+    slope, slope_u = iso230_3.value_of(errors, name, "end_slope")
+    constant, _ = iso230_3.value_of(errors, name, "time_constant")
+    words = []
+    if np.isfinite(slope):
+        cell = iso230_3.cell(errors, name, "end_slope")
+        verdict = "still drifting" if abs(slope) > 2 * slope_u else "steady within the uncertainty"
+        words.append(f"At the end of running d({name}) is {verdict}: {_with_uncertainty(cell)} {unit_of(name)[0]}/h.")
+    if np.isfinite(constant):
+        cell = iso230_3.cell(errors, name, "time_constant")
+        words.append(f"d({name}) approaches its end value with a time constant of {_with_uncertainty(cell)} min.")
+    return words
+
+
+def _when(errors: xr.Dataset) -> str:
+    stop = end_of_running(errors)
+    return "at the end of running" if stop is not None else "at the end of the record"
+
+
+def _values(errors: xr.Dataset) -> list[Block]:
+    found: list[Block] = list(iso230_3.tables(errors))
+    if not found:
+        return [Text("The result holds no ISO 230-3 values.", "note")]
+    meaning = "; ".join(f"{name}: {WHAT[name]}" for name in QUANTITIES)
+    return [*found, Text(f"{meaning}. Level L1 is the one nearer to the end face of the bar.", "note")]
+
+
+def _drift(source: Source, key: str) -> list[Block]:
+    done = events(source)
+    made = [
+        spindle_figures.displacements(source.errors, done, f"{key}-d"),
+        spindle_figures.tilts(source.errors, done, f"{key}-t"),
+    ]
+    return [figure for figure in made if figure is not None] or [Text("No instant has a valid result.", "warning")]
+
+
+def _temperatures(source: Source, key: str) -> list[Block]:
+    figure = spindle_figures.temperatures(source.errors, events(source), f"{key}-temperature")
+    return [figure] if figure is not None else [Text("No temperatures were recorded with this test.", "note")]
+
+
+def _setup(errors: xr.Dataset, key: str) -> list[Block]:
+    figure, table = setup_drawing.figure(errors, f"{key}-setup"), setup_drawing.table(errors)
+    if figure is None or table is None:
+        return [Text("The result does not hold the geometry of beams and bar.", "note")]
+    return [figure, table]
+
+
+def _uncertainty(errors: xr.Dataset) -> list[Block]:
+    time, stop = minutes_of(errors), end_of_running(errors)
+    if not time.size:
+        return [Text("The record is empty.", "warning")]
+    place = stop if stop is not None else time.size - 1
+    hour = int(np.searchsorted(time, 60.0))
+    places = {f"after {minutes(60 * time[hour])}": errors.isel(time=hour)} if hour < min(place, time.size - 1) else {}
+    places[f"{_when(errors)} ({fixed(time[place], 1)} min)"] = errors.isel(time=place)
+    if place < time.size - 1:
+        places[f"end of the record ({fixed(time[-1], 1)} min)"] = errors.isel(time=-1)
+    point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(errors.attrs["functional_point"]))
+    return [
+        budget.twist_table(errors, places, iso_names("spindle")),
+        budget.table(errors.isel(time=place), f"{_when(errors)} ({fixed(time[place], 1)} min)"),
+        Text(
+            f"Functional point ({point}) mm in the frame '{errors.attrs.get('frame', 'not stated')}'. Sources that act "
+            "on many instants at once are one draw for all of them; differences between instants take their covariance "
+            "into account, so that the uncertainty of a difference may be smaller than that of either value.",
+            "note",
+        ),
+    ]
+
+
+def _quality(source: Source, key: str) -> list[Block]:
+    errors = source.errors
+    blocks = quality.sentences(errors, source.raw)
+    table = quality.table(errors)
+    if table is not None:
+        blocks.append(table)
+    if "fit_residual" in errors:
+        largest = np.abs(errors["fit_residual"].values)
+        if np.isfinite(largest).any() and np.nanmax(largest) < 1e-11:
+            blocks.append(
+                Text(
+                    "The fit is exact: as many readings as unknowns. The residuals are zero by construction and say "
+                    "nothing of the accuracy; that comes from the sensors and the beam calibration.",
+                    "note",
+                )
+            )
+        else:
+            figure = spindle_figures.channels(
+                errors, "fit_residual", "Residual of the fit", "Residuals of the fit by channel.", f"{key}-residual"
+            )
+            blocks += [figure] if figure else []
+    figure = spindle_figures.channels(
+        errors, "distance_mean", "Averaged reading", "Averaged readings of the sensors by channel.", f"{key}-reading"
+    )
+    return [*blocks, figure] if figure else blocks

@@ -1,0 +1,93 @@
+"""Numbers as a metrologist writes them (JCGM 100:2008, 7.2.6): uncertainty to two digits, value to the same place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from decimal import ROUND_HALF_UP, Decimal
+
+import numpy as np
+
+DASH = "—"
+ARCSEC = math.pi / 180 / 3600
+
+#: Field unit of a quantity: name, and its size in SI.
+UM = ("µm", 1e-6)
+MM = ("mm", 1e-3)
+SECOND_OF_ARC = ("arcsec", ARCSEC)
+MINUTE = ("min", 60.0)
+
+
+def rounded(value: float, expanded: float, *, signed: bool = True, digits: int = 4) -> tuple[str, str]:
+    """Return value and expanded uncertainty as text, the uncertainty to two significant digits.
+
+    Parameters
+    ----------
+    value, expanded : float
+        In one unit. A value that is not finite gives two dashes; an uncertainty that is not finite or not positive
+        gives a dash, and the value then has ``digits`` significant digits.
+    signed : bool
+        Whether a positive value carries its plus.
+    """
+    if not math.isfinite(value):
+        return DASH, DASH
+    if not (math.isfinite(expanded) and expanded > 0):
+        return _decimal(value, _place(value, digits), signed), DASH
+    place = _place(expanded, 2)
+    return _decimal(value, place, signed), _decimal(expanded, place, signed=False)
+
+
+def _place(value: float, digits: int) -> int:
+    """Power of ten of the last of ``digits`` significant digits, counted after rounding (0.0996 becomes 0.10)."""
+    if value == 0 or not math.isfinite(value):
+        return 1 - digits
+    return int(f"{abs(value):.{digits - 1}e}".split("e")[1]) - digits + 1
+
+
+def _decimal(value: float, place: int, signed: bool) -> str:
+    number = Decimal(repr(float(value))).quantize(Decimal(1).scaleb(place), rounding=ROUND_HALF_UP)
+    if number == 0:
+        return f"{abs(number):f}"
+    return f"{number:{'+' if signed else ''}f}".replace("-", "−")
+
+
+def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
+    """Return a number with so many decimals and a true minus; a dash for NaN."""
+    return _decimal(value, -decimals, signed) if math.isfinite(value) else DASH
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Return a number with so many significant digits, without an exponent; a dash for NaN."""
+    return _decimal(value, _place(value, digits), signed=False) if math.isfinite(value) else DASH
+
+
+def integer(value: float) -> str:
+    """Return a whole number in groups of three with narrow spaces; a dash for NaN."""
+    return f"{round(value):,}".replace(",", "\u202f").replace("-", "−") if math.isfinite(value) else DASH
+
+
+def percent(fraction: float) -> str:
+    """Return a share in per cent that never rounds up to 100 while something is missing."""
+    if not math.isfinite(fraction):
+        return DASH
+    if fraction in (0.0, 1.0):
+        return f"{fraction:.0%}".replace("%", " %")
+    return fixed(min(max(100 * fraction, 0.01), 99.99), 2) + " %"
+
+
+def minutes(seconds: float) -> str:
+    """Return a duration in minutes with one decimal, in seconds below two minutes."""
+    if not math.isfinite(seconds):
+        return DASH
+    return f"{fixed(seconds, 1)} s" if abs(seconds) < 120 else f"{fixed(seconds / 60, 1)} min"
+
+
+def listed(words: list[str]) -> str:
+    """Return words as a list in a sentence: ``a, b and c``."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
+
+
+def finite(reduce: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:
+    """Return a reduction over the finite values; NaN where there is none."""
+    kept = values[np.isfinite(values)]
+    return float(reduce(kept)) if kept.size else math.nan

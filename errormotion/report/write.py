@@ -1,0 +1,178 @@
+"""Put a report together and write it: one file, no network, written beside and renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+import errormotion
+from errormotion.errors import DatasetError, RunError
+from errormotion.report import beam, generic, provenance, spindle
+from errormotion.report.budget import FREEDOMS
+from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.text import DASH
+
+Builder = Callable[[Source, str], Part]
+
+#: Who writes the chapter of a component; every other component gets the generic one.
+BUILDERS: dict[str, Builder] = {"spindle": spindle.part, "beam": beam.part}
+
+
+def write_report(
+    errors: xr.Dataset | Sequence[xr.Dataset],
+    out: Path,
+    *,
+    raw: xr.Dataset | None = None,
+    title: str | None = None,
+    run: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write the report of one or several error datasets as one HTML file.
+
+    Parameters
+    ----------
+    errors : Dataset or sequence of Dataset
+        Error datasets, one chapter each.
+    out : Path
+        The file; an older one is replaced in one step.
+    raw : Dataset, optional
+        The raw dataset that they come from: for counts of lost samples; its samples are not read.
+    title : str, optional
+        Title of the report; without it, made of the machine and what was tested.
+    run : mapping, optional
+        What else is known of the measurement, such as the content of ``run.json``: machine, test, operator, start.
+
+    Returns
+    -------
+    Path
+        ``out``.
+
+    Raises
+    ------
+    DatasetError
+        No dataset, or one that is no error dataset.
+    """
+    datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
+    if not datasets:
+        raise DatasetError("A report needs at least one error dataset, and none was given.")
+    for dataset in datasets:
+        missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
+        if missing:
+            raise DatasetError(
+                f"A report is made from error datasets; this one lacks {', '.join(missing)}. "
+                "Identify the raw dataset first."
+            )
+    sources = [Source(dataset, raw, dict(run or {}), provenance.read(dataset)) for dataset in datasets]
+    parts = [
+        BUILDERS.get(str(source.errors.attrs.get("component")), generic.part)(source, f"p{i + 1}")
+        for i, source in enumerate(sources)
+    ]
+    page = _page(sources, parts, title)
+    out = Path(out)
+    beside = out.with_name(out.name + ".part")
+    beside.write_text(page, encoding="utf-8")
+    os.replace(beside, out)
+    return out
+
+
+def write_run_report(run_folder: Path) -> Path:
+    """Write ``report.html`` into a run folder from its error datasets, its raw dataset and ``run.json``.
+
+    Raises
+    ------
+    RunError
+        The folder does not exist, or holds no ``errors/*/errors.nc``.
+    DatasetError
+        A result cannot be read.
+    """
+    from errormotion.datasets import load
+
+    folder = Path(run_folder)
+    if not folder.is_dir():
+        raise RunError(f"Expected a run folder, and there is none at {folder}.")
+    files = sorted(folder.glob("errors/*/errors.nc"))
+    if not files:
+        raise RunError(
+            f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
+        )
+    run: dict[str, Any] = {}
+    if (folder / "run.json").is_file():
+        try:
+            run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise RunError(
+                f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
+            ) from error
+    raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
+    return write_report([load(path) for path in files], folder / "report.html", raw=raw, run=run)
+
+
+def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -> str:
+    first = sources[0]
+    attributes = first.errors.attrs
+    everything = [(s.provenance, s.run, dict(s.raw.attrs) if s.raw is not None else {}) for s in sources]
+    machine = str(attributes.get("machine", "unknown machine"))
+    templates = Environment(
+        loader=PackageLoader("errormotion.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.tests["table"] = lambda block: isinstance(block, Table)
+    templates.tests["cell"] = lambda value: isinstance(value, Cell)
+    templates.filters["kind"] = lambda block: type(block).__name__.lower()
+    identity = sha256("".join(str(s.errors.attrs.get("provenance", "")) for s in sources).encode()).hexdigest()[:12]
+    return templates.get_template("report.html.j2").render(
+        title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
+        heading=title or parts[0].title,
+        facts=_facts(first, machine),
+        simulated=provenance.simulated(everything) or (_truth(sources)),
+        replayed=provenance.replayed(everything),
+        parts=parts,
+        several=len(parts) > 1,
+        identity=identity,
+        version=errormotion.__version__,
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+
+
+def _truth(sources: Sequence[Source]) -> str:
+    if any(source.errors.attrs.get("method") == "twin" for source in sources):
+        return "they are the truth of a virtual machine"
+    return ""
+
+
+def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
+    """Return what heads the report: who measured what, where and when, as far as it is known."""
+    errors, run = source.errors, source.run
+
+    def known(*names: str) -> str:
+        for holder in (run, source.provenance, errors.attrs, errors["time"].attrs if "time" in errors.coords else {}):
+            for name in names:
+                if name in holder and not isinstance(holder[name], (Mapping, list)) and holder[name] not in (None, ""):
+                    return provenance.text(holder[name])
+        return DASH
+
+    attributes = errors.attrs
+    instruments = provenance.instruments(source.provenance)
+    serials = ", ".join(
+        f"{row['model'] or row['name']} no. {row['serial_number']}" for row in instruments if row["serial_number"]
+    )
+    return [
+        ("Machine", machine),
+        ("Test", known("test", "name")),
+        ("Measured", known("started", "start", "utc_start", "start_utc", "created")),
+        ("Operator", known("operator")),
+        ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
+        ("Reference state", str(attributes.get("reference", DASH))),
+        ("Instruments", serials or ", ".join(row["model"] or row["name"] for row in instruments) or DASH),
+        ("Run", known("id", "run")),
+    ]
