@@ -3,44 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import BenchError
+from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
 from errormotion.twin import frame as frames
-from errormotion.twin import kernels
+from errormotion.twin import rawdata, truth
+from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.schedule import Event, Schedule, StepProgram
+from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
 from errormotion.twin.state import ThermalState, seeded_state
 
 Array = NDArray[np.float64]
 
-#: grid of the slow motion, s, and its nodes per chunk
-GRID = 0.5
-CHUNK = 64
 #: the spindle reaches full speed in this time, s
 SPIN_UP_TIME = 0.75
-#: how well the machine finds a position again, m (one sigma, each axis)
-REPEATABILITY = 0.3e-6
-#: what the speckle does to a reading on the sphere at rest, m (one sigma)
-SPECKLE = 0.5e-6
 #: sensors count as warm when they have been on for this time, s
 WARM_AFTER = 4 * 3600.0
 
-_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "noise", "steps"))}
-
-
-@dataclass(frozen=True)
-class _Nodes:
-    """The slow motion over one chunk of time, ready for the kernel."""
-
-    times: Array
-    slow: Array
-    turns: Array
-    pattern: Array
+_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry"))}
 
 
 class VirtualMachine:
@@ -74,6 +61,8 @@ class VirtualMachine:
         m.
     state : ThermalState
         Temperatures and thermal errors under the present schedule.
+    geometry : GeometricErrors
+        The 21 geometric errors.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -90,7 +79,8 @@ class VirtualMachine:
         self.frame = frames.seeded_frame(self._rng("frame"), self.bar_radius)
         self.bar = bars.seeded_bar(self._rng("bar"), len(self.frame.channels))
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
-        self._chunks: dict[int, _Nodes] = {}
+        self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
+        self._sensing = self._sense()
 
     def __repr__(self) -> str:
         return f"VirtualMachine({self.kind!r}, seed={self.seed})"
@@ -100,6 +90,9 @@ class VirtualMachine:
 
     def _schedule(self, events: Sequence[Event]) -> Schedule:
         return Schedule(tuple(events), self.top_speed / 60 / SPIN_UP_TIME, self.top_speed)
+
+    def _sense(self) -> Sensing:
+        return Sensing(self.seed, self.frame, self.bar, self.sphere_radius, self.state, self.sensors_on_for)
 
     # ------------------------------------------------------------------ what it does
 
@@ -112,7 +105,7 @@ class VirtualMachine:
             Events out of order, a speed that the spindle does not have, an unknown axis.
         """
         self.state = replace(self.state, schedule=self._schedule(schedule))
-        self._chunks = {}
+        self._sensing = self._sense()
 
     def spindle_speed(self, t: ArrayLike) -> Array:
         """Return the speed of the spindle at times t, 1/min, shape (n,)."""
@@ -146,9 +139,47 @@ class VirtualMachine:
 
         The point is the material point at the end of the bar.
         """
-        twist = self.spindle_twist(t)
-        axis = self.bar.axis + np.cross(twist[:, 3:], self.bar.axis)
-        return self.bar.point + twist[:, :3], axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        return self._sensing.axis(_times(t))
+
+    def truth_spindle(self, t: ArrayLike, functional_point: ArrayLike | None = None) -> xr.Dataset:
+        """Return the thermal error of the spindle as an error dataset over ``time``, without uncertainty.
+
+        Parameters
+        ----------
+        t : (n,)
+            Times, s, increasing.
+        functional_point : (3,), optional
+            m; ``spindle_functional_point`` where not given.
+        """
+        t = _times(t)
+        point = self.spindle_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
+        coords = {
+            "time": t,
+            "sensor": list(self.temperature_sensors),
+            "temperature": (("time", "sensor"), self.temperatures(t), {"units": "degC"}),
+            "spindle_speed": ("time", self.spindle_speed(t), {"units": "1/min"}),
+        }
+        twist = move(self.spindle_twist(t), point - self.spindle_functional_point)
+        return truth.dataset(twist, "time", coords, "spindle", point, "cold state at time 0", self._origin())
+
+    def truth_axis(self, axis: str, positions: ArrayLike) -> xr.Dataset:
+        """Return the geometric errors of an axis as an error dataset over ``position`` (m), at the machine's origin."""
+        if axis not in self.geometry.motions:
+            raise BenchError(f"The axes are {', '.join(self.geometry.motions)}; found {axis!r}.")
+        q = _times(positions)
+        coords = {axis.lower(): ("position", q, {"units": "m"})}
+        twist = self.geometry.motions[axis](q)
+        return truth.dataset(twist, "position", coords, axis, np.zeros(3), "axis at zero", self._origin())
+
+    def volumetric_truth(self, points: ArrayLike) -> xr.Dataset:
+        """Return the errors of the tool at commanded points (n, 3), m, as an error dataset over ``target``."""
+        places = np.atleast_2d(np.asarray(points, dtype=float))
+        coords = {name: ("target", places[:, i], {"units": "m"}) for i, name in enumerate("xyz")}
+        twist = self.geometry.twist(places)
+        return truth.dataset(twist, "target", coords, "tool", np.zeros(3), "commanded point", self._origin())
+
+    def _origin(self) -> truth.Origin:
+        return truth.Origin(self.name, self.kind, self.seed, self.state.schedule.events)
 
     # ------------------------------------------------------------------ readings
 
@@ -162,12 +193,7 @@ class VirtualMachine:
         expansion, warm_up : bool
             Whether the frame expands with its temperature, and the sensors warm up.
         """
-        t = _times(t)
-        origin = self.frame.origins(self.state.warming("frame", t) if expansion else np.zeros(t.size))
-        readings = self.bar.still_readings(origin, self.frame.true_direction, *self.spindle_axis(t))
-        if warm_up:
-            readings = readings + self.frame.warm_up_offset(t + self.sensors_on_for)
-        return readings
+        return self._sensing.still(_times(t), expansion=expansion, warm_up=warm_up)
 
     def distances(
         self,
@@ -203,14 +229,86 @@ class VirtualMachine:
         chosen = self._chosen(channels)
         out = np.full((chosen.size, n), np.nan)
         if tool == "bar":
-            self._read_bar(out, first, float(rate), chosen)
+            self._sensing.read_bar(out, first, float(rate), chosen)
         elif tool == "sphere" and motion is not None:
-            self._read_sphere(out, first, float(rate), chosen, motion)
+            self._sensing.read_sphere(out, first, float(rate), chosen, motion)
         else:
             raise BenchError(
                 f"The spindle holds a 'bar', or a 'sphere' with a StepProgram; found {tool!r}, {motion!r}."
             )
         return out
+
+    def raw_spindle_drift(
+        self,
+        t: ArrayLike,
+        *,
+        seed: int,
+        beams: str | rawdata.Beams = "true",
+        averaged: int = 10000,
+        expansion: bool = False,
+        warm_up: bool = True,
+        radius_error: bool = True,
+    ) -> xr.Dataset:
+        """Return a raw dataset of a drift measurement, each sample the mean over whole turns.
+
+        Parameters
+        ----------
+        t : (n,)
+            Times, s, increasing.
+        seed : int
+            Of the noise alone; the machine stays the same.
+        beams : {"true", "nominal"} or (origin, direction, covariance)
+            The beams that the dataset states: (channel, 3) m, (channel, 3), (channel, 6, 6) or None.
+        averaged : int
+            Samples in each mean: ``distance_noise`` is that of one sample by the root of this, and so is the noise.
+        expansion : bool
+            Whether the readings hold the expansion of the frame; without it they are as if compensated perfectly.
+        warm_up : bool
+            Whether they hold the warm-up of the sensors; nothing in a warm machine.
+        radius_error : bool
+            Whether the dataset states the certificate's radius of the bar and not the true one.
+        """
+        t = _times(t)
+        noise = float(self.frame.noise.max()) / np.sqrt(averaged)
+        readings = self.still_readings(t, expansion=expansion, warm_up=warm_up)
+        readings = readings + noise * np.random.default_rng(seed).normal(size=readings.shape)
+        readings[~((readings >= 0) & (readings <= self.frame.range))] = np.nan
+        known = {
+            "true": (self.frame.true_origin, self.frame.true_direction, None),
+            "nominal": (self.frame.nominal_origin, self.frame.nominal_direction, None),
+        }
+        if isinstance(beams, str) and beams not in known:
+            raise BenchError(f"The beams are 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
+        return rawdata.spindle_drift(
+            self.frame,
+            t,
+            readings,
+            noise,
+            known[beams] if isinstance(beams, str) else beams,
+            self.bar_radius if radius_error else self.bar.radius,
+            {
+                "temperature": (("time", "sensor"), self.temperatures(t), {"units": "degC"}),
+                "spindle_speed": ("time", self.spindle_speed(t), {"units": "1/min"}),
+            },
+            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
+        ).assign_coords(sensor=list(self.temperature_sensors))
+
+    def raw_beam_detection(self, *, seed: int) -> xr.Dataset:
+        """Return a raw dataset of a beam detection in the cold state, one mean reading per rest of the sphere.
+
+        Parameters
+        ----------
+        seed : int
+            Of positions and speckle; the machine stays the same.
+        """
+        return rawdata.beam_detection(
+            self.frame,
+            self.sphere_radius,
+            REPEATABILITY,
+            SPECKLE,
+            np.random.default_rng(seed),
+            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
+        )
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)
@@ -218,75 +316,6 @@ class VirtualMachine:
         if unknown:
             raise BenchError(f"The channels are {', '.join(self.frame.channels)}; found {', '.join(unknown)}.")
         return np.array([self.frame.channels.index(name) for name in names], dtype=np.int64)
-
-    def _read_bar(self, out: Array, first: int, rate: float, chosen: NDArray[np.int64]) -> None:
-        keys = np.array([kernels.stream_key(self.seed, _PART["noise"], channel) for channel in chosen])
-        span = GRID * CHUNK
-        for chunk in range(int(first / rate / span), int((first + out.shape[1]) / rate / span) + 1):
-            nodes = self._nodes(chunk)
-            kernels.rotating_bar(
-                out,
-                first,
-                rate,
-                nodes.times,
-                nodes.slow[chosen],
-                nodes.turns,
-                nodes.pattern[chosen],
-                self.frame.noise[chosen],
-                keys,
-                self.frame.range,
-            )
-
-    def _nodes(self, chunk: int) -> _Nodes:
-        """Return the slow motion of one chunk of time; always the same numbers, whoever asks."""
-        if chunk not in self._chunks:
-            grid = (chunk * CHUNK + np.arange(CHUNK + 1)) * GRID
-            kinks = self.state.schedule.kinks
-            times = np.union1d(grid, kinks[(kinks > grid[0]) & (kinks < grid[-1])])
-            middle = np.array([grid[CHUNK // 2]])
-            point, axis = self.spindle_axis(middle)
-            origin = self.frame.origins(self.state.warming("frame", middle))[:, 0]
-            nodes = _Nodes(
-                times,
-                self.still_readings(times),
-                self.state.schedule.turning(times),
-                self.bar.pattern(origin, self.frame.true_direction, point[0], axis[0]),
-            )
-            if len(self._chunks) >= 64:
-                self._chunks = {}
-            self._chunks[chunk] = nodes
-            return nodes
-        return self._chunks[chunk]
-
-    def _read_sphere(self, out: Array, first: int, rate: float, chosen: NDArray[np.int64], motion: StepProgram) -> None:
-        begins, ends = motion.arrivals, motion.departures
-        at = np.clip(begins, motion.begin, None)
-        places = motion.places + self.spindle_twist(at)[:, :3] + REPEATABILITY * self._draws(motion, 3).T
-        speckle = SPECKLE * self._draws(motion, 3 + len(self.frame.channels))[3:]
-        offset = speckle + self.frame.warm_up_offset(at + self.sensors_on_for)
-        origin = self.frame.origins(self.state.warming("frame", at[:1]))[:, 0]
-        keys = [kernels.stream_key(self.seed, _PART["noise"], len(self.frame.channels) + channel) for channel in chosen]
-        kernels.stepped_sphere(
-            out,
-            first,
-            rate,
-            begins,
-            ends,
-            places,
-            self.sphere_radius,
-            origin[chosen],
-            self.frame.true_direction[chosen],
-            offset[chosen],
-            self.frame.noise[chosen],
-            np.array(keys),
-            self.frame.range,
-        )
-
-    def _draws(self, motion: StepProgram, streams: int) -> Array:
-        """Return standard normal numbers (stream, place) that belong to this program on this machine."""
-        bits = np.array([motion.begin, *motion.places[1], *motion.places[-2]]).view(np.int64)
-        key = [self.seed, _PART["steps"], *(int(b) for b in bits)]
-        return np.array([kernels.normals(kernels.stream_key(*key, s), 0, len(motion.places)) for s in range(streams)])
 
 
 def _times(t: ArrayLike) -> Array:

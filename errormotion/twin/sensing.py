@@ -1,0 +1,142 @@
+"""What the five sensors read on the bar and on the sphere, sample by sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.twin import kernels
+from errormotion.twin.bar import Bar
+from errormotion.twin.frame import FrameGeometry
+from errormotion.twin.schedule import StepProgram
+from errormotion.twin.state import ThermalState
+
+Array = NDArray[np.float64]
+Channels = NDArray[np.int64]
+
+#: grid of the slow motion, s, and its intervals per chunk
+GRID = 0.5
+CHUNK = 64
+#: how well the machine finds a position again, m (one sigma, each axis)
+REPEATABILITY = 0.3e-6
+#: what the speckle does to a reading on the sphere at rest, m (one sigma)
+SPECKLE = 0.5e-6
+
+_BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """The slow motion over one chunk of time, ready for the kernel."""
+
+    times: Array
+    slow: Array
+    turns: Array
+    pattern: Array
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Five sensors on one machine under one schedule.
+
+    Attributes
+    ----------
+    seed : int
+        Of the noise.
+    frame, bar, sphere_radius, state
+        Who looks at what, and how it moves.
+    sensors_on_for : float
+        For how long the sensors have been on at time 0, s.
+    """
+
+    seed: int
+    frame: FrameGeometry
+    bar: Bar
+    sphere_radius: float
+    state: ThermalState
+    sensors_on_for: float
+    _chunks: dict[int, _Nodes] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def axis(self, t: Array) -> tuple[Array, Array]:
+        """Return the point of the axis of rotation at the end of the bar, m, and its direction, each (n, 3)."""
+        twist = self.state.twist(t)
+        axis = self.bar.axis + np.cross(twist[:, 3:], self.bar.axis)
+        return self.bar.point + twist[:, :3], axis / np.linalg.norm(axis, axis=1, keepdims=True)
+
+    def still(self, t: Array, *, expansion: bool = True, warm_up: bool = True) -> Array:
+        """Return the readings without noise, runout and texture, m, shape (channel, n)."""
+        origin = self.frame.origins(self.state.warming("frame", t) if expansion else np.zeros(t.size))
+        readings = self.bar.still_readings(origin, self.frame.true_direction, *self.axis(t))
+        return readings + self.frame.warm_up_offset(t + self.sensors_on_for) if warm_up else readings
+
+    def read_bar(self, out: Array, first: int, rate: float, chosen: Channels) -> None:
+        """Fill ``out`` (chosen, n) with the samples first .. first + n - 1 on the turning bar."""
+        keys = np.array([kernels.stream_key(self.seed, _BAR_NOISE, channel) for channel in chosen])
+        span = GRID * CHUNK
+        for chunk in range(int(first / rate / span), int((first + out.shape[1]) / rate / span) + 1):
+            nodes = self._nodes(chunk)
+            kernels.rotating_bar(
+                out,
+                first,
+                rate,
+                nodes.times,
+                nodes.slow[chosen],
+                nodes.turns,
+                nodes.pattern[chosen],
+                self.frame.noise[chosen],
+                keys,
+                self.frame.range,
+            )
+
+    def _nodes(self, chunk: int) -> _Nodes:
+        """Return the slow motion of one chunk of time; always the same numbers, whoever asks."""
+        nodes = self._chunks.get(chunk)
+        if nodes is None:
+            grid = (chunk * CHUNK + np.arange(CHUNK + 1)) * GRID
+            kinks = self.state.schedule.kinks
+            times = np.union1d(grid, kinks[(kinks > grid[0]) & (kinks < grid[-1])])
+            middle = np.array([grid[CHUNK // 2]])
+            point, axis = self.axis(middle)
+            origin = self.frame.origins(self.state.warming("frame", middle))[:, 0]
+            nodes = _Nodes(
+                times,
+                self.still(times),
+                self.state.schedule.turning(times),
+                self.bar.pattern(origin, self.frame.true_direction, point[0], axis[0]),
+            )
+            if len(self._chunks) >= 64:
+                self._chunks.clear()
+            self._chunks[chunk] = nodes
+        return nodes
+
+    def read_sphere(self, out: Array, first: int, rate: float, chosen: Channels, motion: StepProgram) -> None:
+        """Fill ``out`` (chosen, n) with the samples first .. first + n - 1 on the stepped sphere."""
+        begins, ends = motion.arrivals, motion.departures
+        at = np.maximum(begins, motion.begin)
+        places = motion.places + self.state.twist(at)[:, :3] + REPEATABILITY * self._draws(motion, (0, 1, 2)).T
+        offset = SPECKLE * self._draws(motion, 3 + chosen) + self.frame.warm_up_offset(at + self.sensors_on_for)[chosen]
+        origin = self.frame.origins(self.state.warming("frame", at[:1]))[:, 0]
+        keys = np.array([kernels.stream_key(self.seed, _SPHERE_NOISE, channel) for channel in chosen])
+        kernels.stepped_sphere(
+            out,
+            first,
+            rate,
+            begins,
+            ends,
+            places,
+            self.sphere_radius,
+            origin[chosen],
+            self.frame.true_direction[chosen],
+            offset,
+            self.frame.noise[chosen],
+            keys,
+            self.frame.range,
+        )
+
+    def _draws(self, motion: StepProgram, streams: Channels | tuple[int, ...]) -> Array:
+        """Return standard normal numbers (stream, place) that belong to this program on this machine."""
+        bits = np.array([motion.begin, *motion.places[1], *motion.places[-2]]).view(np.int64)
+        labels = (self.seed, _STEPS, *(int(b) for b in bits))
+        return np.array([kernels.normals(kernels.stream_key(*labels, s), 0, len(motion.places)) for s in streams])

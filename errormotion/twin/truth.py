@@ -1,0 +1,51 @@
+"""The truth as error datasets: values that are known exactly, so with covariance 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.twin.schedule import Event
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Which virtual machine says so, and what it was told to do."""
+
+    name: str
+    kind: str
+    seed: int
+    events: tuple[Event, ...]
+
+
+def dataset(
+    twist: NDArray[np.float64],
+    dim: str,
+    coords: Mapping[str, Any],
+    component: str,
+    functional_point: NDArray[np.float64],
+    reference: str,
+    origin: Origin,
+) -> xr.Dataset:
+    """Return an error dataset of true twists (n, 6), m and rad, over one dimension."""
+    settings = {"kind": origin.kind, "schedule": [asdict(event) for event in origin.events]}
+    return build_errors(
+        twist,
+        np.zeros((*twist.shape, 6)),
+        dims=(dim,),
+        coords=coords,
+        component=component,
+        machine=origin.name,
+        frame="machine",
+        functional_point=functional_point,
+        reference=reference,
+        method="twin",
+        method_version="1",
+        provenance=provenance.make(settings, None, None, seed=origin.seed),
+    )
