@@ -1,1 +1,1 @@
-"""To be filled."""
+"""Methods: one folder each, from what an instrument saw to an error dataset."""

@@ -1,0 +1,215 @@
+"""ISO 230-3 values of a spindle drift: what a certificate states, with what is known of each number.
+
+Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. Of each,
+the range over a period and the difference between its end and its start; which is which is part of the name, since the
+two differ as soon as a curve turns back. The uncertainty of a range is that of the difference between the two instants
+that carry it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from scipy.optimize import minimize_scalar
+
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")
+MEASURES = (
+    "range_60min",
+    "difference_60min",
+    "range_running",
+    "difference_running",
+    "range_total",
+    "difference_total",
+    "time_constant",
+    "end_slope",
+    "per_kelvin",
+)
+HOUR = 3600.0
+_SLOPE_SPAN = 600.0
+_LEAST_CHANGE = 0.2
+"""K; below this a change per kelvin says nothing."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Seven quantities over time: value (7, t), influence (source, 7, t), own variance (7, t), all relative."""
+
+    value: Array
+    influence: Array
+    variance: Array
+
+    def difference_uncertainty(self, k: int, i: int, j: int) -> float:
+        """Standard uncertainty of quantity k at instant i minus at instant j."""
+        if i == j:
+            return 0.0
+        shared = self.influence[:, k, i] - self.influence[:, k, j]
+        return float(np.sqrt(shared @ shared + self.variance[k, i] + self.variance[k, j]))
+
+    def weighted(self, k: int, index: NDArray[np.int64], weights: Array) -> tuple[float, float]:
+        """Value and standard uncertainty of a weighted sum of quantity k over some instants."""
+        shared = self.influence[:, k, index] @ weights
+        own = self.variance[k, index] @ weights**2
+        return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own))
+
+
+def quantities(errors: Array, independent: Array, influence: Array, heights: Array) -> Series:
+    """Return the seven quantities of error twists (t, 6).
+
+    ``heights`` (2,) are those of L1 and L2 above the functional point, m. The levels lie on the axis, where the unseen
+    rotation about it does nothing.
+    """
+    G = np.zeros((7, 5))
+    for level, z in enumerate(heights):
+        G[level, [0, 4]] = 1.0, z  # X: EX + EB z
+        G[2 + level, [1, 3]] = 1.0, -z  # Y: EY - EA z
+    G[4, 2] = G[5, 3] = G[6, 4] = 1.0
+    return Series(
+        G @ errors[:, :5].T,
+        np.einsum("ki,sti->skt", G, influence[..., :5]),
+        np.einsum("ki,tij,kj->kt", G, independent[:, :5, :5], G),
+    )
+
+
+@dataclass(frozen=True)
+class Results:
+    """ISO 230-3 values and their standard uncertainties, (quantity, measure), SI; NaN where not determined."""
+
+    test: str
+    value: Array
+    uncertainty: Array
+    sensor: str
+    series: Series
+
+    def as_extras(self, time: Array) -> dict[str, xr.DataArray]:
+        """Return the variables that ride along in the error dataset."""
+        table = {"quantity": list(QUANTITIES), "measure": list(MEASURES)}
+        units = {"units": "SI: m or rad; s for time_constant; per s for end_slope; per K for per_kelvin"}
+        shared = np.einsum("skt,skt->kt", self.series.influence, self.series.influence)
+        u = np.sqrt(shared + self.series.variance)
+        places = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
+
+        def by_level(values: Array) -> xr.DataArray:
+            stacked = np.stack([values[[0, 2]], values[[1, 3]]])
+            # The schema's `level` is the height; here the two levels go by name.
+            return xr.DataArray(
+                stacked, dims=("level_name", "lateral", "time"),
+                coords={"level_name": places["level"], "lateral": places["lateral"], "time": time},
+                attrs={"units": "m"},
+            )
+
+        return {
+            "iso_value": xr.DataArray(self.value, coords=table, dims=("quantity", "measure"), attrs=units),
+            "iso_uncertainty": xr.DataArray(self.uncertainty, coords=table, dims=("quantity", "measure"), attrs=units),
+            "displacement": by_level(self.series.value[:4]),
+            "displacement_u": by_level(u[:4]),
+        }
+
+
+def evaluate(
+    series: Series,
+    time: Array,
+    *,
+    temperature: Array | None,
+    sensors: Sequence[str],
+    spindle_speed: Array | None,
+    running_end: float | None,
+    sensor: str | None,
+) -> Results:
+    """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state."""
+    value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
+    uncertainty = np.full_like(value, np.nan)
+    step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    turning = spindle_speed is not None and bool(np.nanmax(np.nan_to_num(spindle_speed)) > 0)
+    still = spindle_speed is not None and not turning
+    end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning)
+    hottest, change = _thermometer(temperature, sensors, sensor, time <= end)
+    for k in range(len(QUANTITIES)):
+        known = np.isfinite(series.value[k]) & (time >= -1e-9)
+        for column, until in ((0, HOUR), (2, end), (4, time[-1])):
+            if time[-1] < until - 1.5 * step:
+                continue
+            inside = np.flatnonzero(known & (time <= until + 1e-6))
+            if inside.size < 2:
+                continue
+            top, bottom = inside[series.value[k, inside].argmax()], inside[series.value[k, inside].argmin()]
+            first, last = inside[0], inside[-1]
+            value[k, column] = series.value[k, top] - series.value[k, bottom]
+            uncertainty[k, column] = series.difference_uncertainty(k, top, bottom)
+            if time[last] >= until - max(10 * step, 5.0):
+                value[k, column + 1] = series.value[k, last] - series.value[k, first]
+                uncertainty[k, column + 1] = series.difference_uncertainty(k, last, first)
+        running = np.flatnonzero(known & (time <= end))
+        value[k, 6] = _time_constant(time[running], series.value[k, running])
+        tail = running[time[running] >= end - _SLOPE_SPAN]
+        if tail.size > 10 and np.ptp(time[tail]) > 0.9 * _SLOPE_SPAN:
+            value[k, 7], uncertainty[k, 7] = series.weighted(k, tail, _slope_weights(time[tail]))
+        if change is not None:
+            warm = running[np.isfinite(change[running])]
+            if warm.size > 10 and np.ptp(change[warm]) > _LEAST_CHANGE:
+                value[k, 8], uncertainty[k, 8] = series.weighted(k, warm, _slope_weights(change[warm]))
+    test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"
+    return Results(test, value, uncertainty, hottest, series)
+
+
+def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:
+    if speed is None or not turning:
+        return float(time[-1])
+    return float(time[np.flatnonzero(np.nan_to_num(speed) > 0)[-1]])
+
+
+def _thermometer(
+    temperature: Array | None, sensors: Sequence[str], wanted: str | None, running: NDArray[np.bool_]
+) -> tuple[str, Array | None]:
+    """Return name and change (t,), K, of the wanted sensor or of the one that changes most while running."""
+    if wanted is not None and wanted not in sensors:
+        raise MethodError(f"iso_temperature = '{wanted}': the record has the sensors {', '.join(sensors) or 'none'}.")
+    if temperature is None or not running.any():
+        return "", None
+    part = temperature[:, running]
+    seen = np.isfinite(part)
+    spread = np.where(seen, part, -np.inf).max(axis=1) - np.where(seen, part, np.inf).min(axis=1)
+    index = list(sensors).index(wanted) if wanted is not None else int(np.argmax(spread))
+    return sensors[index], temperature[index]
+
+
+def _slope_weights(x: Array) -> Array:
+    """Weights whose sum with y is the least-squares slope of y over x."""
+    centred = x - x.mean()
+    return np.asarray(centred / (centred @ centred))
+
+
+def _time_constant(time: Array, y: Array) -> float:
+    """Return tau of y0 + c (1 - exp(-t / tau)), s; NaN where the curve has no such shape.
+
+    For each tau, y0 and c follow by linear least squares; the best tau must lie between a fiftieth of the record and
+    its whole length, and the curve must explain nine tenths of the change.
+    """
+    if time.size < 20 or np.ptp(time) <= 0:
+        return np.nan
+    pick = np.unique(np.linspace(0, time.size - 1, min(time.size, 500)).astype(int))
+    t, v = time[pick] - time[pick][0], y[pick]
+    total = float(np.sum((v - v.mean()) ** 2))
+
+    def rest(log_tau: float) -> float:
+        rows = np.column_stack([np.ones(t.size), -np.expm1(-t / np.exp(log_tau))])
+        return float(np.sum((v - rows @ np.linalg.lstsq(rows, v)[0]) ** 2))
+
+    low, high = np.log(t[-1] / 50), np.log(t[-1])
+    grid = np.linspace(low, high, 25)
+    best = int(np.argmin([rest(g) for g in grid]))
+    if best in (0, grid.size - 1) or total == 0:
+        return np.nan
+    found = minimize_scalar(rest, bounds=(grid[best - 1], grid[best + 1]), method="bounded")
+    return float(np.exp(found.x)) if found.fun < 0.1 * total else np.nan
