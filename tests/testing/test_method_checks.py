@@ -1,0 +1,292 @@
+"""The kit passes a sound method, and each broken one fails exactly the check that is made for its fault."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from pydantic import ConfigDict
+
+from errormotion import datasets
+from errormotion.datasets import provenance
+from errormotion.errors import MethodError
+from errormotion.kinematics.twists import cross_matrix
+from errormotion.plugins import MethodInfo, Needs, PluginSettings
+from errormotion.testing import MethodConformance, MethodSubject, run_checks
+from errormotion.testing.kit import run_check
+from errormotion.testing.method_checks import METHOD_CHECKS
+
+SCHEMA = "errormotion.raw.body/1"
+NOISE = 1e-7  # m, of one reading
+CALIBRATION = 2e-7  # m, of one sensor's offset, the same at all times
+CHANNELS = ["a", "b", "c", "d", "e", "f", "g", "h"]
+NEEDED = ("displacement", "origin", "beam")
+
+
+class Settings(PluginSettings):
+    noise: float = NOISE
+
+
+class Sound:
+    """Eight sensors look at a body from known places; its six freedoms follow by least squares."""
+
+    info = MethodInfo("body", "A method that exists in this test only", "simulated_only", cannot_see=("its shape",))
+    needs = Needs((), SCHEMA)
+    Settings = Settings
+
+    def acquire(self, bench, settings, *, inputs, done=None):
+        raise NotImplementedError
+
+    def append_dim(self, settings):
+        return "time"
+
+    def progress(self, settings):
+        return 12
+
+    def checked(self, raw):
+        if raw.attrs.get("schema") != SCHEMA:
+            raise MethodError(f"expected raw data of schema {SCHEMA}, found schema {raw.attrs.get('schema')}")
+        missing = [name for name in NEEDED if name not in raw]
+        if missing:
+            raise MethodError(f"missing: {', '.join(missing)}")
+        return raw
+
+    def displacement(self, raw):
+        return raw["displacement"].transpose("channel", "time").values.astype(float)
+
+    def identify(self, raw, settings):
+        raw = self.checked(raw)
+        origin = raw["origin"].transpose("channel", "direction").values
+        beam = raw["beam"].transpose("channel", "direction").values
+        readings = self.displacement(raw)
+        point = origin.mean(axis=0)
+        gain = np.linalg.pinv(design(origin, beam, point), rcond=1e-10)
+        values = self.values((gain @ readings).T, gain)
+        source = np.repeat(CALIBRATION * gain.T[:, None, :], len(values), axis=1)
+        spread = np.broadcast_to((settings.noise**2 + CALIBRATION**2) * gain @ gain.T, (len(values), 6, 6))
+        return self.result(
+            raw["time"].values, values, spread, source, point, list(raw["channel"].values), settings, raw
+        )
+
+    def values(self, values, gain):
+        return values
+
+    def result(self, time, values, spread, source, point, channels, settings, raw):
+        return datasets.build_errors(
+            values,
+            spread,
+            dims=("time",),
+            coords={"time": time},
+            component="spindle",
+            machine="none",
+            frame="machine",
+            functional_point=point,
+            reference="time 0",
+            method="body",
+            method_version="1",
+            provenance=provenance.make(settings, raw, []),
+            influence=source,
+            sources=channels,
+            source_groups=["calibration"] * len(channels),
+        )
+
+    def plan(self, settings):
+        raw, _ = make(0)
+        errors = self.identify(raw, settings)
+        return errors.assign({name: errors[name] * 0 for name in datasets.DOF}).assign(
+            {name: (errors[name] * 0).assign_attrs(errors[name].attrs) for name in datasets.DOF}
+        )
+
+
+def design(origin, beam, point):
+    """Return how the readings follow from the freedoms, scaled to lengths: (channel, 6)."""
+    return np.concatenate([beam, np.einsum("cij,cj->ci", cross_matrix(origin - point), beam)], axis=1)
+
+
+def make(seed):
+    """Return raw data of a body that drifts by some um and urad, and its true errors."""
+    rng = np.random.default_rng(seed)
+    place = np.random.default_rng(7)  # the same set-up each time
+    origin = place.uniform(-0.5, 0.5, (8, 3))
+    beam = place.normal(size=(8, 3))
+    beam /= np.linalg.norm(beam, axis=1, keepdims=True)
+    time = np.arange(12) * 60.0
+    point = np.array([0.1, 0.0, -0.2])
+    truth = 1e-5 * np.outer(time / time[-1], rng.normal(size=6))
+    readings = design(origin, beam, point) @ truth.T
+    readings += rng.normal(0, CALIBRATION, (8, 1)) + rng.normal(0, NOISE, (8, 12))
+    raw = xr.Dataset(
+        {
+            "displacement": (("channel", "time"), readings, {"units": "m"}),
+            "origin": (("channel", "direction"), origin, {"units": "m"}),
+            "beam": (("channel", "direction"), beam, {"units": "1"}),
+        },
+        coords={"channel": CHANNELS, "time": ("time", time, {"units": "s"}), "direction": ["x", "y", "z"]},
+        attrs={"schema": SCHEMA},
+    )
+    errors = datasets.build_errors(
+        truth,
+        np.zeros((12, 6, 6)),
+        dims=("time",),
+        coords={"time": time},
+        component="spindle",
+        machine="none",
+        frame="machine",
+        functional_point=point,
+        reference="time 0",
+        method="truth",
+        method_version="1",
+        provenance={"seed": seed},
+    )
+    return raw, errors
+
+
+SOUND = MethodSubject(Sound, make, raw_vectors={"origin": "point", "beam": "direction"})
+
+
+class TestSound(MethodConformance):
+    subject = SOUND
+
+
+class CannotSayWhatItCannotSee(Sound):
+    info = replace(Sound.info, cannot_see="its shape")
+
+
+class SwallowsUnknownSettings(Sound):
+    class Settings(Settings):
+        model_config = ConfigDict(extra="ignore")
+
+
+class ForgetsItsVersion(Sound):
+    def result(self, *args):
+        return super().result(*args).assign_attrs(method_version="0")
+
+
+class JoinsAlongNothing(Sound):
+    def append_dim(self, settings):
+        return "instant"
+
+
+class Rolls(Sound):
+    def values(self, values, gain):
+        return values + 1e-13 * np.random.normal(size=values.shape)  # noqa: NPY002
+
+
+class ExaggeratesOneInstant(Sound):
+    def values(self, values, gain):
+        values[1] *= 10
+        return values
+
+
+class HidesABias(Sound):
+    """Is off by as much as a fifth of a micrometre in each sensor, the same at all times."""
+
+    def values(self, values, gain):
+        return values + gain @ np.full(8, 2.5e-7)
+
+
+class ForgetsWhatTimesShare(Sound):
+    def result(self, *args):
+        return super().result(*args).drop_vars(["influence", "source", "source_group"])
+
+
+class KnowsOnlyItsOwnFrame(Sound):
+    def values(self, values, gain):
+        return values + np.array([1e-9, 0, 0, 0, 0, 0])
+
+
+class TakesSinglePrecisionForMicrometres(Sound):
+    def displacement(self, raw):
+        return super().displacement(raw) * (1.0 if raw["displacement"].dtype == np.float64 else 1e-6)
+
+
+class CountsOnTheOrderOfDimensions(Sound):
+    def displacement(self, raw):
+        return raw["displacement"].values.astype(float)
+
+
+class RaisesKeyErrors(Sound):
+    def checked(self, raw):
+        return super().checked(raw[[*NEEDED]])
+
+
+class TakesAnySchema(Sound):
+    def checked(self, raw):
+        return super().checked(raw.assign_attrs(schema=SCHEMA))
+
+
+class TakesNothingForZero(Sound):
+    def displacement(self, raw):
+        return np.nan_to_num(super().displacement(raw))
+
+
+class LeavesItsMark(Sound):
+    def checked(self, raw):
+        super().checked(raw)["displacement"].attrs["identified"] = "yes"
+        return raw
+
+
+class ReadsMemoryOnly(Sound):
+    def checked(self, raw):
+        if not isinstance(super().checked(raw)["displacement"].variable._data, np.ndarray):
+            raise MethodError("expected arrays in memory")
+        return raw
+
+
+class PlansOneFreedom(Sound):
+    def plan(self, settings):
+        planned = super().plan(settings)
+        values = np.stack([planned[name].values for name in datasets.DOF], axis=-1)
+        values[:, 1:] = np.nan
+        unit = np.broadcast_to(np.eye(6) * 1e-14, (12, 6, 6))
+        return self.result(
+            planned["time"].values, values, unit, np.zeros((8, 12, 6)), np.zeros(3), CHANNELS, settings, None
+        )
+
+
+BROKEN = [
+    ("info_complete", CannotSayWhatItCannotSee),
+    ("settings_strict", SwallowsUnknownSettings),
+    ("schema", ForgetsItsVersion),
+    ("joins_along_a_dimension", JoinsAlongNothing),
+    ("deterministic", Rolls),
+    ("recovers_truth", ExaggeratesOneInstant),
+    ("coverage", HidesABias),
+    ("differences", ForgetsWhatTimesShare),
+    ("frame_invariance", KnowsOnlyItsOwnFrame),
+    ("number_format", TakesSinglePrecisionForMicrometres),
+    ("layout", CountsOnTheOrderOfDimensions),
+    ("refuses_missing_inputs", RaisesKeyErrors),
+    ("refuses_missing_inputs", TakesAnySchema),
+    ("nothing_measured", TakesNothingForZero),
+    ("leaves_inputs_alone", LeavesItsMark),
+    ("round_trip", ReadsMemoryOnly),
+    ("plan", PlansOneFreedom),
+]
+
+
+@pytest.mark.parametrize(("check", "plugin"), BROKEN, ids=lambda value: getattr(value, "__name__", value))
+def test_a_broken_method_fails_exactly_its_check(check, plugin):
+    results = run_checks(replace(SOUND, plugin=plugin, seeds=20))
+    failed = {result.name: result.message for result in results if not result.ok}
+    assert failed.keys() == {check}
+
+
+def test_every_check_has_a_plugin_that_fails_it():
+    assert {check for check, _ in BROKEN} == {check.name for check in METHOD_CHECKS}
+
+
+def test_every_check_says_what_it_claims():
+    assert all(len(check.claim) > 30 for check in METHOD_CHECKS)
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1 / 1.3, "too small"), (1.3, "too large")])
+def test_a_covariance_that_is_off_by_thirty_percent_is_seen(factor, verdict):
+    class States(Sound):
+        def result(self, time, values, spread, source, *rest):
+            return super().result(time, values, factor * spread, np.sqrt(factor) * source, *rest)
+
+    check = next(check for check in METHOD_CHECKS if check.name == "coverage")
+    result = run_check(check, replace(SOUND, plugin=States))
+    assert not result.ok
+    assert f"the stated covariance is {verdict}" in result.message
