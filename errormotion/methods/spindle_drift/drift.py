@@ -108,7 +108,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
             "No cylinder of the stated radius touches the five readings of the reference state. Check bar_radius "
             f"({radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
         )
-    point = np.round(then.E[0], 4) if settings.functional_point is None else np.array(settings.functional_point)
+    point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
     frame = Frame(origin, direction, levels, point)
     sigma = _noise(raw, averages, mean, settings, notes)
     sigma_then = np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size
@@ -136,7 +136,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     covariance = independent + np.einsum("sti,stj->tij", influence, influence)
     zero = float(averages.time[reference].mean())
     time = averages.time - zero
-    extras = _extras(raw, averages, mean, state, origin, direction, radius, levels, time, notes)
+    extras = _extras(raw, averages, mean, state, origin, direction, radius, levels, time)
     results = iso230_3.evaluate(
         iso230_3.quantities(errors, independent, influence, levels - point[2]),
         time,
@@ -339,9 +339,7 @@ def _extras(
     radius: float,
     levels: Array,
     time: Array,
-    notes: list[str],
 ) -> Mapping[str, xr.DataArray]:
-    del notes
     channel = ("channel", list(CHANNELS))
     axis = ("direction", list("xyz"))
 
@@ -367,7 +365,7 @@ def _extras(
         "bar_axis_point": xr.DataArray(state.E[first], coords={"direction": axis}, dims="direction", attrs={"units": "m"}),
         "bar_axis_direction": xr.DataArray(state.a[first], coords={"direction": axis}, dims="direction", attrs={"units": "1"}),
         "bar_radius": xr.DataArray(radius, attrs={"units": "m"}),
-        "level": xr.DataArray(levels, dims="height", attrs={"units": "m"}),
+        "level_height": xr.DataArray(levels, coords={"level": ["L1", "L2"]}, dims="level", attrs={"units": "m"}),
     }
     for name in ("dropped_samples", "invalid_samples"):
         if name in raw:

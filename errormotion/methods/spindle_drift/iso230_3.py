@@ -101,13 +101,8 @@ class Results:
         places = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
 
         def by_level(values: Array) -> xr.DataArray:
-            stacked = np.stack([values[[0, 2]], values[[1, 3]]])
-            # The schema's `level` is the height; here the two levels go by name.
-            return xr.DataArray(
-                stacked, dims=("level_name", "lateral", "time"),
-                coords={"level_name": places["level"], "lateral": places["lateral"], "time": time},
-                attrs={"units": "m"},
-            )
+            by_place = values[[0, 2, 1, 3]].reshape(2, 2, -1)  # X1 Y1 at L1, X2 Y2 at L2
+            return xr.DataArray(by_place, coords=places, dims=("level", "lateral", "time"), attrs={"units": "m"})
 
         return {
             "iso_value": xr.DataArray(self.value, coords=table, dims=("quantity", "measure"), attrs=units),

@@ -1,0 +1,130 @@
+"""From the readings of a stepped sphere to an error dataset of the five beams."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.beams import Beam, circles_and_line, likelihood_fit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.spindle_drift.settings import Settings
+
+    Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+_ALONG = np.cos(np.radians(1e-4))
+
+
+def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return an error dataset of component ``beam``: what each beam is, minus what it was meant to be.
+
+    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation that takes the nominal direction to the
+    actual one, about that beam's zero point. The rotation of a beam about itself is not seen: NaN where the nominal
+    beam lies along an axis; elsewhere the smallest rotation stands for it.
+
+    Raises
+    ------
+    MethodError
+        Readings that do not determine a beam; the beam is named.
+    """
+    names = [str(name) for name in raw["channel"].values]
+    radius = float(raw["sphere_radius"])
+    distance = raw["distance"].transpose("channel", "profile", "step").values.astype(np.float64)
+    centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction").values
+    scan = raw["scan_direction"].transpose("channel", "profile", "direction").values
+    origin0 = np.asarray(raw["nominal_origin"].transpose("channel", "direction").values, np.float64)
+    direction0 = np.asarray(raw["nominal_direction"].transpose("channel", "direction").values, np.float64)
+    direction0 = direction0 / np.linalg.norm(direction0, axis=1, keepdims=True)
+    found: list[Beam] = []
+    paper_origin, paper_direction = np.full_like(origin0, np.nan), np.full_like(origin0, np.nan)
+    notes: list[str] = []
+    for i, name in enumerate(names):
+        beam = likelihood_fit(distance[i], centre[i], radius, origin0[i], direction0[i], name)
+        found.append(beam)
+        clean = distance[i].copy()
+        clean[tuple(beam.left_out.T)] = np.nan
+        paper_origin[i], paper_direction[i] = circles_and_line(clean, centre[i], scan[i], radius, direction0[i])
+        missing = int(np.isnan(distance[i]).sum())
+        if missing:
+            notes.append(f"{name}: {missing} of {distance[i].size} readings are unknown (NaN).")
+        if len(beam.left_out):
+            places = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
+            notes.append(f"{name}: {len(beam.left_out)} readings left out as outliers: {places}.")
+    errors, covariance = _errors(origin0, direction0, found)
+    for note in notes:
+        log.warning(note)
+    beam_axis, axis = ("beam", names), ("direction", list("xyz"))
+    parameters = ["px", "py", "pz", "ux", "uy", "uz"]
+
+    def vectors(values: Array, unit: str) -> xr.DataArray:
+        return xr.DataArray(values, coords={"beam": beam_axis, "direction": axis}, dims=("beam", "direction"), attrs={"units": unit})
+
+    extras = {
+        "beam_origin": vectors(np.array([b.origin for b in found]), "m"),
+        "beam_direction": vectors(np.array([b.direction for b in found]), "1"),
+        "nominal_origin": vectors(origin0, "m"),
+        "nominal_direction": vectors(direction0, "1"),
+        "paper_origin": vectors(paper_origin, "m"),
+        "paper_direction": vectors(paper_direction, "1"),
+        "beam_covariance": xr.DataArray(
+            np.array([b.covariance for b in found]),
+            coords={"beam": beam_axis, "p": ("p", parameters), "p_": ("p_", parameters)},
+            dims=("beam", "p", "p_"),
+            attrs={"units": "SI: m for p, 1 for u"},
+        ),
+        "residual": xr.DataArray(
+            np.array([b.residual for b in found]),
+            coords={"beam": beam_axis},
+            dims=("beam", "profile", "step"),
+            attrs={"units": "m"},
+        ),
+        "noise": xr.DataArray(np.array([b.noise for b in found]), coords={"beam": beam_axis}, dims="beam", attrs={"units": "m"}),
+        "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), coords={"beam": beam_axis}, dims="beam"),
+    }
+    ds = build_errors(
+        errors,
+        covariance,
+        dims=("beam",),
+        coords={"beam": names},
+        component="beam",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=origin0.mean(axis=0),
+        reference="nominal beams; each beam's errors are stated at its own nominal zero point (nominal_origin)",
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, raw, None, steps=["ray-sphere likelihood fit", "circles and line"]),
+        extras=extras,
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+def _errors(origin0: Array, direction0: Array, found: list[Beam]) -> tuple[Array, Array]:
+    errors = np.empty((len(found), 6))
+    covariance = np.empty((len(found), 6, 6))
+    for i, (p0, u0, beam) in enumerate(zip(origin0, direction0, found, strict=True)):
+        sine = np.cross(u0, beam.direction)
+        cosine = float(u0 @ beam.direction)
+        if cosine <= 0:
+            raise MethodError("A detected beam points away from its nominal direction: check the nominal directions.")
+        size = float(np.linalg.norm(sine))
+        errors[i, :3] = beam.origin - p0
+        errors[i, 3:] = sine * (np.arctan2(size, cosine) / size if size > 0 else 1.0)
+        # d(u0 x u) = [u0] du; the angle's stretch is 1 to second order in a few mrad.
+        chart = np.zeros((6, 6))
+        chart[:3, :3] = np.eye(3)
+        chart[3:, 3:] = np.cross(np.eye(3), u0) * -1.0
+        covariance[i] = chart @ beam.covariance @ chart.T
+        along = int(np.argmax(np.abs(u0)))
+        if abs(u0[along]) >= _ALONG:
+            errors[i, 3 + along] = np.nan
+    return errors, covariance

@@ -1,0 +1,94 @@
+"""The plugin ``spindle_drift``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.detection import identify_beams
+from errormotion.methods.spindle_drift.drift import identify_drift
+from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SCHEMA = "errormotion.raw.spindle_drift/1"
+
+
+class SpindleDrift:
+    """How a spindle moves and tilts while it warms up, from five distance sensors on a bar."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="spindle_drift",
+        summary="Spindle drift with five sensors on a bar, ISO 230-3: beam detection and drift",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "the rotation about the spindle axis (EC)",
+            "errors within one turn of the spindle: they are averaged away",
+            "what moves the sensors' frame and is not in its temperature",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(
+        instruments=("spindle_frame",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
+    )
+    Settings: ClassVar[type[PluginSettings]] = Settings
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: Settings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition``."""
+        from errormotion.methods.spindle_drift import acquisition  # noqa: PLC0415 - identification never needs it
+
+        if settings.procedure == "beam_detection":
+            return acquisition.detect_beams(bench, settings, done)
+        return acquisition.record_drift(bench, settings, inputs.get("beams"), done)
+
+    def append_dim(self, settings: Settings) -> str:
+        """Return ``channel`` for a beam detection (beam by beam), ``time`` for a drift record."""
+        return "channel" if settings.procedure == "beam_detection" else "time"
+
+    def progress(self, settings: Settings) -> float:
+        """Return the expected length: beams, or seconds of drift."""
+        return 5.0 if settings.procedure == "beam_detection" else settings.duration
+
+    def identify(self, raw: xr.Dataset, settings: Settings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.spindle_drift/1``, either variant; stays as it is and may be larger than memory.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset does not follow its schema; all violations at once.
+        MethodError
+            The data do not determine the answer.
+        """
+        settings = settings or Settings()
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        validate(checked)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"spindle_drift reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        part = identify_beams if "step" in raw.dims else identify_drift
+        return part(checked, settings, self.info.id, self.info.version)
+
+    def plan(self, settings: Settings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        from errormotion.methods.spindle_drift.planning import plan  # noqa: PLC0415 - a plan is no part of measuring
+
+        return plan(self, settings or Settings())
+
+
