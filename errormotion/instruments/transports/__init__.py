@@ -1,1 +1,94 @@
-"""To be filled."""
+"""Moving bytes: serial lines, TCP, simulators, recordings. Only this package touches ``serial`` and ``socket``.
+
+``open_transport(url)`` returns a `Transport`:
+
+* ``serial:///dev/ttyUSB0?baudrate=921600`` a serial line, 8N1
+* ``tcp://host:port`` a TCP connection
+* ``sim://machine/device?seed=3`` a simulated device, behind a real TCP connection or pty of its own
+* ``replay://session.rec`` a recorded session, played back strictly
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.transports.address import SCHEMES, Address, parse_address
+from errormotion.instruments.transports.base import Transport
+
+if TYPE_CHECKING:
+    from errormotion.instruments.transports.recording import Recorder
+
+
+def open_transport(
+    url: str,
+    *,
+    simulator: str | None = None,
+    recorder: Recorder | Path | str | None = None,
+    timeout: float = 1.0,
+    baudrate: int | None = None,
+) -> Transport:
+    """Open the transport that an address names.
+
+    Parameters
+    ----------
+    url : str
+        Address, see the module.
+    simulator : str, optional
+        ``module:Class`` of the wire simulator behind ``sim://``.
+    recorder : Recorder or path, optional
+        Where every frame of the session is written.
+    timeout : float
+        Time limit of a silent read, s.
+    baudrate : int, optional
+        Of a serial line; the address wins where it names one.
+
+    Raises
+    ------
+    InstrumentError
+        Unknown scheme, nobody at the address, no simulator for this instrument.
+    """
+    from errormotion.instruments.transports.recording import Recorder, RecordingTransport, ReplayTransport
+
+    address = parse_address(url)
+    transport: Transport
+    match address.scheme:
+        case "tcp":
+            from errormotion.instruments.transports.tcp import TcpTransport
+
+            transport = TcpTransport(address, timeout=timeout)
+        case "serial":
+            from errormotion.instruments.transports.serial_line import SerialTransport
+
+            transport = SerialTransport(address, timeout=timeout, baudrate=baudrate)
+        case "replay":
+            transport = ReplayTransport(Path(address.path), timeout=timeout)
+        case _:
+            from errormotion.instruments.transports.simulated import SimulatedTransport
+
+            transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout)
+    if recorder is None:
+        return transport
+    try:
+        return RecordingTransport(transport, recorder if isinstance(recorder, Recorder) else Recorder(recorder, url))
+    except BaseException:
+        transport.close()
+        raise
+
+
+def load_simulator(name: str | None, url: str) -> Any:
+    """Return the simulator class named ``module:Class``; InstrumentError where there is none."""
+    if name is None:
+        raise InstrumentError(
+            f"This instrument has no simulator, so '{url}' leads nowhere; use the address of a device"
+        )
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise InstrumentError(f"The simulator '{name}' behind '{url}' does not load: {error}") from error
+
+
+__all__ = ["SCHEMES", "Address", "Transport", "open_transport", "parse_address"]

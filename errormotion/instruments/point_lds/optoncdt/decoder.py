@@ -1,0 +1,80 @@
+"""A stream's decoder: keeps what a split left over, follows the counter, fills gaps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import ProtocolError
+from errormotion.instruments.point_lds.optoncdt import kernels
+from errormotion.instruments.point_lds.optoncdt.codec import COUNTER_BITS, encode_value
+from errormotion.instruments.streaming import Chunk
+
+LARGEST_GAP = 1 << (COUNTER_BITS - 1)
+"""Samples: half the counter's circle; more cannot be told from a counter that ran backwards."""
+
+
+class StreamDecoder:
+    """Turns the bytes of one stream, however they are split, into samples without gaps.
+
+    Parameters
+    ----------
+    measuring_range : float
+        m.
+    counter : bool
+        Whether each sample brings its counter.
+    from_zero : bool
+        Whether the first sample has counter 0; else it is taken as it comes.
+    """
+
+    def __init__(self, measuring_range: float, *, counter: bool, from_zero: bool = False) -> None:
+        self._range = measuring_range
+        self._counter = counter
+        self._rest = b""
+        self._after_text = False
+        self._next = 0
+        self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
+        self._state[kernels.ANCHORED] = from_zero
+
+    @property
+    def orphans(self) -> int:
+        """Values so far that did not fit together."""
+        return int(self._state[kernels.ORPHANS])
+
+    def __call__(self, data: bytes) -> Chunk:
+        """Return the samples that the next bytes complete.
+
+        Raises
+        ------
+        ProtocolError
+            The counter leaps by more than half its circle: the sensor has restarted, or the data are no samples.
+        """
+        buffer = np.frombuffer(self._rest + data, dtype=np.uint8)
+        values = np.empty(buffer.size // 3, dtype=np.uint32)
+        text = np.empty(buffer.size, dtype=np.uint8)
+        used, n_values, n_text, self._after_text = kernels.split(buffer, values, text, self._after_text)
+        self._rest = buffer[used:].tobytes()
+        raws = np.empty(n_values + 1, dtype=np.int32)
+        numbers = np.empty(n_values + 1, dtype=np.int64)
+        count = kernels.assemble(values[:n_values], self._counter, self._state, raws, numbers)
+        return Chunk(*self._convert(raws[:count], numbers[:count]), text[:n_text].tobytes())
+
+    def _convert(self, raws: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any]) -> tuple[Any, Any]:
+        if not raws.size:
+            return np.empty(0), np.empty(0, dtype=np.uint8)
+        size = int(numbers[-1]) + 1 - self._next
+        if size - raws.size > LARGEST_GAP:
+            raise ProtocolError(
+                f"The sample counter leaps by {size - raws.size}, more than half of its {COUNTER_BITS} bits: "
+                "the sensor was restarted, or these are no samples; start the stream again"
+            )
+        distances, reasons = np.empty(size), np.empty(size, dtype=np.uint8)
+        kernels.convert(raws, numbers, self._next, self._range, distances, reasons)
+        self._next += size
+        return distances, reasons
+
+    def warm_up(self) -> None:
+        """Compile everything now, so that the first samples find it ready."""
+        trial = StreamDecoder(1.0, counter=self._counter)
+        trial(encode_value(1000) + encode_value(0, first=False))

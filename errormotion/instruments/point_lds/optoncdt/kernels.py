@@ -1,0 +1,259 @@
+"""Compiled loops of the codec: bytes to values, values to samples, samples to bytes. They run without the GIL."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from errormotion.instruments.point_lds.optoncdt.codec import (
+    ABOVE,
+    AFTER_RANGE,
+    BEFORE_RANGE,
+    BELOW,
+    ERROR_CODES,
+    FIRST_ERROR_CODE,
+    FIRST_ERROR_REASON,
+    GARBLED,
+    HIGHEST,
+    LARGEST_DISTANCE,
+    LOST,
+    LOWEST,
+    NO_PEAK,
+    OFFSET,
+    SCALE,
+    UNKNOWN,
+)
+
+Array = np.ndarray[Any, Any]
+
+MASK = 0x3FFFF
+FOLLOWING = 1 << 18  # the value is not the first of its sample
+SUSPECT = 1 << 19  # bytes were discarded right before it: its first byte may be a stray
+GARBLED_RAW = -1
+LAST_ERROR_CODE = max(ERROR_CODES)
+
+# Places in the state of `assemble`.
+NUMBER, PENDING, HAS_PENDING, JUMP_RAW, JUMP_AHEAD, HAS_JUMP, ORPHANS, ANCHORED, BASE = range(9)
+STATE_SIZE = 9
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[int, int, int, bool]:
+    """Split bytes into tagged values and the rest.
+
+    Parameters
+    ----------
+    data : ndarray, uint8
+    values : ndarray, uint32
+        Receives the values, with FOLLOWING and SUSPECT; room for a third of ``data``.
+    text : ndarray, uint8
+        Receives all other bytes; room for ``data``.
+    after_text : bool
+        Whether the bytes right before ``data`` were discarded.
+
+    Returns
+    -------
+    consumed : int
+        Bytes used; up to two at the end may be the begin of a value and have to come again with the next ones.
+    n_values, n_text : int
+    after_text : bool
+        For the next call.
+    """
+    size = data.size
+    i = n_values = n_text = 0
+    while i < size:
+        low = data[i]
+        prompt = low == 0x3E and i > 0 and data[i - 1] == 0x2D
+        if low < 0x40:
+            if i + 2 < size:
+                middle, high = data[i + 1], data[i + 2]
+                if 0x40 <= middle < 0x80 <= high:
+                    value = np.uint32(low) | np.uint32(middle & 0x3F) << 6 | np.uint32(high & 0x3F) << 12
+                    if high >= 0xC0:
+                        value |= np.uint32(FOLLOWING)
+                    if after_text:
+                        value |= np.uint32(SUSPECT)
+                        after_text = False
+                    values[n_values] = value
+                    n_values += 1
+                    i += 3
+                    continue
+            elif not prompt and (i + 1 == size or 0x40 <= data[i + 1] < 0x80):
+                break
+        text[n_text] = low
+        n_text += 1
+        after_text = not prompt  # behind a prompt the values go on cleanly
+        i += 1
+    return i, n_values, n_text, after_text
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: Array) -> int:
+    """Pair distances with their counters and number the samples; return how many there are.
+
+    A counter that jumps is believed when the next one is further on in the same direction round the 18 bits: then
+    samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both garbled.
+
+    Parameters
+    ----------
+    values : ndarray, uint32
+        From `split`.
+    counter : bool
+        Whether each sample is a distance and a counter, or a distance alone.
+    state : ndarray, int64, (STATE_SIZE,)
+        Kept from call to call; NUMBER is the number of the next sample, BASE the counter of sample 0, ANCHORED whether
+        that is known (else the first sample that comes is number 0).
+    raws : ndarray, int32
+        Receives the raw distances, GARBLED_RAW where damaged; room for ``values`` and one more.
+    numbers : ndarray, int64
+        Receives the samples' numbers since the start of the stream.
+    """
+    count = 0
+    for value in values:
+        suspect = value & SUSPECT != 0
+        raw = np.int64(GARBLED_RAW) if suspect else np.int64(value & MASK)
+        if not counter:
+            if value & FOLLOWING:
+                state[ORPHANS] += 1
+                continue
+            raws[count], numbers[count] = raw, state[NUMBER]
+            state[NUMBER] += 1
+            count += 1
+            continue
+        if not value & FOLLOWING:
+            if state[HAS_PENDING]:
+                state[ORPHANS] += 1
+                raw = np.int64(GARBLED_RAW)
+            state[PENDING], state[HAS_PENDING] = raw, 1
+            continue
+        if not state[HAS_PENDING]:
+            state[ORPHANS] += 1
+            continue
+        state[HAS_PENDING] = 0
+        raw = np.int64(GARBLED_RAW) if suspect else state[PENDING]
+        reading = np.int64(value & MASK)
+        if not state[ANCHORED]:
+            if raw == GARBLED_RAW:
+                state[ORPHANS] += 1
+                continue
+            state[ANCHORED], state[BASE] = 1, reading
+        ahead = (reading - state[BASE] - state[NUMBER]) & MASK
+        if state[HAS_JUMP] and state[JUMP_AHEAD] < ahead:
+            state[NUMBER] += state[JUMP_AHEAD]
+            raws[count], numbers[count] = state[JUMP_RAW], state[NUMBER]
+            state[NUMBER] += 1
+            count += 1
+            ahead -= state[JUMP_AHEAD] + 1
+        elif state[HAS_JUMP]:
+            state[ORPHANS] += 1
+        state[HAS_JUMP] = 0
+        if ahead == 0:
+            raws[count], numbers[count] = raw, state[NUMBER]
+            state[NUMBER] += 1
+            count += 1
+        else:
+            state[JUMP_RAW], state[JUMP_AHEAD], state[HAS_JUMP] = raw, ahead, 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def convert(raws: Array, numbers: Array, first: int, measuring_range: float, distances: Array, reasons: Array) -> None:
+    """Turn numbered raw values into distances on a gapless clock.
+
+    Parameters
+    ----------
+    raws, numbers : ndarray
+        From `assemble`.
+    first : int
+        Number of the first place of ``distances``.
+    measuring_range : float
+        Unit of the result.
+    distances : ndarray, float64
+        Receives distances from the start of the range, NaN where there is none.
+    reasons : ndarray, uint8
+        Receives the place in `codec.REASONS` of why not; 0 where there is a distance.
+    """
+    slope, offset = SCALE * measuring_range, OFFSET * measuring_range
+    place = 0
+    for i in range(raws.size):
+        here = numbers[i] - first
+        while place < here:
+            distances[place], reasons[place] = np.nan, LOST
+            place += 1
+        raw = raws[i]
+        if LOWEST <= raw <= HIGHEST:
+            distances[place], reasons[place] = raw * slope - offset, 0
+        else:
+            distances[place] = np.nan
+            if raw < 0:
+                reasons[place] = GARBLED
+            elif raw < LOWEST:
+                reasons[place] = BELOW
+            elif raw <= LARGEST_DISTANCE:
+                reasons[place] = ABOVE
+            elif FIRST_ERROR_CODE <= raw <= LAST_ERROR_CODE:
+                reasons[place] = FIRST_ERROR_REASON + raw - FIRST_ERROR_CODE
+            else:
+                reasons[place] = UNKNOWN
+        place += 1
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def quantise(distances: Array, measuring_range: float, raws: Array) -> None:
+    """Turn distances into what the sensor sends: 16 bits inside the measuring range, error codes outside.
+
+    Parameters
+    ----------
+    distances : ndarray, float64
+        From the start of the range; NaN: nothing in the beam.
+    measuring_range : float
+        In the same unit.
+    raws : ndarray, int32
+        Receives the values.
+    """
+    slope, offset = 1 / (SCALE * measuring_range), OFFSET / SCALE
+    for i in range(distances.size):
+        x = distances[i] * slope + offset
+        if np.isnan(x):
+            raws[i] = NO_PEAK
+        elif x < LOWEST:
+            raws[i] = BEFORE_RANGE
+        elif x > HIGHEST:
+            raws[i] = AFTER_RANGE
+        else:
+            raws[i] = np.int32(x + 0.5)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def encode(raws: Array, first: int, counter: bool, data: Array) -> int:
+    """Write samples as bytes; return how many.
+
+    Parameters
+    ----------
+    raws : ndarray, int32
+        Values of 18 bits; a negative one is a sample that is not sent.
+    first : int
+        Counter of the first.
+    counter : bool
+        Whether each distance is followed by its counter.
+    data : ndarray, uint8
+        Receives the bytes; room for 6 a sample.
+    """
+    n = 0
+    for i in range(raws.size):
+        raw = raws[i]
+        if raw < 0:
+            continue
+        data[n] = raw & 0x3F
+        data[n + 1] = 0x40 | raw >> 6 & 0x3F
+        data[n + 2] = 0x80 | raw >> 12 & 0x3F
+        n += 3
+        if counter:
+            number = first + i
+            data[n] = number & 0x3F
+            data[n + 1] = 0x40 | number >> 6 & 0x3F
+            data[n + 2] = 0xC0 | number >> 12 & 0x3F
+            n += 3
+    return n

@@ -1,0 +1,84 @@
+"""Settings of an optoNCDT."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from errormotion.datasets.units import Frequency, Length, Time
+from errormotion.errors import InstrumentError
+from errormotion.instruments.point_lds.optoncdt.codec import MODELS, check_line
+from errormotion.instruments.transports import parse_address
+from errormotion.plugins import PluginSettings
+
+DEFAULT_BAUDRATE = 921600
+
+
+class SensorSettings(PluginSettings):
+    """What the sensors of one frame have in common."""
+
+    model: Literal["ILD1420", "ILD2300"] = Field(default="ILD2300", description="sensor family")
+    range: Length = Field(default=2e-3, description="measuring range")
+    rate: Frequency = Field(default=20e3, description="measuring rate; one of the model's")
+    baudrate: int | None = Field(
+        default=None,
+        description="of a serial line, also behind a serial server; default: 921600 on a line, none on TCP",
+    )
+    noise: Length = Field(default=0.3e-6, description="standard deviation of a single sample", ge=0)
+    timeout: Time = Field(default=1.0, description="time limit of silence", gt=0)
+
+    @model_validator(mode="after")
+    def _fits_the_model(self) -> Self:
+        model = MODELS[self.model]
+        if not any(math.isclose(self.rate, rate, rel_tol=1e-6) for rate in model.rates):
+            known = ", ".join(f"{rate / 1000:g}" for rate in model.rates)
+            raise ValueError(f"the {self.model} measures at {known} kHz; found {self.rate / 1000:g} kHz")
+        if not any(math.isclose(self.range, length, rel_tol=1e-6) for length in model.ranges):
+            known = ", ".join(f"{length * 1000:g}" for length in model.ranges)
+            raise ValueError(f"the {self.model} is made for ranges of {known} mm; found {self.range * 1000:g} mm")
+        if self.baudrate is not None and self.baudrate not in model.baudrates:
+            known = ", ".join(str(rate) for rate in model.baudrates)
+            raise ValueError(f"the {self.model} speaks at {known} baud; found {self.baudrate}")
+        if self.baudrate is not None:
+            self._check_line(self.baudrate)
+        return self
+
+    @property
+    def with_counter(self) -> bool:
+        """Whether each distance is followed by the sample counter."""
+        return True
+
+    def line_speed(self, address: str) -> int | None:
+        """Return the baud rate at an address, None where there is no serial line.
+
+        Raises
+        ------
+        InstrumentError
+            The rate does not fit through.
+        """
+        place = parse_address(address)
+        serial = place.scheme == "serial" or place.params.get("wire") == "pty"
+        speed = int(place.number("baudrate", self.baudrate or (DEFAULT_BAUDRATE if serial else 0)))
+        if not speed:
+            return None
+        check_line(self.rate, speed, counter=self.with_counter)
+        return speed
+
+    def _check_line(self, baudrate: int) -> None:
+        try:
+            check_line(self.rate, baudrate, counter=self.with_counter)
+        except InstrumentError as error:
+            raise ValueError(str(error)) from None
+
+
+class OptoSettings(SensorSettings):
+    """Settings of one sensor."""
+
+    counter: bool = Field(default=True, description="send the sample counter, which shows lost samples")
+
+    @property
+    def with_counter(self) -> bool:
+        """Whether each distance is followed by the sample counter."""
+        return self.counter

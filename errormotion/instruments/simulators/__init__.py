@@ -1,0 +1,33 @@
+"""Wire simulators: devices that speak the real protocols over real sockets and ptys, and ask the twin for the truth.
+
+All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock.
+``world("cframe", seed=3)`` returns it, so that a test can compare with the truth.
+
+Parameters of every address: ``seed`` (0), ``pace`` (simulated seconds per second; default as fast as the readers
+take it), ``warm`` (1; 0 = the sensors were switched on just now), ``wire`` (``tcp`` or ``pty``), and the fault menu of
+`simulators.faults`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from errormotion.instruments.simulators.world import VirtualWorld
+
+
+def world(machine: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
+    """Return the world of a machine and seed; made when it is not there yet."""
+    from errormotion.instruments.simulators.world import world as find
+
+    return find(machine, seed, warm=warm)
+
+
+def reset() -> None:
+    """End all worlds of this process and their threads."""
+    from errormotion.instruments.simulators.world import reset as end_all
+
+    end_all()
+
+
+__all__ = ["reset", "world"]

@@ -1,0 +1,83 @@
+"""What the simulated devices share: a place in a world, a wire, a fault, and answering by lines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_bytes
+from errormotion.instruments.simulators.world import world
+from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import make_server
+
+DEFAULT_MACHINE = "cframe"
+
+
+class SimulatedDevice:
+    """A device in a virtual world that answers line by line.
+
+    Parameters
+    ----------
+    address : Address
+        ``sim://machine/device?seed=...``
+    faults : tuple of str
+        What of the fault menu it offers.
+    line_end : bytes
+        What ends a request.
+    default_name : str
+        Device where the address names none.
+    every : int
+        Default period of faults.
+
+    Attributes
+    ----------
+    url : str
+        Where its wire ends.
+    """
+
+    def __init__(
+        self, address: Address, *, faults: tuple[str, ...], line_end: bytes, default_name: str, every: int = 1
+    ) -> None:
+        self.name = address.path or default_name
+        self.params = address.params
+        self.fault: Fault = parse_fault(address, faults, every=every)
+        self._line_end = line_end
+        self._buffer = b""
+        self._answers = 0
+        seed = int(address.number("seed", 0))
+        self._rng = np.random.default_rng([abs(seed), *self.name.encode()])
+        self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
+        self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
+        self.url = self._server.url
+        pace = address.number("pace", 0.0)
+        self.world.attach(self, pace or None)
+        self._server.start()
+
+    def close(self) -> None:
+        """End the device; with the last one of its world the world ends."""
+        self._server.close()
+        self.world.detach(self)
+
+    def answer(self, request: bytes) -> bytes:
+        """Return the answer to one request, given without its line end."""
+        raise NotImplementedError
+
+    def reply(self, data: bytes) -> None:
+        """Send an answer, with whatever fault is due."""
+        number, fault = self._answers, self.fault
+        self._answers += 1
+        if fault.kind == "silence" and self._silent():
+            return
+        if fault.hits("garbage", number):
+            data = stray_bytes(self._rng) + data
+        with self._server.lock:
+            for piece in fault.pieces(data):
+                self._server.send(piece)
+
+    def _silent(self) -> bool:
+        return self._answers > self.fault.at
+
+    def _on_data(self, data: bytes) -> None:
+        self._buffer += data
+        while self._line_end in self._buffer:
+            request, _, self._buffer = self._buffer.partition(self._line_end)
+            self.reply(self.answer(request))

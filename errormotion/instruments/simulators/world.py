@@ -1,0 +1,298 @@
+"""The virtual world: one machine, one clock, and the thread that makes the samples of all channels in lockstep.
+
+The clock advances only while samples stream (or by ``elapse``). Nobody waits for real time unless a pace is asked
+for: a block of samples is made for every streaming channel, then sent, and sending waits for the readers. So the clock
+runs exactly as fast as the slowest reader.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from errormotion.errors import InstrumentError
+from errormotion.twin import Event, StepProgram
+
+BLOCK = 4096  # samples made at once when running freely
+PACED_BLOCK = 0.01  # s, when running at a pace
+LEAD_IN = (0.5, 2.5)  # s between the order to step and the first motion: nobody outside knows exactly
+
+
+class Stream(Protocol):
+    """A channel that wants samples."""
+
+    rate: float
+    sync: str
+    position: int
+
+    @property
+    def channel(self) -> str:
+        """Name of its beam."""
+
+    def push(self, distances: np.ndarray[Any, Any]) -> None:
+        """Send the next samples, m; may wait for the reader."""
+
+
+class Device(Protocol):
+    """A simulated device in a world."""
+
+    def close(self) -> None:
+        """End the device."""
+
+
+class VirtualWorld:
+    """A virtual machine with a clock, shared by all simulated devices on it.
+
+    Parameters
+    ----------
+    name : str
+        Kind of the machine, ``cframe`` or ``gantry``.
+    seed : int
+    warm : bool
+        Whether the sensors were switched on long ago.
+
+    Attributes
+    ----------
+    machine : VirtualMachine
+        The twin, which knows the truth.
+    time : float
+        Simulated seconds since the start of the schedule.
+    pace : float or None
+        Simulated seconds per second; None = as fast as the readers.
+    """
+
+    def __init__(self, name: str, seed: int, *, warm: bool = True) -> None:
+        from errormotion.twin import VirtualMachine
+
+        self.name = name
+        self.seed = seed
+        self.machine = VirtualMachine(name, seed, warm=warm)
+        self.pace: float | None = None
+        self.time = 0.0
+        self.tool = "bar"
+        self.motion: StepProgram | None = None
+        self._programs = 0
+        self._schedule: tuple[Event, ...] = ()
+        self._devices: set[Device] = set()
+        self._streams: list[Stream] = []
+        self._armed: list[Stream] = []  # slaves that wait for their master
+        self._change = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def attach(self, device: Device, pace: float | None = None) -> None:
+        """Count a device in; ``pace`` holds for the whole world."""
+        with self._change:
+            self._devices.add(device)
+            if pace is not None:
+                self.pace = pace
+
+    def detach(self, device: Device) -> None:
+        """Count a device out; with the last one the world ends."""
+        with self._change:
+            self._devices.discard(device)
+            empty = not self._devices
+        if empty:
+            self.end()
+
+    def end(self) -> None:
+        """Forget this world, end its devices and its thread; what it knows can still be asked. Idempotent."""
+        with _lock:
+            if _worlds.get(self._key) is self:
+                del _worlds[self._key]
+        with self._change:
+            devices, self._devices = self._devices, set()
+            self._streams.clear()
+            self._armed.clear()
+            thread, self._thread = self._thread, None
+            self._change.notify_all()
+        for device in devices:
+            device.close()
+        if thread is not None:
+            thread.join()
+
+    @property
+    def _key(self) -> tuple[str, int, bool]:
+        return self.name, self.seed, self.machine.sensors_on_for > 0
+
+    @property
+    def streaming(self) -> bool:
+        """Whether any channel streams."""
+        return bool(self._streams)
+
+    # ------------------------------------------------------------------ what a controller orders
+
+    def start(self, schedule: Sequence[Event]) -> None:
+        """Begin anew at time 0, cold, with a schedule."""
+        with self._change:
+            self._refuse_while_streaming("start a schedule")
+            self.machine.start(schedule)
+            self._schedule = tuple(schedule)
+            self.time = 0.0
+            self.motion = None
+
+    def mount(self, tool: str) -> None:
+        """Put the bar or the sphere into the spindle."""
+        if tool not in ("bar", "sphere"):
+            raise InstrumentError(f"The machine has a 'bar' and a 'sphere' to mount; found '{tool}'")
+        with self._change:
+            self._refuse_while_streaming("change the tool")
+            self.tool, self.motion = tool, None
+
+    def elapse(self, seconds: float) -> None:
+        """Let simulated time pass without samples."""
+        if not seconds >= 0:
+            raise InstrumentError(f"Time passes forwards only; found {seconds} s")
+        with self._change:
+            self._refuse_while_streaming("let time pass")
+            self.time += seconds
+
+    def run_steps(
+        self, start: Sequence[float], direction: Sequence[float], step: float, count: int, dwell: float, travel: float
+    ) -> StepProgram:
+        """Step the sphere along a line; the motion begins a short and unknown time from now."""
+        with self._change:
+            if self.tool != "sphere":
+                raise InstrumentError("Only the sphere is stepped; mount it first")
+            if self.stepping:
+                raise InstrumentError("The machine is still stepping; wait until its program has ended")
+            rng = np.random.default_rng([abs(self.seed), self._programs])
+            self._programs += 1
+            begin = self.time + rng.uniform(*LEAD_IN)
+            self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
+            return self.motion
+
+    @property
+    def stepping(self) -> bool:
+        """Whether a step program waits or runs."""
+        return self.motion is not None and self.time < self.motion.end
+
+    @property
+    def sensors_on_for(self) -> float:
+        """How long the sensors have been on, s."""
+        return self.machine.sensors_on_for + self.time
+
+    def commanded(self) -> dict[str, Any]:
+        """Return what a controller displays: time, speed, compensation, whether it is stepping."""
+        now = self.time
+        speed, compensation = 0.0, {"X": True, "Y": True, "Z": True}
+        for event in self._schedule:
+            if event.time <= now:
+                speed = speed if event.spindle_speed is None else event.spindle_speed
+                compensation.update(event.compensation or {})
+        return {"time": now, "spindle_speed": speed, "compensation": compensation, "stepping": self.stepping}
+
+    def position(self) -> list[float]:
+        """Return the commanded position of the tool, m."""
+        motion = self.motion
+        if motion is None:
+            return [0.0, 0.0, 0.0]
+        place = max(int(np.searchsorted(motion.arrivals, self.time, side="right")) - 1, 0)
+        return [float(x) for x in motion.places[place]]
+
+    def _refuse_while_streaming(self, what: str) -> None:
+        if self._streams:
+            names = ", ".join(stream.channel for stream in self._streams)
+            raise InstrumentError(f"Cannot {what} while {names} stream; stop the streams first")
+
+    # ------------------------------------------------------------------ samples
+
+    def begin_stream(self, stream: Stream) -> None:
+        """Begin to make samples: at once, for a slave when its master begins, for a master with all its slaves."""
+        with self._change:
+            if stream.sync == "SLAVE":
+                self._armed.append(stream)
+                return
+            starting = [stream]
+            if stream.sync == "MASTER":
+                starting, self._armed = [*self._armed, stream], []
+            for each in starting:
+                each.position = _first_sample(self.time, each.rate)
+            self._streams.extend(starting)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._generate, name=f"sim-world-{self.name}", daemon=True)
+                self._thread.start()
+            self._change.notify_all()
+
+    def end_stream(self, stream: Stream) -> None:
+        """Make no more samples for this channel, nor for the slaves of a master; a block in the making may come."""
+        with self._change:
+            if stream in self._armed:
+                self._armed.remove(stream)
+            if stream in self._streams:
+                self._streams.remove(stream)
+                if stream.sync == "MASTER":
+                    slaves = [each for each in self._streams if each.sync == "SLAVE"]
+                    self._armed.extend(slaves)
+                    self._streams = [each for each in self._streams if each not in slaves]
+
+    def _generate(self) -> None:
+        wall, began = time.monotonic(), self.time
+        running = False
+        while True:
+            with self._change:
+                if not self._streams:
+                    running = False
+                    self._change.wait_for(lambda: bool(self._streams) or self._thread is None)
+                if self._thread is not threading.current_thread():
+                    return
+                if not running:
+                    wall, began, running = time.monotonic(), self.time, True
+                streams, now, pace = tuple(self._streams), self.time, self.pace
+            fastest = max(streams, key=lambda stream: stream.rate)
+            size = BLOCK if pace is None else max(1, round(PACED_BLOCK * pace * fastest.rate))
+            until = (fastest.position + size) / fastest.rate
+            self._make(streams, until)
+            with self._change:
+                if self.time == now:  # nobody has set the clock meanwhile
+                    self.time = until
+            if pace is not None:
+                time.sleep(max(0.0, wall + (until - began) / pace - time.monotonic()))
+
+    def _make(self, streams: Sequence[Stream], until: float) -> None:
+        """Make the samples of all streams before a time; channels on one clock in one go."""
+        groups: dict[tuple[float, int], list[Stream]] = {}
+        for stream in streams:
+            groups.setdefault((stream.rate, stream.position), []).append(stream)
+        for (rate, first), group in groups.items():
+            size = _first_sample(until, rate) - first
+            if size <= 0:
+                continue
+            distances = self._distances(first, size, rate, [stream.channel for stream in group])
+            for stream, values in zip(group, distances, strict=True):
+                stream.position += size
+                stream.push(values)
+
+    def _distances(self, first: int, n: int, rate: float, channels: list[str]) -> np.ndarray[Any, Any]:
+        if self.tool == "sphere" and self.motion is None:  # parked outside of the frame
+            return np.full((len(channels), n), np.nan)
+        return self.machine.distances(first, n, rate, channels, tool=self.tool, motion=self.motion)
+
+
+def _first_sample(time: float, rate: float) -> int:
+    """Return the number of the first sample at or after a time, rounding errors aside."""
+    return int(np.ceil(time * rate - 1e-6))
+
+
+_worlds: dict[tuple[str, int, bool], VirtualWorld] = {}
+_lock = threading.RLock()
+
+
+def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
+    """Return the world of a machine and seed; made when it is not there yet."""
+    with _lock:
+        key = (name, int(seed), warm)
+        if key not in _worlds:
+            _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
+        return _worlds[key]
+
+
+def reset() -> None:
+    """End all worlds of this process and their threads."""
+    with _lock:
+        worlds = list(_worlds.values())
+    for each in worlds:
+        each.end()

@@ -1,0 +1,84 @@
+"""Settings of the five-sensor frame: where the sensors are connected, and how they stand around the bar."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from errormotion.datasets.units import Expansion, Length, Temperature
+from errormotion.instruments.point_lds.optoncdt.settings import SensorSettings
+
+CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
+Vector = tuple[float, float, float]
+Place = tuple[Length, Length, Length]
+
+# Beams as drawn, mid-range on a bar of 10 mm diameter along z that ends at z = 0, levels at 10 mm and 50 mm.
+_STANDOFF, _L1, _L2 = 6e-3, 10e-3, 50e-3
+NOMINAL_ORIGIN: dict[str, Place] = {
+    "X1": (_STANDOFF, 0.0, _L1),
+    "X2": (_STANDOFF, 0.0, _L2),
+    "Y1": (0.0, _STANDOFF, _L1),
+    "Y2": (0.0, _STANDOFF, _L2),
+    "Z": (0.0, 0.0, -1e-3),
+}
+NOMINAL_DIRECTION: dict[str, Vector] = {
+    "X1": (-1.0, 0.0, 0.0),
+    "X2": (-1.0, 0.0, 0.0),
+    "Y1": (0.0, -1.0, 0.0),
+    "Y2": (0.0, -1.0, 0.0),
+    "Z": (0.0, 0.0, 1.0),
+}
+
+
+class FrameSettings(SensorSettings):
+    """Settings of the frame; those of its sensors are the same for all five."""
+
+    addresses: dict[str, str] = Field(
+        default_factory=dict, description="URL of each sensor; default: made from the frame's own address"
+    )
+    origin: dict[str, Place] = Field(
+        default_factory=lambda: dict(NOMINAL_ORIGIN), description="beam origins as drawn (x, y, z)"
+    )
+    direction: dict[str, Vector] = Field(
+        default_factory=lambda: dict(NOMINAL_DIRECTION), description="beam directions as drawn (x, y, z)"
+    )
+    bar_radius: Length = Field(default=5e-3, description="calibrated radius of the bar", gt=0)
+    levels: tuple[Length, Length] = Field(default=(_L1, _L2), description="z of the levels L1 and L2")
+    expansion: tuple[Expansion, Expansion, Expansion] = Field(
+        default=(2.1e-6, 2.4e-6, 1.3e-6), description="how the frame carries the X, Y and Z sensors away per kelvin"
+    )
+    frame_temperature: str = Field(default="frame", description="name of the thermometer channel on the frame")
+    reference_temperature: Temperature = Field(default=20.0, description="temperature at which the geometry holds")
+    powered_since: datetime | None = Field(
+        default=None, description="when the sensors were switched on, for sensors that do not tell; with time zone"
+    )
+
+    @field_validator("addresses", "origin", "direction")
+    @classmethod
+    def _known_channels(cls, value: dict[str, object]) -> dict[str, object]:
+        wrong = ", ".join(sorted(set(value) - set(CHANNELS)))
+        missing = ", ".join(name for name in CHANNELS if name not in value)
+        if wrong or (missing and value):
+            raise ValueError(
+                f"the channels are {', '.join(CHANNELS)}"
+                + (f"; unknown: {wrong}" if wrong else "")
+                + (f"; missing: {missing}" if missing else "")
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Self:
+        if not 0.1e-3 <= self.bar_radius <= 0.1:
+            raise ValueError(
+                f"a bar radius between 0.1 mm and 100 mm was expected; found {self.bar_radius * 1e3:g} mm. "
+                "From Python, lengths are in m"
+            )
+        for name, direction in self.direction.items():
+            if not abs(np.linalg.norm(direction) - 1) < 1e-3:
+                raise ValueError(f"the direction of {name} must be a unit vector; found {direction}")
+        if self.powered_since is not None and self.powered_since.tzinfo is None:
+            raise ValueError("powered_since needs a time zone, such as 2025-03-01T08:00:00+01:00")
+        return self

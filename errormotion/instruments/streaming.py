@@ -1,0 +1,244 @@
+"""One reader thread for a streaming instrument, and a bounded queue behind it.
+
+The thread takes bytes off the transport, has them decoded, and queues the samples. When the queue is full the thread
+waits, if the transport holds the device back; if it does not (a serial line) the samples are thrown away, counted,
+and appear as lost. Nothing vanishes in silence.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.transports import Transport
+
+POLL = 0.1
+"""Seconds after which the thread looks whether it shall end."""
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Samples as they came off the wire.
+
+    Attributes
+    ----------
+    values : ndarray, float64, (n,)
+        NaN where there is none.
+    reasons : ndarray, uint8, (n,)
+        Why not; 0 where there is one.
+    text : bytes
+        What came between the values.
+    """
+
+    values: Array
+    reasons: Array
+    text: bytes = b""
+
+
+class Decoder(Protocol):
+    """Turns bytes, however they are split, into gapless samples."""
+
+    def __call__(self, data: bytes) -> Chunk:
+        """Return the samples that the next bytes complete."""
+
+
+class Reader:
+    """The reader thread of one stream.
+
+    Parameters
+    ----------
+    transport : Transport
+    decode : Decoder
+        Called in the thread.
+    name : str
+        Of the instrument, for messages.
+    limit : int
+        Samples in the queue at which the thread begins to wait.
+    overrun : int
+        Reason code of samples that were thrown away.
+    prompt : bytes
+        What ends an answer of the device.
+    """
+
+    def __init__(
+        self, transport: Transport, decode: Decoder, *, name: str, limit: int, overrun: int, prompt: bytes
+    ) -> None:
+        self._transport = transport
+        self._decode = decode
+        self._name = name
+        self._limit = limit
+        self._overrun = overrun
+        self._prompt = prompt
+        self._queue: deque[_Entry] = deque()
+        self._queued = 0
+        self._text = b""
+        self._reply: bytes | None = None
+        self._listening = False
+        self._final = False  # the next answer is the last thing to be read
+        self._error: InstrumentError | None = None
+        self._draining = False
+        self._ended = False
+        self._heard = time.monotonic()
+        self._change = threading.Condition()
+        self.host_time = self._heard
+        self.stray_bytes = 0
+        self._thread = threading.Thread(target=self._run, name=f"reader-{name}", daemon=True)
+        self._thread.start()
+
+    def fill(self, values: Array, reasons: Array, timeout: float) -> None:
+        """Fill both arrays with the next samples; ``host_time`` is then when the last of them came.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            The device was silent for ``timeout`` s while samples were missing.
+        InstrumentError
+            Whatever ended the thread.
+        """
+        done, size = 0, values.size
+        while done < size:
+            with self._change:
+                self._await_samples(timeout)
+                entry = self._queue[0]
+                n = min(size - done, entry.size - entry.used)
+                part = slice(entry.used, entry.used + n)
+                entry.used += n
+                if entry.used == entry.size:
+                    self._queue.popleft()
+                self._queued -= n
+                self.host_time = entry.host_time
+                if self._queued < self._limit:
+                    self._change.notify_all()
+            into = slice(done, done + n)
+            if entry.chunk is None:
+                values[into], reasons[into] = np.nan, self._overrun
+            else:
+                values[into], reasons[into] = entry.chunk.values[part], entry.chunk.reasons[part]
+            done += n
+
+    def _await_samples(self, timeout: float) -> None:
+        start = time.monotonic()
+        while not self._queue:
+            if self._error is not None:
+                raise self._error
+            left = max(self._heard, start) + timeout - time.monotonic()
+            if left <= 0:
+                raise InstrumentTimeoutError(f"{self._name}: no data for {timeout:g} s; is it on, is the cable in?")
+            self._change.wait(left)
+
+    def drain(self) -> None:
+        """From now on throw all samples away, so that the device is never held back."""
+        with self._change:
+            self._draining = True
+            self._queue.clear()
+            self._queued = 0
+            self._change.notify_all()
+
+    def ask(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
+        """Write a request and return the answer's text, prompt included, which comes between the data.
+
+        With ``final`` nothing is read after the answer.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No answer within ``timeout`` s.
+        InstrumentError
+            Whatever ended the thread.
+        """
+        with self._change:
+            self._text, self._reply, self._listening, self._final = b"", None, True, final
+        self._transport.write(request)
+        with self._change:
+            self._change.wait_for(lambda: self._reply is not None or self._error is not None, timeout)
+            self._listening = False
+            if self._reply is not None:
+                return self._reply
+            if self._error is not None:
+                raise self._error
+            raise InstrumentTimeoutError(f"{self._name}: no answer to {request!r} within {timeout:g} s")
+
+    def stop(self, request: bytes, timeout: float) -> bytes:
+        """Write the request that ends the stream, wait for its answer, end the thread; return the answer."""
+        self.drain()
+        try:
+            return self.ask(request, timeout, final=True)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """End the thread whatever the device does; idempotent."""
+        with self._change:
+            self._ended = True
+            self._change.notify_all()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._ended:
+                try:
+                    data = self._transport.read(timeout=POLL)
+                except InstrumentTimeoutError:
+                    continue
+                now = time.monotonic()
+                self._accept(self._decode(data), now)
+        except InstrumentError as error:
+            with self._change:
+                self._error = error
+                self._change.notify_all()
+
+    def _accept(self, chunk: Chunk, now: float) -> None:
+        with self._change:
+            self._heard = now
+            if chunk.text:
+                self._accept_text(chunk.text)
+            size = chunk.values.size
+            if self._draining or not size:
+                return
+            if self._queued >= self._limit:
+                if self._transport.holds_back:
+                    self._change.wait_for(lambda: self._queued < self._limit or self._draining or self._ended)
+                    if self._draining:
+                        return
+                else:
+                    self._throw_away(size, now)
+                    return
+            self._queue.append(_Entry(chunk, size, now))
+            self._queued += size
+            self._change.notify_all()
+
+    def _accept_text(self, text: bytes) -> None:
+        if not self._listening:
+            self.stray_bytes += len(text)
+            return
+        self._text += text
+        head, found, tail = self._text.partition(self._prompt)
+        if found:
+            self._reply, self._listening = head + found, False
+            self.stray_bytes += len(tail)
+            self._ended = self._ended or self._final
+            self._change.notify_all()
+
+    def _throw_away(self, size: int, now: float) -> None:
+        last = self._queue[-1]
+        if last.chunk is None:
+            last.size += size
+        else:
+            self._queue.append(_Entry(None, size, now))
+        self._queued += size
+
+
+@dataclass
+class _Entry:
+    chunk: Chunk | None  # None: thrown away
+    size: int
+    host_time: float
+    used: int = 0

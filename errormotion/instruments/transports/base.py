@@ -1,0 +1,91 @@
+"""What a transport is: bytes out, bytes in, a time limit on silence."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+
+from errormotion.errors import InstrumentTimeoutError, ProtocolError
+
+CHUNK = 65536
+"""Most bytes taken off the wire at once."""
+
+
+class Transport(ABC):
+    """A stream of bytes to and from one device.
+
+    Attributes
+    ----------
+    url : str
+        The address.
+    timeout : float
+        Time limit of a silent read, s.
+    holds_back : bool
+        Whether a device waits (or loses data itself, visibly) while nobody reads here. On a serial line nothing holds
+        the bytes back: they are lost without a trace.
+    simulated : bool
+        Whether a simulator is at the other end.
+    """
+
+    holds_back = True
+    simulated = False
+
+    def __init__(self, url: str, timeout: float) -> None:
+        self.url = url
+        self.timeout = timeout
+        self._rest = b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; InstrumentError when the connection is gone."""
+        self._send(data)
+
+    def read(self, max_bytes: int = CHUNK, timeout: float | None = None) -> bytes:
+        """Return between 1 and ``max_bytes`` bytes, as soon as there are any.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Silence for ``timeout`` (default: the transport's own) seconds.
+        InstrumentError
+            The connection is gone.
+        """
+        if self._rest:
+            data, self._rest = self._rest[:max_bytes], self._rest[max_bytes:]
+            return data
+        return self._receive(max_bytes, self.timeout if timeout is None else timeout)
+
+    def read_until(self, terminator: bytes, *, limit: int = CHUNK, timeout: float | None = None) -> bytes:
+        """Return all bytes up to and with ``terminator``; what follows it stays for the next read.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No terminator within the time limit; the message shows what came.
+        ProtocolError
+            ``limit`` bytes without one.
+        """
+        allowed = self.timeout if timeout is None else timeout
+        end, data = time.monotonic() + allowed, b""
+        while terminator not in data:
+            if len(data) >= limit:
+                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start {data[:32]!r}")
+            try:
+                data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
+            except InstrumentTimeoutError:
+                came = f"only {data[:64]!r}" if data else "nothing"
+                raise InstrumentTimeoutError(
+                    f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; {came} came"
+                ) from None
+        head, found, tail = data.partition(terminator)
+        self._rest = tail + self._rest
+        return head + found
+
+    @abstractmethod
+    def _send(self, data: bytes) -> None: ...
+
+    @abstractmethod
+    def _receive(self, max_bytes: int, timeout: float) -> bytes: ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection; idempotent."""

@@ -1,0 +1,200 @@
+"""Recording a session, and playing it back strictly.
+
+A recording is a text file: a head line with the address, then one line a frame::
+
+    errormotion-session/1 2025-03-01T12:00:00+00:00 tcp://192.168.0.2:23
+    W 0.000213 5f3a11c0 4f5554505554204e4f4e450d0a
+    R 0.001877 91b2d377 2d3e
+    END 2 91b2d377
+
+``W`` is written by the driver, ``R`` came from the device; then follow seconds since the start, a checksum, and the
+bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: no byte changes, no
+frame vanishes or moves unseen.
+
+Played back, each write must be the next recorded one, byte for byte; a frame that came after a write comes after that
+write again; and at the end nothing may be left over. Everything else is a `ReplayError`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+from zlib import crc32
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
+from errormotion.instruments.transports.base import Transport
+
+FORMAT = "errormotion-session/1"
+
+
+class Recorder:
+    """Writes the frames of one session to a new file; InstrumentError where the file is there or cannot be made."""
+
+    def __init__(self, path: Path | str, address: str) -> None:
+        self._start = time.monotonic()
+        self._crc = 0
+        self._frames = 0
+        self._lock = threading.Lock()
+        try:
+            self._file = Path(path).open("x", encoding="ascii", errors="backslashreplace")  # noqa: SIM115 - kept open
+        except FileExistsError:
+            raise InstrumentError(f"The recording {path} is there already; name another file or remove it") from None
+        except OSError as error:
+            raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+        self._file.write(f"{FORMAT} {datetime.now(UTC).isoformat(timespec='seconds')} {address}\n")
+
+    def frame(self, direction: str, data: bytes) -> None:
+        """Append one frame; ``direction`` is W or R."""
+        with self._lock:
+            if self._file.closed:
+                return
+            self._crc = crc32(direction.encode() + data, self._crc)
+            self._frames += 1
+            self._file.write(f"{direction} {time.monotonic() - self._start:.6f} {self._crc:08x} {data.hex()}\n")
+
+    def close(self) -> None:
+        """Write the last line; idempotent."""
+        with self._lock:
+            if not self._file.closed:
+                self._file.write(f"END {self._frames} {self._crc:08x}\n")
+                self._file.close()
+
+
+class RecordingTransport(Transport):
+    """Passes all through to another transport, and every frame to a recorder."""
+
+    def __init__(self, inner: Transport, recorder: Recorder) -> None:
+        super().__init__(inner.url, inner.timeout)
+        self._inner = inner
+        self._recorder = recorder
+        self.holds_back = inner.holds_back
+        self.simulated = inner.simulated
+
+    def _send(self, data: bytes) -> None:
+        self._recorder.frame("W", data)  # before it goes out: the answer must not overtake it
+        self._inner.write(data)
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        data = self._inner.read(max_bytes, timeout)
+        self._recorder.frame("R", data)
+        return data
+
+    def close(self) -> None:
+        """Close the connection, then the recording; idempotent."""
+        self._inner.close()
+        self._recorder.close()
+
+
+def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
+    """Return the address of a recorded session and its frames as (direction, bytes).
+
+    Raises
+    ------
+    ReplayError
+        No such file, not a recording, a changed byte, a missing end; with the line number.
+    """
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except OSError as error:
+        raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ReplayError(f"{path} is not a recording, or is damaged: byte {error.start} is not ASCII") from None
+    head = lines[0].split(" ", 2) if lines else []
+    if len(head) != 3 or head[0] != FORMAT:
+        raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
+    if len(lines) < 2 or not lines[-1].startswith("END "):
+        raise ReplayError(f"The recording {path} is cut off: its last line should begin with 'END'; record it again")
+    frames: list[tuple[str, bytes]] = []
+    crc = 0
+    for number, line in enumerate(lines[1:-1], start=2):
+        try:
+            direction, _, check, text = line.split(" ")
+            data = bytes.fromhex(text)
+            crc = crc32(direction.encode() + data, crc)
+            right = direction in ("W", "R") and check == f"{crc:08x}"
+        except ValueError:
+            right = False
+        if not right:
+            raise ReplayError(f"{path}, line {number}: this frame is not what was recorded (its checksum is wrong)")
+        frames.append((direction, data))
+    if lines[-1] != f"END {len(frames)} {crc:08x}":
+        raise ReplayError(f"{path}: its end does not fit its {len(frames)} frames; record it again")
+    return head[2], frames
+
+
+class ReplayTransport(Transport):
+    """Plays a recorded session back; see the module for what it is strict about."""
+
+    def __init__(self, path: Path, *, timeout: float = 1.0) -> None:
+        super().__init__(f"replay://{path}", timeout)
+        self.recorded_address, frames = read_recording(path)
+        self.simulated = self.recorded_address.startswith("sim://")
+        self._writes = deque(data for direction, data in frames if direction == "W")
+        self._reads: deque[tuple[int, bytes]] = deque()  # (writes that come before, bytes)
+        before = 0
+        for direction, data in frames:
+            if direction == "W":
+                before += 1
+            else:
+                self._reads.append((before, data))
+        self._written = 0
+        self._partial = b""
+        self._closed = False
+        self._change = threading.Condition()
+
+    def _send(self, data: bytes) -> None:
+        with self._change:
+            self._partial += data
+            while self._partial:
+                if not self._writes:
+                    raise ReplayError(f"{self.url}: expected no further write; the driver writes {self._partial!r}")
+                expected = self._writes[0]
+                if not expected.startswith(self._partial[: len(expected)]):
+                    raise ReplayError(f"{self.url}: expected the driver to write {expected!r}; it writes {data!r}")
+                if len(self._partial) < len(expected):
+                    break
+                self._partial = self._partial[len(expected) :]
+                self._writes.popleft()
+                self._written += 1
+            self._change.notify_all()
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        with self._change:
+            if self._closed:
+                raise InstrumentError(f"The recording {self.url} is closed")
+            if not self._reads:
+                raise ReplayError(f"{self.url}: the recording is over, but the driver reads on")
+            if not self._change.wait_for(lambda: self._closed or self._reads[0][0] <= self._written, timeout):
+                raise InstrumentTimeoutError(
+                    f"{self.url}: the device goes on only after {self._writes[0]!r} is written"
+                )
+            if self._closed:
+                raise InstrumentError(f"The recording {self.url} is closed")
+            before, data = self._reads.popleft()
+            if len(data) > max_bytes:
+                self._reads.appendleft((before, data[max_bytes:]))
+            return data[:max_bytes]
+
+    def close(self) -> None:
+        """Close; idempotent.
+
+        Raises
+        ------
+        ReplayError
+            The session went on where the driver stops.
+        """
+        with self._change:
+            if self._closed:
+                return
+            self._closed = True
+            self._change.notify_all()
+            left_bytes = sum(len(data) for _, data in self._reads) + len(self._rest)
+            left_writes = len(self._writes)
+        if left_bytes or left_writes or self._partial:
+            raise ReplayError(
+                f"{self.url}: the driver stops, but the recording goes on with {left_writes} writes "
+                f"and {left_bytes} bytes from the device"
+            )

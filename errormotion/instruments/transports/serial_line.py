@@ -1,0 +1,59 @@
+"""A serial line, 8N1."""
+
+from __future__ import annotations
+
+import serial
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.transports.address import Address
+from errormotion.instruments.transports.base import Transport
+
+DEFAULT_BAUDRATE = 9600
+
+
+class SerialTransport(Transport):
+    """A serial line: 8 data bits, no parity, one stop bit."""
+
+    holds_back = False
+
+    def __init__(self, address: Address, *, timeout: float = 1.0, baudrate: int | None = None) -> None:
+        super().__init__(address.url, timeout)
+        speed = int(address.number("baudrate", baudrate or DEFAULT_BAUDRATE))
+        self._port: serial.Serial | None = None
+        try:
+            self._port = serial.Serial(address.path, speed, timeout=timeout, write_timeout=timeout)
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise InstrumentError(f"The serial line {self.url} cannot be opened at {speed} baud: {error}") from None
+
+    def _line(self) -> serial.Serial:
+        if self._port is None:
+            raise InstrumentError(f"The serial line {self.url} is closed")
+        return self._port
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._line().write(data)
+        except serial.SerialTimeoutException:
+            raise InstrumentTimeoutError(f"{self.url} takes no bytes for {self.timeout:g} s") from None
+        except OSError as error:
+            raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        port = self._line()
+        try:
+            if port.timeout != timeout:
+                port.timeout = timeout
+            data: bytes = port.read(1)
+            if data and max_bytes > 1 and (waiting := port.in_waiting):
+                data += port.read(min(waiting, max_bytes - 1))
+        except (OSError, TypeError) as error:  # TypeError: pyserial's, when the port is closed meanwhile
+            raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
+        if not data:
+            raise InstrumentTimeoutError(f"{self.url} is silent for {timeout:g} s")
+        return data
+
+    def close(self) -> None:
+        """Close the line; idempotent."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None

@@ -1,0 +1,187 @@
+"""The device end of a wire, on loopback: what the simulators speak through."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+from errormotion.errors import InstrumentError
+
+SEND_BUFFER = 32768
+"""Bytes: bounds how far a virtual clock runs ahead of its reader."""
+
+
+class Server(ABC):
+    """One device's end of a wire, with a thread that hands over what comes in.
+
+    Attributes
+    ----------
+    url : str
+        Where a driver reaches it.
+    lock : threading.RLock
+        Held while bytes go out, so that two senders do not mix theirs.
+    """
+
+    url: str
+
+    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
+        self._on_data = on_data
+        self.lock = threading.RLock()
+        self._ended = threading.Event()
+        self._wake_read, self._wake_write = socket.socketpair()
+        self._thread = threading.Thread(target=self._run, name=f"sim-{name}", daemon=True)
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Hang up and end the thread; idempotent."""
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        self.hang_up()
+        self._wake_write.send(b".")
+        if self._thread is not threading.current_thread() and self._thread.ident is not None:
+            self._thread.join()
+        self._release()
+        self._wake_read.close()
+        self._wake_write.close()
+
+    @abstractmethod
+    def send(self, data: bytes | memoryview) -> bool:
+        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+
+    @abstractmethod
+    def hang_up(self) -> None:
+        """Drop the present connection; another one may come."""
+
+    @abstractmethod
+    def _run(self) -> None: ...
+
+    @abstractmethod
+    def _release(self) -> None: ...
+
+
+class TcpServer(Server):
+    """Listens on a free port of 127.0.0.1; one connection at a time."""
+
+    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
+        super().__init__(name, on_data)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        self._line: socket.socket | None = None
+        self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+
+    def send(self, data: bytes | memoryview) -> bool:
+        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+        with self.lock:
+            line = self._line
+            if line is None:
+                return False
+            try:
+                line.sendall(data)
+            except OSError:
+                return False
+            return True
+
+    def hang_up(self) -> None:
+        """Drop the present connection; another one may come."""
+        line = self._line  # no lock: a sender may hold it, waiting for a reader who is gone
+        if line is not None:
+            try:
+                line.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                return  # the other side was faster
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            ready, _, _ = select.select([self._line or self._listener, self._wake_read], [], [])
+            if self._wake_read in ready:
+                break
+            if self._line is None:
+                line, _ = self._listener.accept()
+                line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._line = line
+                continue
+            try:
+                data = self._line.recv(4096)
+            except OSError:
+                data = b""
+            if data:
+                self._on_data(data)
+            else:
+                self._forget()
+
+    def _forget(self) -> None:
+        line = self._line
+        self.hang_up()
+        with self.lock:
+            self._line = None
+        if line is not None:
+            line.close()
+
+    def _release(self) -> None:
+        self._forget()
+        self._listener.close()
+
+
+class PtyServer(Server):
+    """A pseudo terminal: the driver opens its far end as a serial line."""
+
+    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
+        import tty  # only where there are terminals
+
+        super().__init__(name, on_data)
+        self._near, self._far = os.openpty()  # the far end stays open here: else its first closing ends the line
+        tty.setraw(self._far)
+        os.set_blocking(self._near, False)
+        self._cut = False
+        self.url = f"serial://{os.ttyname(self._far)}"
+
+    def send(self, data: bytes | memoryview) -> bool:
+        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+        view = memoryview(data)
+        with self.lock:
+            while len(view) and not (self._ended.is_set() or self._cut):
+                if select.select([], [self._near], [], 0.05)[1]:
+                    try:
+                        view = view[os.write(self._near, view) :]
+                    except BlockingIOError:
+                        continue
+                    except OSError:
+                        return False
+        return not self._cut and not self._ended.is_set()
+
+    def hang_up(self) -> None:
+        """Pull the cable: a serial line has no connection to drop, it just goes silent for good."""
+        self._cut = True
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            ready, _, _ = select.select([self._near, self._wake_read.fileno()], [], [])
+            if self._wake_read.fileno() in ready:
+                break
+            try:
+                data = os.read(self._near, 4096)
+            except OSError:
+                break
+            if data and not self._cut:
+                self._on_data(data)
+
+    def _release(self) -> None:
+        os.close(self._near)
+        os.close(self._far)
+
+
+def make_server(wire: str, name: str, on_data: Callable[[bytes], None]) -> Server:
+    """Return a server for ``wire``: ``tcp`` or ``pty``; InstrumentError for another one."""
+    if wire == "tcp":
+        return TcpServer(name, on_data)
+    if wire == "pty":
+        return PtyServer(name, on_data)
+    raise InstrumentError(f"A simulated device speaks over 'wire=tcp' or 'wire=pty'; found 'wire={wire}'")

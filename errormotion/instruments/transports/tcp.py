@@ -1,0 +1,70 @@
+"""A TCP connection."""
+
+from __future__ import annotations
+
+import socket
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.transports.address import Address
+from errormotion.instruments.transports.base import Transport
+
+
+class TcpTransport(Transport):
+    """A TCP connection to a device or a serial server.
+
+    ``receive_buffer`` (bytes) bounds what the system holds for a slow reader; the default is the system's.
+    """
+
+    def __init__(self, address: Address, *, timeout: float = 1.0, receive_buffer: int | None = None) -> None:
+        super().__init__(address.url, timeout)
+        self._socket: socket.socket | None = None
+        line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            if receive_buffer is not None:
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+            line.settimeout(timeout)
+            line.connect((address.host, address.port))
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except TimeoutError:
+            line.close()
+            raise InstrumentTimeoutError(f"Nobody answers at {self.url} within {timeout:g} s") from None
+        except OSError as error:
+            line.close()
+            raise InstrumentError(
+                f"No connection to {self.url}: {error.strerror or error}; is the device on?"
+            ) from None
+        self._socket = line
+
+    def _line(self) -> socket.socket:
+        if self._socket is None:
+            raise InstrumentError(f"The connection to {self.url} is closed")
+        return self._socket
+
+    def _send(self, data: bytes) -> None:
+        line = self._line()
+        try:
+            line.settimeout(self.timeout)
+            line.sendall(data)
+        except TimeoutError:
+            raise InstrumentTimeoutError(f"{self.url} takes no bytes for {self.timeout:g} s") from None
+        except OSError as error:
+            raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        line = self._line()
+        try:
+            line.settimeout(timeout)
+            data = line.recv(max_bytes)
+        except (TimeoutError, BlockingIOError):
+            raise InstrumentTimeoutError(f"{self.url} is silent for {timeout:g} s") from None
+        except OSError as error:
+            raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
+        if not data:
+            raise InstrumentError(f"The connection to {self.url} is lost: the device closed it")
+        return data
+
+    def close(self) -> None:
+        """Close the connection; idempotent."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
