@@ -134,9 +134,10 @@ def dotted(keys: Iterable[Key]) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence for an unknown name: the nearest known one if any is near, and what there is."""
-    names = sorted(known)
-    near = get_close_matches(name, names, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
+    names = sorted(set(known))
+    by_lower = {known_name.lower(): known_name for known_name in names}
+    near = get_close_matches(name.lower(), by_lower, n=1)
+    hint = f"did you mean '{by_lower[near[0]]}'? " if near else ""
     return f"{hint}Known here: {', '.join(names) or 'none'}"
 
 
@@ -152,7 +153,9 @@ def _mistake(details: ErrorDetails, model: type[BaseModel], prefix: Sequence[Key
     if kind == "quantity":
         return f"{place}: {message}"
     if kind in ("value_error", "assertion_error"):
-        return f"{place}: {message.partition(', ')[2]}; found {_short(found)}"
+        told = message.partition(", ")[2]
+        complete = isinstance(found, Mapping) or "; found" in told  # of a whole table, or in its own words
+        return f"{place}: {told}" if complete else f"{place}: {told}; found {_short(found)}"
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected.startswith(("greater", "less")):
         expected = f"a value {expected}"
