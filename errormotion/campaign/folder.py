@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from errormotion.campaign.store import replace_text
+from errormotion.datasets.provenance import plain
 from errormotion.errors import RunError
 
 SCHEMA = "errormotion.run/1"
@@ -91,7 +91,7 @@ class RunFolder:
     def save(self, **changes: Any) -> None:
         """Change fields of ``run.json`` and write it."""
         self.data |= changes | {"updated": now()}
-        replace_text(self.path / "run.json", json.dumps(strict(self.data), indent=1, ensure_ascii=False) + "\n")
+        replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 
     def step(self, name: str, outcome: str, **details: Any) -> None:
         """Add one line to what happened to this run."""
@@ -168,14 +168,3 @@ def list_runs(runs: Path) -> list[RunFolder]:
 def now() -> str:
     """Return the time now in UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def strict(value: Any) -> Any:
-    """Return a value that strict JSON can hold: numbers that are none become null, and what is unknown its text."""
-    if isinstance(value, dict):
-        return {str(k): strict(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [strict(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, str | int | bool | None) else str(value)

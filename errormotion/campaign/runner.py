@@ -9,12 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import platform
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol
 from uuid import uuid4
@@ -24,12 +23,12 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import RunFolder, list_runs, now, strict
+from errormotion.campaign.folder import RunFolder, list_runs, now
 from errormotion.campaign.journal import journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
+from errormotion.campaign.store import committed_length
+from errormotion.datasets import provenance
 from errormotion.errors import ErrormotionError, RunError
-
-SOFTWARE = ("errormotion", "numpy", "scipy", "xarray", "zarr", "numba", "pydantic")
 
 log = logging.getLogger(__name__)
 
@@ -184,7 +183,7 @@ class _Session:
     def _new_folder(self, test: TestPlan) -> RunFolder:
         plan = self.campaign
         info = test.method.info
-        settings = strict(test.settings.model_dump(mode="json"))
+        settings = provenance.plain(test.settings.model_dump(mode="json"))
         return RunFolder.create(
             self.runs,
             test.name,
@@ -211,7 +210,7 @@ class _Session:
                 "settings_hash": settings_hash(settings, info.id, info.version),
                 "inputs": {},
                 "instruments": [answer.record() for answer in self.bench.answers],
-                "software": _software(),
+                "software": provenance.make({}, None, None)["software"],
                 "samples": {},
                 "raw": "raw.zarr",
                 "errors": None,
@@ -240,6 +239,8 @@ class _Session:
     def _acquire(self, folder: RunFolder, test: TestPlan, inputs: Mapping[str, xr.Dataset]) -> None:
         method = test.method()
         dim, expected = method.append_dim(test.settings), float(method.progress(test.settings))
+        if folder.raw.exists() and committed_length(folder.raw, dim) == 0:  # made, and cut off before its first samples
+            shutil.rmtree(folder.raw)
         done = datasets.load(folder.raw) if folder.raw.exists() else None
         before = int(done.sizes[dim]) if done is not None else 0
         folder.data["instruments"] = [answer.record() for answer in self.bench.answers]
@@ -249,7 +250,7 @@ class _Session:
         log.info("acquire", extra={"data": {"test": test.name, "method": method.info.id, "samples": before}})
         self.progress.stage("measuring", expected)
         self.progress.advance(before)
-        attrs = {"instruments": json.dumps(strict(folder.data["instruments"])), "start": now()}
+        attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         try:
@@ -375,13 +376,3 @@ def _stored_plan(folder: RunFolder) -> CampaignPlan:
     campaign, bench = folder.data["campaign"], folder.data["bench"]
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     return parse_campaign(campaign["text"], folder.path / f"run.json ({campaign['file']})", plan)
-
-
-def _software() -> dict[str, str]:
-    found = {"python": platform.python_version(), "system": platform.platform()}
-    for name in SOFTWARE:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

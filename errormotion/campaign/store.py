@@ -69,7 +69,7 @@ class RawStore:
         if not self._arrays:
             raise RunError(f"{path}: expected at least one variable along '{dim}'; found none")
         self.block = next(iter(self._arrays.values())).block
-        self.count = self.committed = self._known_length()
+        self.count = self.committed = committed_length(path, dim)
         for column in self._arrays.values():
             column.load(self.count)
         self._unsynced: set[Path] = set()
@@ -103,7 +103,7 @@ class RawStore:
         encoding: dict[str, dict[str, Any]] = {}
         for name, stored in skeleton.variables.items():
             if stored.dtype.kind == "U":
-                skeleton[name] = stored.astype(object)
+                skeleton[name] = stored.astype(np.dtypes.StringDType())
             skeleton[name].encoding = {}
         for name, variable in growing.items():
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
@@ -173,12 +173,6 @@ class RawStore:
     def attrs(self) -> dict[str, Any]:
         """Attributes of the dataset; written with the next :meth:`commit`."""
         return cast(dict[str, Any], self._root["attributes"])
-
-    def _known_length(self) -> int:
-        """Return the length that the root knows, 0 before the first commit."""
-        known = self._root.get("consolidated_metadata", {}).get("metadata", {})
-        lengths = {known[name]["shape"][column.axis] for name, column in self._arrays.items() if name in known}
-        return int(lengths.pop()) if lengths else 0
 
     def _write_block(self) -> None:
         """Write the current block of every array."""
@@ -276,6 +270,15 @@ class _Column:
         shape = list(self._metadata["shape"])
         shape[self.axis] = count
         return self._metadata | {"shape": shape}
+
+
+def committed_length(path: Path, dim: str) -> int:
+    """Return the samples that a reader of a store sees; 0 before the first commit."""
+    root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    for metadata in root.get("consolidated_metadata", {}).get("metadata", {}).values():
+        if dim in metadata["dimension_names"]:
+            return int(metadata["shape"][metadata["dimension_names"].index(dim)])
+    return 0
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -1,0 +1,219 @@
+"""The commands. Each imports what it needs when it is called, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from errormotion.cli.guard import ERROR, INVALID, guarded
+from errormotion.cli.output import show, show_json, table
+
+app = typer.Typer(
+    name="errormotion",
+    help="Measure how machine tools move wrongly.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+plugins_app = typer.Typer(no_args_is_help=True, help="What instruments and methods there are.", rich_markup_mode=None)
+bench_app = typer.Typer(no_args_is_help=True, help="Check a bench file, or the bench itself.", rich_markup_mode=None)
+app.add_typer(plugins_app, name="plugins")
+app.add_typer(bench_app, name="bench")
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
+Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: what the campaign says.")]
+
+
+def _version(value: bool) -> None:
+    if value:
+        from errormotion import __version__
+
+        show(f"errormotion {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Measure how machine tools move wrongly."""
+    del version
+
+
+@app.command()
+@guarded
+def demo(
+    runs: Annotated[Path, typer.Option(help="Folder for the run folders.")] = Path("runs"),
+    json_: Json = False,
+) -> None:
+    """Measure the spindle drift of a virtual machine, and compare it to the truth."""
+    from errormotion.cli import demonstration
+
+    demonstration.run(runs, json_)
+
+
+@app.command()
+@guarded
+def run(
+    campaign: Annotated[
+        Path | None, typer.Argument(help="A campaign file; with --resume it may be left out.", show_default=False)
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished campaign.")] = False,
+    runs: Runs = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Don't wait for the operator: all is as it is asked for.")] = False,
+    report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
+    json_: Json = False,
+) -> None:
+    """Make the tests of a campaign: acquire, identify, report."""
+    from errormotion.cli import running
+
+    running.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)
+
+
+@app.command()
+@guarded
+def identify(
+    raw: Annotated[Path, typer.Argument(help="A raw dataset: NetCDF file, Zarr folder, or run folder.")],
+    method: Annotated[str, typer.Option(help="The id of a method plugin.")],
+    out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    json_: Json = False,
+) -> None:
+    """Turn a raw dataset into an error dataset."""
+    from errormotion.cli import data
+
+    data.identify(raw, method, out, set_ or [], settings, json_)
+
+
+@app.command("import")
+@guarded
+def import_(
+    log: Annotated[Path, typer.Argument(help="A log with columns: CSV or TSV.")],
+    map_: Annotated[Path, typer.Option("--map", help="A TOML file that says what the columns are.")],
+    out: Annotated[Path, typer.Option(help="The raw dataset to write: .nc or .zarr.")],
+    json_: Json = False,
+) -> None:
+    """Turn a log that a lab already has into a raw dataset."""
+    from errormotion.cli import data
+
+    data.import_log(log, map_, out, json_)
+
+
+@app.command()
+@guarded
+def report(
+    run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
+    out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
+    json_: Json = False,
+) -> None:
+    """Write the report of a run anew."""
+    from errormotion.cli import data
+
+    data.report(run, out, json_)
+
+
+@app.command()
+@guarded
+def validate(
+    file: Annotated[Path, typer.Argument(help="A dataset (.nc, .zarr), a run folder, a bench or a campaign file.")],
+    json_: Json = False,
+) -> None:
+    """Check that a file follows its schema, and tell every violation."""
+    from errormotion.cli import data
+
+    mistakes = data.validate(file)
+    if json_:
+        show_json({"ok": not mistakes, "file": str(file), "violations": mistakes})
+    else:
+        show("\n  - ".join([f"{file}: {len(mistakes)} violations", *mistakes]) if mistakes else f"{file}: good")
+    if mistakes:
+        raise typer.Exit(INVALID)
+
+
+@app.command()
+@guarded
+def doctor(json_: Json = False) -> None:
+    """Check that this machine has what errormotion needs."""
+    from errormotion.cli import examination
+
+    findings = examination.examine()
+    if json_:
+        show_json({"ok": all(f.ok for f in findings), "findings": [f.__dict__ for f in findings]})
+    else:
+        show(table(["", "what", "found"], [["ok" if f.ok else "BAD", f.name, f.message] for f in findings]))
+    if not all(f.ok for f in findings):
+        raise typer.Exit(ERROR)
+
+
+@plugins_app.command("list")
+@guarded
+def plugins_list(json_: Json = False) -> None:
+    """List all plugins, those that do not load included."""
+    from errormotion.cli import plugging
+
+    plugging.list_plugins(json_)
+
+
+@plugins_app.command("show")
+@guarded
+def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: Json = False) -> None:
+    """Show what a plugin says of itself, and its settings."""
+    from errormotion.cli import plugging
+
+    plugging.show_plugin(plugin, json_)
+
+
+@plugins_app.command("check")
+@guarded
+def plugins_check(
+    plugin: Annotated[str, typer.Argument(help="Its id.")],
+    address: Annotated[str | None, typer.Option(help="Where a real instrument is; default: its simulator.")] = None,
+    json_: Json = False,
+) -> None:
+    """Run the conformance kit on a plugin."""
+    from errormotion.cli import plugging
+
+    if not plugging.check_plugin(plugin, address, json_):
+        raise typer.Exit(INVALID)
+
+
+@bench_app.command("validate")
+@guarded
+def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+    """Check a bench file; nothing is opened."""
+    from errormotion.campaign.files import load_bench
+    from errormotion.errors import BenchError
+
+    try:
+        plan = load_bench(file)
+    except BenchError as error:
+        if json_:
+            show_json({"ok": False, "file": str(file), "message": str(error)})
+        typer.echo(str(error), err=True)
+        raise typer.Exit(INVALID) from error
+    rows = [[i.name, i.driver.info.id, i.driver.info.kind, i.address] for i in plan.instruments]
+    if json_:
+        keys = ("name", "driver", "kind", "address")
+        instruments = [dict(zip(keys, row, strict=True)) for row in rows]
+        show_json(
+            {"ok": True, "file": str(file), "name": plan.name, "machine": plan.machine, "instruments": instruments}
+        )
+    else:
+        show(f"{file}: good. Bench '{plan.name}', machine '{plan.machine}'.")
+        show(table(["instrument", "driver", "kind", "address"], rows))
+
+
+@bench_app.command("probe")
+@guarded
+def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
+    """Open every instrument, ask who it is, and read it once."""
+    from errormotion.cli import probing
+
+    if not probing.probe(file, json_):
+        raise typer.Exit(ERROR)

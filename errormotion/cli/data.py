@@ -1,0 +1,120 @@
+"""``errormotion identify``, ``import``, ``report`` and ``validate``: what is done with data on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from errormotion import datasets, plugins
+from errormotion.cli.output import show, show_json
+from errormotion.cli.settings import read_settings
+from errormotion.cli.summary import last_values
+from errormotion.errors import DatasetError, ErrormotionError
+
+
+def identify(
+    raw: Path, method_id: str, out: Path, assignments: list[str], settings_file: Path | None, as_json: bool
+) -> None:
+    """Identify a raw dataset with a method and write the errors."""
+    if out.exists():
+        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    method = plugins.get("methods", method_id)
+    settings = read_settings(method.Settings, settings_file, assignments)
+    with datasets.load(raw_of(raw)) as dataset:
+        errors = method().identify(dataset, settings)
+    datasets.validate(errors)
+    datasets.save(errors, out)
+    results = last_values(errors)
+    if as_json:
+        show_json({"ok": True, "errors": str(out), "component": errors.attrs["component"], "results": results})
+        return
+    show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
+    for result in results:
+        show(
+            f"  {result['name']} after {result['time_min']:.1f} min: {result['value']:+.2f} {result['unit']} "
+            f"(U = {result['expanded_uncertainty']:.2f}, k = 2)"
+        )
+
+
+def raw_of(path: Path) -> Path:
+    """Return the raw dataset that a path means: a run folder stands for its raw store."""
+    return path / "raw.zarr" if (path / "run.json").exists() else path
+
+
+def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
+    """Turn a log with columns into a raw dataset."""
+    from errormotion.datasets.importer import import_log as read_log
+
+    raw = read_log(log, map_file, out)
+    sizes = {str(dim): size for dim, size in raw.sizes.items()}
+    if as_json:
+        show_json({"ok": True, "raw": str(out), "schema": raw.attrs["schema"], "sizes": sizes})
+    else:
+        show(f"{out}: {raw.attrs['schema']}, " + ", ".join(f"{size} along {dim}" for dim, size in sizes.items()))
+
+
+def report(run: Path, out: Path | None, as_json: bool) -> None:
+    """Write the report of a run folder or of one file of errors."""
+    from errormotion.campaign.folder import RunFolder
+    from errormotion.report import write_report, write_run_report
+
+    if run.is_dir():
+        folder = RunFolder.open(run)
+        if out is None:
+            path = write_run_report(run)
+            folder.data["report"] = path.relative_to(folder.path).as_posix()
+            folder.step("report", "done")
+            folder.save()
+        else:
+            raw = datasets.load(folder.raw) if folder.raw.exists() else None
+            files = sorted(run.glob("errors/*/errors.nc"))
+            path = write_report([datasets.load(file) for file in files], out, raw=raw, run=folder.data)
+    else:
+        path = write_report(datasets.load(run), out or run.with_suffix(".html"))
+    if as_json:
+        show_json({"ok": True, "report": str(path)})
+    else:
+        show(str(path))
+
+
+def validate(file: Path) -> list[str]:
+    """Return every violation of a dataset, a run folder, a bench or a campaign file."""
+    if file.suffix == ".toml":
+        return _of_toml(file)
+    if (file / "run.json").exists():
+        return _of_run(file)
+    try:
+        with datasets.load(file) as dataset:
+            return list(datasets.violations(dataset))
+    except DatasetError as error:
+        return [str(error)]
+
+
+def _of_toml(file: Path) -> list[str]:
+    from errormotion.campaign.files import load_bench, load_campaign
+    from errormotion.datasets.tomlfile import read_toml
+
+    try:
+        schema = str(read_toml(file).get("schema", ""))
+        if schema.startswith("errormotion.campaign/"):
+            load_campaign(file)
+        else:
+            load_bench(file)
+    except ErrormotionError as error:
+        return str(error).removeprefix(f"{file}: ").split("\n  - ")
+    return []
+
+
+def _of_run(path: Path) -> list[str]:
+    from errormotion.campaign.folder import RunFolder
+
+    try:
+        folder = RunFolder.open(path)
+    except ErrormotionError as error:
+        return [str(error)]
+    found = []
+    for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
+        found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    if folder.finished and folder.errors is None:
+        found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
+    return found

@@ -1,0 +1,83 @@
+"""Progress bars with the time that remains, on a terminal; silence elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+
+class Bars:
+    """What the runner does, as bars on stderr; shows nothing where stderr is no terminal."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self._console = Console(stderr=True)
+        self._shown = not quiet and sys.stderr.isatty()
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._shown,
+        )
+        self._task: TaskID | None = None
+        self._name = ""
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._finish(error is None)
+        self._progress.stop()
+
+    def test(self, name: str, folder: Path, number: int, total: int) -> None:
+        """Begin a test."""
+        self._finish()
+        self._name = f"{number + 1}/{total} {name}: "
+        if self._shown:
+            self._progress.console.print(f"test {number + 1} of {total}, {name}: {folder}", highlight=False)
+
+    def stage(self, name: str, total: float | None = None) -> None:
+        """Begin a part of a test."""
+        self._finish()
+        self._task = self._progress.add_task(self._name + name, total=total)
+
+    def advance(self, done: float) -> None:
+        """Say how much of the part is done."""
+        if self._task is not None:
+            self._progress.update(self._task, completed=done)
+
+    def ask(self, message: str) -> None:
+        """Ask the operator for something and wait for Enter."""
+        self._progress.stop()
+        try:
+            self._console.input(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ", markup=False)
+        finally:
+            self._progress.start()
+
+    def _finish(self, well: bool = True) -> None:
+        if self._task is None:
+            return
+        if well:
+            task = self._progress.tasks[self._progress.task_ids.index(self._task)]
+            self._progress.update(self._task, total=task.completed or 1, completed=task.completed or 1)
+        self._progress.stop_task(self._task)
+        self._task = None

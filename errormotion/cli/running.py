@@ -1,0 +1,104 @@
+"""``errormotion run``: a campaign with bars, questions to the operator, and a summary at the end."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from errormotion import datasets
+from errormotion.campaign import runner
+from errormotion.campaign.files import CampaignPlan, load_campaign
+from errormotion.campaign.folder import RunFolder
+from errormotion.cli.guard import USAGE
+from errormotion.cli.output import show, show_json, table
+from errormotion.cli.progress import Bars
+from errormotion.cli.summary import last_values
+
+
+def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
+    """Run or resume a campaign and print what came of it."""
+    if campaign is None and not resume:
+        typer.echo("Give a campaign file, or --resume to go on with the newest unfinished one.", err=True)
+        raise typer.Exit(USAGE)
+    plan = load_campaign(campaign) if campaign else None
+    folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json)
+    if as_json:
+        show_json({"ok": True, "tests": [describe(folder) for folder in folders]})
+        return
+    for folder in folders:
+        show(f"\n{folder.data['test']} ({folder.data['method']['id']}): {folder.data['status']} in {folder.path}")
+        for line in _lines(folder):
+            show(f"  {line}")
+
+
+def work(
+    plan: CampaignPlan | None,
+    *,
+    resume: bool = False,
+    runs: Path | None = None,
+    yes: bool = False,
+    with_report: bool = True,
+    quiet: bool = False,
+) -> list[RunFolder]:
+    """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
+    with Bars(quiet) as bars:
+        ask = _agree if yes else bars.ask if sys.stdin.isatty() and sys.stderr.isatty() else None
+        report = report_of_run if with_report else None
+        if resume or plan is None:
+            return runner.resume(plan, runs=runs, progress=bars, ask=ask, report=report)
+        return runner.run(plan, runs=runs, progress=bars, ask=ask, report=report)
+
+
+def report_of_run(folder: Path) -> Path:
+    """Write the report of a run folder."""
+    from errormotion.report import write_run_report
+
+    return write_run_report(folder)
+
+
+def describe(folder: RunFolder) -> dict[str, Any]:
+    """Return what a program wants to know of a run."""
+    data = folder.data
+    errors = folder.errors
+    return {
+        "test": data["test"],
+        "method": data["method"]["id"],
+        "status": data["status"],
+        "folder": str(folder.path),
+        "samples": data["samples"],
+        "raw": str(folder.raw),
+        "errors": str(errors) if errors else None,
+        "report": str(folder.path / data["report"]) if data["report"] else None,
+        "report_error": report_error(folder),
+        "results": last_values(datasets.load(errors)) if errors else [],
+    }
+
+
+def report_error(folder: RunFolder) -> str | None:
+    """Return why the last report was not written; None if it was, or none was wanted."""
+    reports = [step for step in folder.data["steps"] if step["step"] == "report"]
+    return str(reports[-1]["reason"]) if reports and reports[-1]["outcome"] == "failed" else None
+
+
+def _lines(folder: RunFolder) -> list[str]:
+    found = describe(folder)
+    lines = [f"report  {found['report']}"] if found["report"] else []
+    if found["report_error"]:
+        lines.append(f"no report: {found['report_error']}; when that is mended: errormotion report {folder.path}")
+    lines.append(f"errors  {found['errors']}")
+    if found["results"]:
+        end = found["results"][0]["time_min"]
+        rows = [
+            [r["name"], f"{r['value']:.2f}", f"{r['expanded_uncertainty']:.2f}", r["unit"]] for r in found["results"]
+        ]
+        lines.append(f"after {end:.1f} min:")
+        lines += table(["", "error", "U (k=2)", ""], rows).splitlines()
+    return lines
+
+
+def _agree(message: str) -> None:
+    """Take it as done, and leave a trace."""
+    typer.echo(f"taken as done (--yes): {message}", err=True)

@@ -1,0 +1,53 @@
+"""Settings of a plugin from the command line: a TOML file, and ``--set key=value`` over it."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from errormotion.datasets import tomlfile
+from errormotion.errors import MethodError
+
+
+def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> Any:
+    """Return a checked settings object.
+
+    Parameters
+    ----------
+    model : type of PluginSettings
+        What it must be.
+    file : Path, optional
+        A TOML file with the settings at its top.
+    assignments : sequence of str
+        ``key=value``, dotted keys for tables; the value as TOML has it, else taken as text.
+
+    Raises
+    ------
+    MethodError
+        Every mistake at once.
+    """
+    data = tomlfile.read_toml(file, error=MethodError) if file else {}
+    for assignment in assignments:
+        key, sign, text = assignment.partition("=")
+        if not sign or not key.strip():
+            raise MethodError(f"--set {assignment}: expected key=value, such as --set average='0.5 s'")
+        *tables, name = key.strip().split(".")
+        place = data
+        for table in tables:
+            place = place.setdefault(table, {})
+            if not isinstance(place, dict):
+                raise MethodError(f"--set {assignment}: '{table}' is a value, not a table")
+        place[name] = _value(text.strip())
+    settings, mistakes = tomlfile.check(data, model)
+    if settings is None:
+        raise MethodError(tomlfile.report(file or "--set", mistakes))
+    return settings
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
