@@ -1,0 +1,136 @@
+"""Which points do not belong: found without trusting any single one.
+
+1. Shapes through few points are tried; the one that half of the points are nearest to wins (least median of squares,
+   Rousseeuw 1984), improved by fitting to the nearest half (concentration steps of least trimmed squares).
+2. Points within three robust standard deviations of it make a first clean set.
+3. The set is refitted and every point judged by a fit that does not contain it, until the set no longer changes. A
+   point is left out where Student's t says that among n clean Gaussian points the worst is this far off once in a
+   hundred fits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.errors import FitError
+from errormotion.kinematics.fits._shapes import Floats, Shape
+from errormotion.kinematics.fits._solver import EPS, Frame, design, levenberg
+
+__all__ = ["FALSE_ALARMS", "outliers"]
+
+Flags = NDArray[np.bool_]
+
+FALSE_ALARMS = 0.01  # fits of clean Gaussian data in which any point is named
+KEPT = 8
+SEED = 230
+# Median of the length of a standard normal vector of 1 and 2 components.
+MEDIAN = {1: 0.6744897501960817, 2: 1.1774100225154747}
+
+
+def outliers(shape: Shape, points: Floats, weights: Floats, sigma: float | None) -> tuple[int, ...]:
+    """Return the indices of the points that do not belong to the shape.
+
+    Raises
+    ------
+    FitError
+        Too few points to tell, or no shape that half of the points agree on.
+    """
+    spare = 3
+    if len(points) < shape.minimum + spare:
+        raise FitError(
+            f"a robust fit of a {shape.name} needs at least {shape.minimum + spare} points to tell the wrong ones "
+            f"from the right ones; found {len(points)}"
+        )
+    centre = np.median(points, axis=0)
+    scale = float(np.median(np.linalg.norm(points - centre, axis=1)))
+    if scale <= 10 * EPS * np.abs(points).max():
+        raise FitError(f"half of the points are one point; a {shape.name} needs points apart")
+    frame = Frame(centre, scale)
+    local, q, root = shape.scaled(scale), frame.inside(points), np.sqrt(weights)
+    # Nothing below the rounding of the coordinates is a deviation; nor, where the noise is known, what it explains.
+    floor = 50 * EPS * (1 + np.abs(points).max() / scale) * root.max()
+    floor = floor if sigma is None else max(floor, sigma / scale)
+
+    theta, spread = _least_trimmed(local, q, root)
+    clean = _misses(local, theta, q, root) <= 3 * max(spread, floor)
+    seen: set[bytes] = set()
+    while clean.tobytes() not in seen:
+        seen.add(clean.tobytes())
+        _majority(shape, clean)
+        theta = levenberg(local, theta, q[clean], root[clean]).theta
+        clean = _belongs(local, theta, q, root, clean, floor)
+    _majority(shape, clean)
+    return tuple(int(i) for i in np.flatnonzero(~clean))
+
+
+def _least_trimmed(shape: Shape, q: Floats, root: Floats) -> tuple[Floats, float]:
+    """Return the shape that the nearest half of the points agree on best, and their robust standard deviation."""
+    n, rng = len(q), np.random.default_rng(SEED)
+    half = min(n - 1, (n + shape.minimum + 1) // 2)
+
+    def rank(theta: Floats) -> float:
+        return float(np.partition(_misses(shape, theta, q, root), half - 1)[half - 1])
+
+    starts = sorted(shape.robust_starts(q, rng), key=rank)[:KEPT]
+    if not starts:
+        raise FitError(f"no few of the points make a {shape.name}; look at them")
+    trimmed = [_concentrate(shape, theta, q, root, half) for theta in starts]
+    best = min(trimmed, key=rank)
+    quantile = MEDIAN[shape.components]
+    small_sample = 1 + 5 / max(n * shape.components - shape.tangent(best).shape[1], 1)
+    return best, rank(best) / quantile * small_sample
+
+
+def _concentrate(shape: Shape, theta: Floats, q: Floats, root: Floats, half: int) -> Floats:
+    before: NDArray[np.intp] | None = None
+    for _ in range(15):
+        nearest = np.sort(np.argpartition(_misses(shape, theta, q, root), half - 1)[:half])
+        if before is not None and np.array_equal(nearest, before):
+            break
+        theta, before = levenberg(shape, theta, q[nearest], root[nearest], limit=20).theta, nearest
+    return theta
+
+
+def _belongs(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> Flags:
+    """Judge every point by the fit to the clean set without it."""
+    J, f = design(shape, theta, q, root)
+    m, p = shape.components, J.shape[1]
+    inside = np.repeat(clean, m)
+    dof = int(inside.sum()) - p
+    if dof < 2 * m:
+        return clean
+    R = np.linalg.qr(J[inside])[1]
+    # Leverage: the share of the fit's own uncertainty in the point's distance, mean over its components.
+    leverage = np.sum(np.linalg.lstsq(R.T, J.T, rcond=None)[0] ** 2, axis=0).reshape(-1, m).mean(axis=1)
+    square = np.sum(f.reshape(-1, m) ** 2, axis=1)
+    total = float(f[inside] @ f[inside])
+    own = np.maximum(1 - leverage, 1e-6)
+    variance_without = np.where(clean, (total - square / own) / (dof - m), total / dof)
+    variance_without = np.maximum(variance_without, floor**2)
+    deviation = square / np.where(clean, own, 1 + leverage) / m / variance_without
+    limit = np.where(clean, _limit(m, dof - m, len(q)), _limit(m, dof, len(q)))
+    return np.asarray(deviation <= limit)
+
+
+def _limit(m: int, dof: int, n: int) -> float:
+    """Return the F quantile with (m, dof) freedoms that the worst of n clean points exceeds in 1 % of fits."""
+    tail = FALSE_ALARMS / n
+    if m == 2:
+        return float(dof / 2 * (tail ** (-2 / dof) - 1))
+    from scipy.special import stdtrit  # loaded here: half a second that only robust fits need
+
+    quantile = float(stdtrit(dof, 1 - tail / 2))
+    return quantile * quantile
+
+
+def _misses(shape: Shape, theta: Floats, q: Floats, root: Floats) -> Floats:
+    length: Floats = np.linalg.norm(shape.residuals(theta, q), axis=1) * root
+    return length
+
+
+def _majority(shape: Shape, clean: Flags) -> None:
+    if clean.sum() < max(shape.minimum + 1, (len(clean) + 1) // 2):
+        raise FitError(
+            f"no {shape.name} that at least half of the {len(clean)} points agree on; they look like something else"
+        )

@@ -1,0 +1,263 @@
+"""What a shape is to the solver, and the shapes whose start is one algebraic fit: line, plane, circle, sphere.
+
+A shape is written in centred and scaled coordinates: the origin is the points' centroid and their root mean square
+distance from it is 1. Its parameter vector holds directions as three numbers; the solver moves in the fewer free ones,
+which `tangent` spans. Cylinder and cone are in `errormotion.kinematics.fits._axial`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Kind = Literal["place", "direction", "length", "angle"]
+
+__all__ = ["Circle", "Circle3D", "Floats", "Group", "Line", "Plane", "Shape", "Sphere", "complement", "norms"]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters that belong together: a place and a direction have several, a length and an angle one."""
+
+    name: str
+    kind: Kind
+    size: int = 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the single parameters, such as ``centre_x``."""
+        return tuple(f"{self.name}_{axis}" for axis in "xyz"[: self.size]) if self.size > 1 else (self.name,)
+
+
+class Shape(ABC):
+    """A shape that points may lie on.
+
+    Attributes
+    ----------
+    name : str
+    groups : tuple of Group
+        The parameter vector theta.
+    minimum : int
+        Fewest points that determine the shape.
+    components : int
+        Parts of the vector from a point to the shape; its length is the orthogonal distance.
+    spans : int
+        Dimensions that the points must spread over: 1 a line, 2 a plane, 3 space.
+    """
+
+    name: str
+    groups: tuple[Group, ...]
+    minimum: int
+    components: int = 1
+    spans: int
+
+    @abstractmethod
+    def starts(self, q: Floats) -> list[Floats]:
+        """Return parameter vectors to start from, best first; none if the points allow none."""
+
+    @abstractmethod
+    def residuals(self, theta: Floats, q: Floats) -> Floats:
+        """Return the orthogonal distances, (n, components)."""
+
+    @abstractmethod
+    def gradient(self, theta: Floats, q: Floats) -> Floats:
+        """Return the residuals' derivative by theta, (n, components, k)."""
+
+    @abstractmethod
+    def tangent(self, theta: Floats) -> Floats:
+        """Return the free steps as columns, (k, p): theta may go to ``settle(theta + tangent @ step)``."""
+
+    @abstractmethod
+    def settle(self, theta: Floats) -> Floats:
+        """Return the same shape with unit directions, a fixed sign, and its point nearest to the origin."""
+
+    def scaled(self, scale: float) -> Self:  # noqa: ARG002 - only shapes with a known length depend on it
+        """Return the shape to fit when lengths are divided by ``scale``."""
+        return self
+
+    def robust_starts(self, q: Floats, rng: np.random.Generator) -> Iterator[Floats]:
+        """Yield candidates through few points each, some of which miss the outliers."""
+        for _ in range(50 * self.minimum):
+            yield from self.starts(q[rng.choice(len(q), self.minimum, replace=False)])
+
+
+class Line(Shape):
+    """A line in 2D or 3D: point nearest to the origin, direction."""
+
+    name, minimum, spans = "line", 2, 1
+
+    def __init__(self, dimensions: int) -> None:
+        self.dimensions = dimensions
+        self.groups = (Group("point", "place", dimensions), Group("direction", "direction", dimensions))
+        self.components = dimensions - 1
+
+    def starts(self, q: Floats) -> list[Floats]:
+        middle = q.mean(axis=0)
+        _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
+        if s[0] - s[1] <= 1e-9 * s[0]:
+            return []  # no direction is better than the others
+        return [self.settle(np.concatenate([middle, axes[0]]))]
+
+    def residuals(self, theta: Floats, q: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        return (q - c) @ complement(u)
+
+    def gradient(self, theta: Floats, q: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        across = np.broadcast_to(complement(u).T, (len(q), self.components, self.dimensions))
+        h = ((q - c) @ u)[:, None, None]
+        return np.concatenate([-across, -h * across], axis=2)
+
+    def tangent(self, theta: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        B = complement(u)
+        return np.block([[B, -np.outer(u, c @ B)], [np.zeros_like(B), B]])
+
+    def settle(self, theta: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        u = signed(u)
+        return np.concatenate([c - u * (u @ c), u])
+
+
+class Plane(Shape):
+    """A plane: point nearest to the origin, normal."""
+
+    name, minimum, spans = "plane", 3, 2
+    groups = (Group("point", "place", 3), Group("normal", "direction", 3))
+
+    def starts(self, q: Floats) -> list[Floats]:
+        middle = q.mean(axis=0)
+        _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
+        if s[1] - s[2] <= 1e-9 * s[0]:
+            return []
+        return [self.settle(np.concatenate([middle, axes[2]]))]
+
+    def residuals(self, theta: Floats, q: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        return ((q - c) @ u)[:, None]
+
+    def gradient(self, theta: Floats, q: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        return np.concatenate([np.broadcast_to(-u, q.shape), q - c], axis=1)[:, None, :]
+
+    def tangent(self, theta: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        B = complement(u)
+        return np.block([[u[:, None], (c @ u) * B], [np.zeros((3, 1)), B]])
+
+    def settle(self, theta: Floats) -> Floats:
+        c, u = np.split(theta, 2)
+        u = signed(u)
+        return np.concatenate([(u @ c) * u, u])
+
+
+class Sphere(Shape):
+    """A sphere, or a circle in 2D: centre, radius."""
+
+    name, minimum, spans, dimensions = "sphere", 4, 3, 3
+
+    def __init__(self) -> None:
+        self.groups = (Group("centre", "place", self.dimensions), Group("radius", "length"))
+
+    def starts(self, q: Floats) -> list[Floats]:
+        """Return Taubin's algebraic fit (IEEE Trans. PAMI 13 (1991) 1115), by singular values."""
+        middle = q.mean(axis=0)
+        d = q - middle
+        z = np.einsum("ni,ni->n", d, d)
+        if not (mean := z.mean()) > 0:
+            return []
+        A = np.column_stack([(z - mean) / (2 * np.sqrt(mean)), d])
+        a = np.linalg.svd(A, full_matrices=False)[2][-1]
+        a0 = a[0] / (2 * np.sqrt(mean))
+        if abs(a0) < 1e-14:
+            return []
+        c = -a[1:] / (2 * a0)
+        return [np.array([*(c + middle), np.sqrt(c @ c + mean)])]
+
+    def residuals(self, theta: Floats, q: Floats) -> Floats:
+        miss: Floats = norms(q - theta[:-1])[0] - theta[-1]
+        return miss[:, None]
+
+    def gradient(self, theta: Floats, q: Floats) -> Floats:
+        n = norms(q - theta[:-1])[1]
+        return np.concatenate([-n, np.full((len(q), 1), -1.0)], axis=1).reshape(len(q), 1, -1)
+
+    def tangent(self, theta: Floats) -> Floats:
+        return np.eye(len(theta))
+
+    def settle(self, theta: Floats) -> Floats:
+        return np.array([*theta[:-1], abs(theta[-1])])
+
+
+class Circle(Sphere):
+    """A circle in 2D."""
+
+    name, minimum, spans, dimensions = "circle", 3, 2, 2
+
+
+class Circle3D(Shape):
+    """A circle in 3D: centre, normal, radius. The distance has a part in the circle's plane and one across it."""
+
+    name, minimum, spans, components = "circle", 3, 2, 2
+    groups = (Group("centre", "place", 3), Group("normal", "direction", 3), Group("radius", "length"))
+
+    def starts(self, q: Floats) -> list[Floats]:
+        found = []
+        for plane in Plane().starts(q):
+            c, u = np.split(plane, 2)
+            B = complement(u)
+            found = [self.settle(np.array([*(c + B @ flat[:2]), *u, flat[2]])) for flat in Circle().starts((q - c) @ B)]
+        return found
+
+    def residuals(self, theta: Floats, q: Floats) -> Floats:
+        h, rho, _ = about_axis(theta, q)
+        return np.column_stack([rho - theta[6], h])
+
+    def gradient(self, theta: Floats, q: Floats) -> Floats:
+        h, _, n = about_axis(theta, q)
+        one = np.ones((len(q), 1))
+        in_plane = np.concatenate([-n, -h[:, None] * n, -one], axis=1)
+        across = np.concatenate([-one * theta[3:6], q - theta[:3], 0 * one], axis=1)
+        return np.stack([in_plane, across], axis=1)
+
+    def tangent(self, theta: Floats) -> Floats:
+        T = np.zeros((7, 6))
+        T[:3, :3] = np.eye(3)
+        T[3:6, 3:5] = complement(theta[3:6])
+        T[6, 5] = 1.0
+        return T
+
+    def settle(self, theta: Floats) -> Floats:
+        return np.array([*theta[:3], *signed(theta[3:6]), abs(theta[6])])
+
+
+def norms(d: Floats) -> tuple[Floats, Floats]:
+    """Return lengths, (n,), and unit vectors, (n, dimensions); the unit vector of nothing is 0."""
+    length = np.sqrt(np.einsum("ni,ni->n", d, d))
+    return length, d / np.where(length > 0, length, 1.0)[:, None]
+
+
+def about_axis(theta: Floats, q: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return height along, distance from and unit vector away from the axis (point theta[:3], direction theta[3:6])."""
+    d, u = q - theta[:3], theta[3:6]
+    h = d @ u
+    return h, *norms(d - h[:, None] * u)
+
+
+def complement(u: Floats) -> Floats:
+    """Return orthonormal vectors across the unit vector ``u`` as columns, (d, d - 1), by a Householder reflection."""
+    v = u.copy()
+    v[0] += np.copysign(1.0, u[0])
+    return (np.eye(len(u)) - np.outer(v, v) * (2 / (v @ v)))[:, 1:]
+
+
+def signed(u: Floats) -> Floats:
+    """Return the unit vector along ``u`` whose largest component is positive."""
+    u = u / np.linalg.norm(u)
+    return u if u[np.argmax(np.abs(u))] > 0 else -u

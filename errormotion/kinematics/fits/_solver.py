@@ -1,0 +1,234 @@
+"""Least squares of orthogonal distances to any shape, with covariance and refusal of what the points do not hold.
+
+The points are centred and scaled, so that all numbers are near 1 wherever the machine's origin is. Levenberg-Marquardt
+(by QR) goes from the shape's algebraic start to the minimum, Gauss-Newton to its last digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from errormotion.errors import FitError
+from errormotion.kinematics.fits._shapes import Floats, Shape, norms
+
+__all__ = ["Estimate", "Frame", "Solution", "design", "estimate", "levenberg"]
+
+EPS = float(np.finfo(float).eps)
+SEARCHED_POINTS = 1000  # the best of several starts is chosen on a part of the points
+# Of a shape of size 1 a step of 1e-7 changes the sum of squares by 1e-14 of itself: from there on the steps, not the
+# sum, tell whether the solver comes nearer.
+LAST_DIGITS = 1e-7
+# Ratio of the least to the greatest singular value below which a freedom is numerically loose. An arc of one part in
+# 1e5 of its radius has 1e-10.
+LOOSE = 1e-11
+# A radius known to worse than half of itself, a direction to half a radian: no linear covariance holds there.
+TOO_UNCERTAIN = 0.5
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the solver stopped."""
+
+    theta: Floats
+    cost: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Centre and scale of the points: ``q = (p - centre) / scale``."""
+
+    centre: Floats
+    scale: float
+
+    def inside(self, points: Floats) -> Floats:
+        """Return points in the frame."""
+        return (points - self.centre) / self.scale
+
+    def outside(self, shape: Shape, theta: Floats) -> tuple[Floats, Floats]:
+        """Return parameters in the points' own unit, and the scale of each."""
+        shift: list[float] = []
+        scale: list[float] = []
+        for group in shape.groups:
+            shift.extend(self.centre if group.kind == "place" else np.zeros(group.size))
+            scale.extend(np.full(group.size, self.scale if group.kind in ("place", "length") else 1.0))
+        return np.array(shift) + np.array(scale) * theta, np.array(scale)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted shape in the points' own unit; ``residuals`` of all points, the left-out ones included."""
+
+    shape: Shape
+    theta: Floats
+    covariance: Floats
+    residuals: Floats
+    left_out: tuple[int, ...]
+    sigma: float
+    dof: int
+
+
+def estimate(
+    shape: Shape, points: Floats, weights: Floats, sigma: float | None, left_out: tuple[int, ...] = ()
+) -> Estimate:
+    """Fit a shape to all points but the left-out ones.
+
+    Raises
+    ------
+    FitError
+        The points do not hold the shape; the message says what is loose.
+    """
+    used = np.ones(len(points), dtype=bool)
+    used[list(left_out)] = False
+    frame = _frame(shape, points[used], weights[used])
+    local, q, root = shape.scaled(frame.scale), frame.inside(points), np.sqrt(weights)
+    _refuse_flat(shape, points[used], frame)
+    solution = _best(local, q[used], root[used])
+    theta = solution.theta
+
+    J, f = design(local, theta, q[used], root[used])
+    _, s, Vt = np.linalg.svd(J, full_matrices=False)
+    if not np.isfinite(theta).all() or s[-1] <= LOOSE * s[0]:
+        raise _loose(shape, points[used], local.tangent(theta) @ Vt[-1])
+    if not solution.converged:
+        raise FitError(
+            f"the fit of the {shape.name} did not settle: the points do not look like a {shape.name}. "
+            f"Plot them, or ask for a robust fit"
+        )
+    dof = int(used.sum()) * shape.components - J.shape[1]
+    estimated = float(np.sqrt(f @ f / dof)) if dof > 0 else np.nan
+    unit = estimated if sigma is None else sigma / frame.scale
+    half = local.tangent(theta) @ (Vt.T / s) * unit
+    _refuse_uncertain(shape, theta, half)
+
+    outside, scale = frame.outside(shape, theta)
+    covariance = (half @ half.T) * np.outer(scale, scale)
+    parts = local.residuals(theta, q) * frame.scale
+    residuals = parts[:, 0] if shape.components == 1 else norms(parts)[0]
+    return Estimate(shape, outside, covariance, residuals, left_out, float(unit * frame.scale), dof)
+
+
+def design(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> tuple[Floats, Floats]:
+    """Return the weighted Jacobian by the free steps, (n components, p), and the weighted residuals."""
+    J = (shape.gradient(theta, q) @ shape.tangent(theta)) * root_weights[:, None, None]
+    f = shape.residuals(theta, q) * root_weights[:, None]
+    return J.reshape(f.size, -1), f.ravel()
+
+
+def levenberg(shape: Shape, theta: Floats, q: Floats, root_weights: Floats, limit: int = 200) -> Solution:
+    """Go from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
+    damping, cost = 1e-3, np.inf
+    for _ in range(limit):
+        J, f = design(shape, theta, q, root_weights)
+        R, g = _triangle(J, f)
+        cost = float(f @ f)
+        if np.linalg.norm(_solve(R, g)) < LAST_DIGITS:
+            return _last_digits(shape, theta, q, root_weights)
+        marquardt = np.maximum(np.linalg.norm(R, axis=0), 1e-6)
+        while damping < 1e10:
+            step = _solve(np.vstack([R, np.sqrt(damping) * np.diag(marquardt)]), np.append(g, 0 * marquardt))
+            trial = shape.settle(theta + shape.tangent(theta) @ step)
+            misses = shape.residuals(trial, q) * root_weights[:, None]
+            if np.sum(misses**2) < cost:
+                theta, damping = trial, 0.1 * damping
+                break
+            damping = max(10 * damping, 1e-6)
+        else:  # no step improves: a minimum as far as rounding shows it, if the gradient agrees
+            flat = np.linalg.norm(R.T @ g) <= 1e-6 * np.linalg.norm(R) * np.sqrt(cost)
+            return Solution(theta, cost, bool(flat or cost < (100 * EPS) ** 2 * len(q)))
+    return Solution(theta, cost, converged=False)
+
+
+def _last_digits(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> Solution:
+    """Gauss-Newton as long as its steps shrink."""
+    before = np.inf
+    for _ in range(100):
+        J, f = design(shape, theta, q, root_weights)
+        step = _solve(*_triangle(J, f))
+        length = float(np.linalg.norm(step))
+        if length >= before or length < EPS:
+            break
+        theta, before = shape.settle(theta + shape.tangent(theta) @ step), length
+    return Solution(theta, float(f @ f), converged=True)
+
+
+def _best(shape: Shape, q: Floats, root_weights: Floats) -> Solution:
+    starts = shape.starts(q)
+    if not starts:
+        raise FitError(f"the points single out no {shape.name}: they fit several equally well. Add points elsewhere")
+    if len(starts) > 1:
+        part = np.unique(np.linspace(0, len(q) - 1, min(len(q), SEARCHED_POINTS)).astype(int))
+        tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60) for theta in starts]
+        starts = [min(tried, key=lambda solution: solution.cost).theta]
+    return levenberg(shape, starts[0], q, root_weights)
+
+
+def _triangle(J: Floats, f: Floats) -> tuple[Floats, Floats]:
+    Q, R = np.linalg.qr(J)
+    return R, np.asarray(Q.T @ f)
+
+
+def _solve(R: Floats, g: Floats) -> Floats:
+    return np.asarray(np.linalg.lstsq(R, -g, rcond=1e-14)[0], dtype=float)
+
+
+def _frame(shape: Shape, points: Floats, weights: Floats) -> Frame:
+    _enough(shape, points)
+    centre = np.average(points, axis=0, weights=weights)
+    scale = float(np.sqrt(np.mean((points - centre) ** 2) * points.shape[1]))
+    if scale <= 10 * EPS * np.abs(points).max():
+        raise FitError(f"a {shape.name} needs {shape.minimum} points apart; all {len(points)} are one point")
+    return Frame(centre, scale)
+
+
+def _enough(shape: Shape, points: Floats) -> None:
+    if len(points) < shape.minimum:
+        raise FitError(f"a {shape.name} needs at least {shape.minimum} points; found {len(points)}. Measure more")
+
+
+def _refuse_flat(shape: Shape, points: Floats, frame: Frame) -> None:
+    s = np.linalg.svd(frame.inside(points), compute_uv=False)
+    rounding = 1e-12 + 100 * EPS * np.abs(points).max() / frame.scale
+    spread = int(np.sum(s > rounding * s[0]))
+    if spread < shape.spans:
+        where = {1: "on one line", 2: "in one plane"}[spread]
+        loose = ", ".join(group.name for group in shape.groups)
+        raise FitError(
+            f"the points lie {where}, which leaves the {shape.name} loose ({loose}); it needs points that spread "
+            f"{'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
+        )
+
+
+def _loose(shape: Shape, points: Floats, direction: Floats) -> FitError:
+    """Return the error that names the parameters which may change without moving the shape off the points."""
+    names, start = [], 0
+    for group in shape.groups:
+        if np.linalg.norm(direction[start : start + group.size]) > 0.1 * np.linalg.norm(direction):
+            names.append(group.name)
+        start += group.size
+    return FitError(
+        f"the points leave the {shape.name} loose: {' and '.join(names) or 'everything'} may change together "
+        f"without leaving the points. Add points elsewhere on it{_repeated(shape, points)}"
+    )
+
+
+def _repeated(shape: Shape, points: Floats) -> str:
+    distinct = len(np.unique(points, axis=0))
+    return f". Only {distinct} of the {len(points)} points are distinct" if distinct < shape.minimum else ""
+
+
+def _refuse_uncertain(shape: Shape, theta: Floats, half: Floats) -> None:
+    start = 0
+    for group in shape.groups:
+        part = slice(start, start + group.size)
+        uncertainty = np.linalg.norm(half[part], axis=None if group.size > 1 else 1).item()
+        size = abs(theta[part][0]) if group.kind == "length" else 1.0
+        if group.kind != "place" and uncertainty > TOO_UNCERTAIN * size:
+            raise FitError(
+                f"the noise hides the {group.name} of the {shape.name}: its standard uncertainty is "
+                f"{uncertainty / size:.2g} {'of itself' if group.kind == 'length' else 'rad'}. "
+                f"The points span too little of the {shape.name}; spread them, or fit a simpler shape"
+            )
+        start += group.size

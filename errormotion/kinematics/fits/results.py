@@ -1,0 +1,125 @@
+"""What a fit returns: the shape's parameters by name, their covariance, and what the points are off by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from errormotion.kinematics.fits._shapes import Floats
+
+__all__ = ["CircleFit", "ConeFit", "CylinderFit", "Fit", "LineFit", "PlaneFit", "SphereFit"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit:
+    """Common to all fits; lengths are in the unit of the points, angles in rad.
+
+    Attributes
+    ----------
+    parameters : ndarray, (k,)
+        All parameters, in the order of `parameter_names`.
+    parameter_names : tuple of str
+        Such as ``("centre_x", "centre_y", "radius")``. A direction counts as three although it has two freedoms.
+    covariance : ndarray, (k, k)
+        Of `parameters`: ``sigma^2 (J^T W J)^-1`` spread over them. Without a freedom of its own a direction's length,
+        and a point along its own line, has no variance: the rank is the number of freedoms. NaN where `sigma` is.
+    residuals : ndarray, (n,)
+        Orthogonal distance of every point, left-out ones included. Positive outside of a round shape or on the normal's
+        side of a plane; never negative for a line or circle in 3D, whose distance has no sign.
+    left_out : tuple of int
+        Indices of the points that a robust fit left out.
+    sigma : float
+        Standard uncertainty of a point across the shape (weight 1), given or estimated; NaN where no freedom is left
+        to estimate it.
+    dof : int
+        Degrees of freedom: components of residuals less freedoms of the shape.
+    """
+
+    parameters: Floats
+    parameter_names: tuple[str, ...]
+    covariance: Floats
+    residuals: Floats
+    left_out: tuple[int, ...]
+    sigma: float
+    dof: int
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Sum of the squared residuals of the points that were used."""
+        used = np.delete(self.residuals, list(self.left_out))
+        return float(used @ used)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the points that were used."""
+        return float(np.sqrt(self.sum_of_squares / (len(self.residuals) - len(self.left_out))))
+
+    @property
+    def standard_uncertainty(self) -> dict[str, float]:
+        """Standard uncertainty of every parameter by name."""
+        return dict(zip(self.parameter_names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LineFit(Fit):
+    """A line: the point nearest to the points' centroid, (d,), and the unit direction, (d,)."""
+
+    point: Floats
+    direction: Floats
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlaneFit(Fit):
+    """A plane: the point nearest to the points' centroid, (3,), and the unit normal, (3,)."""
+
+    point: Floats
+    normal: Floats
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CircleFit(Fit):
+    """A circle: centre, (d,), radius, and in 3D the unit normal, (3,)."""
+
+    centre: Floats
+    radius: float
+    normal: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SphereFit(Fit):
+    """A sphere: centre, (3,), and radius."""
+
+    centre: Floats
+    radius: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CylinderFit(Fit):
+    """A cylinder: the axis's point nearest to the points' centroid, (3,), unit direction, (3,), radius.
+
+    A known radius is repeated here and is none of the `parameters`.
+    """
+
+    point: Floats
+    direction: Floats
+    radius: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConeFit(Fit):
+    """A cone: the axis's point nearest to the points' centroid, (3,), unit direction towards the opening, (3,).
+
+    ``radius`` is that of the cone at ``point``, ``half_angle`` the one between axis and surface, rad.
+    """
+
+    point: Floats
+    direction: Floats
+    radius: float
+    half_angle: float
+
+    @property
+    def apex(self) -> Floats:
+        """The tip, (3,); infinitely far for a cylinder."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.point - self.direction * (self.radius / np.tan(self.half_angle)))
