@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py  # type: ignore[import-untyped]
 import numpy as np
 import xarray as xr
 from xarray.indexes import RangeIndex
@@ -64,6 +65,8 @@ def load(path: str | Path) -> xr.Dataset:
     path = Path(path)
     engine = _engine_of(path)
     with _reading(path):
+        if engine == "h5netcdf":
+            h5py.File(path).close()  # h5netcdf leaves a half-made object behind when the file is damaged
         ds = xr.open_dataset(
             path,
             engine=engine,
@@ -82,8 +85,8 @@ def load(path: str | Path) -> xr.Dataset:
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a dataset beside its place, bring it to the disk and rename it.
 
-    Each variable is held in memory while it is written, unless dask holds it. Evenly spaced times that the attributes
-    ``sample_rate`` and ``time_start`` tell are left out.
+    A NetCDF file is composed in memory, a Zarr folder one variable at a time (piece by piece if dask holds it).
+    Evenly spaced times that the attributes ``sample_rate`` and ``time_start`` tell are left out.
 
     Parameters
     ----------
@@ -116,7 +119,8 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
             # xarray's overloads do not know the type of a plain path together with zarr_format
             storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
         else:
-            storable(ds).to_netcdf(part, engine="h5netcdf")
+            # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
+            part.write_bytes(storable(ds).to_netcdf(engine="h5netcdf"))
         _sync(part)
         _refuse_existing(path, overwrite)
         _replace(part, path)
