@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.report import canvas, provenance
+from errormotion.report import canvas, provenance, quality
 from errormotion.report.document import (
     Block,
     Cell,
@@ -23,7 +23,7 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.spindle_figures import LOOK
-from errormotion.report.text import ARCSEC, finite, fixed, listed
+from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, significant
 
 _UNKNOWN = "the beam was not determined"
 
@@ -39,7 +39,7 @@ def part(source: Source, key: str) -> Part:
             Section("beams", "Origins and directions", _beams(errors)),
             Section("nominal", "Difference to nominal", _nominal(errors)),
             Section("constructions", "Circles and line beside the likelihood fit", _constructions(errors)),
-            Section("quality", "Residuals and data quality", _residuals(errors, key), page_break=True),
+            Section("quality", "Residuals and data quality", [*quality.notes(errors), *_residuals(errors, key)]),
             Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
         ],
     )
@@ -136,16 +136,17 @@ def _summary(errors: xr.Dataset) -> list[str]:
     if known:
         far, off = max(known, key=lambda entry: entry[1][0]), max(known, key=lambda entry: entry[1][1])
         words.append(
-            f"Against nominal, origins differ by up to {fixed(1e6 * far[1][0], 0)} µm ({far[0]}) and directions by up to "
-            f"{fixed(off[1][1] / ARCSEC, 0)} arcsec ({off[0]}); an evaluation with nominal beams would carry these "
-            "differences."
+            f"Against nominal, origins differ by up to {fixed(1e6 * far[1][0], 0)} µm ({far[0]}) and directions by "
+            f"up to {fixed(off[1][1] / ARCSEC, 0)} arcsec ({off[0]}); an evaluation with nominal beams would carry "
+            "these differences."
         )
     both = _construction_differences(errors)
     both = [row for row in both if math.isfinite(row[0])]
     if both:
         words.append(
-            f"The construction from circles and a line agrees with the likelihood fit within "
-            f"{fixed(1e6 * max(row[0] for row in both), 1)} µm and {fixed(max(row[1] for row in both) / ARCSEC, 0)} arcsec."
+            "The construction from circles and a line agrees with the likelihood fit within "
+            f"{fixed(1e6 * max(row[0] for row in both), 1)} µm and "
+            f"{fixed(max(row[1] for row in both) / ARCSEC, 0)} arcsec."
         )
     return words
 
@@ -167,8 +168,14 @@ def _beams(errors: xr.Dataset) -> list[Block]:
                 or_dash(fixed(1e6 * noise[i], 2), "no noise was stated"),
             ]
         )
+        across = np.nan_to_num(_covariance(errors)[i, 3:, 3:], nan=-1.0)
+        largest = float(np.sqrt(np.linalg.eigvalsh(across)[-1])) if (np.diag(across) >= 0).all() else math.nan
         senses.append(
-            [name, *(estimate(v, u, reason=_UNKNOWN) for v, u in zip(direction[i], expanded[i, 3:], strict=True))]
+            [
+                name,
+                *(or_dash(fixed(value, 6, signed=True), _UNKNOWN) for value in direction[i]),
+                or_dash(significant(2 * largest / ARCSEC), "no covariance is stated"),
+            ]
         )
     return [
         Table(
@@ -178,9 +185,9 @@ def _beams(errors: xr.Dataset) -> list[Block]:
             places,
         ),
         Table(
-            "Directions as unit vectors, from the sensor to the object. After ±: expanded uncertainty, k = 2; 0.000 01 "
-            "is 2.1 arcsec.",
-            ["beam", "u_x", "u_y", "u_z"],
+            "Directions as unit vectors, from the sensor to the object, and their expanded uncertainty as an angle in "
+            "the worst direction, k = 2. A change of 0.000 01 across the beam is 2.1 arcsec.",
+            ["beam", "u_x", "u_y", "u_z", "U / arcsec"],
             senses,
         ),
     ]
@@ -244,8 +251,8 @@ def _constructions(errors: xr.Dataset) -> list[Block]:
         )
     return [
         Table(
-            "Construction from circles and a line, minus the maximum-likelihood fit of all readings to the intersection "
-            "of ray and sphere. The likelihood fit is the one that is used.",
+            "Construction from circles and a line, minus the maximum-likelihood fit of all readings to the "
+            "intersection of ray and sphere. The likelihood fit is the one that is used.",
             ["beam", "Δx / µm", "Δy / µm", "Δz / µm", "distance / µm", "angle / arcsec"],
             rows,
             [("", 1), ("origin", 4), ("direction", 1)],
@@ -258,6 +265,7 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
         return [Text("The result holds no residuals.", "note")]
     values = 1e6 * errors["residual"].transpose("beam", "profile", "step").values
     names = _names(errors)
+    left = errors["left_out"].values if "left_out" in errors else None
     rows: list[list[Cell | str]] = []
     for i, name in enumerate(names):
         rows.append(
@@ -265,13 +273,14 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
                 name,
                 str(int(np.isfinite(values[i]).sum())),
                 str(int(np.isnan(values[i]).sum())),
+                Cell(DASH, reason="not counted") if left is None else integer(float(left[i])),
                 or_dash(fixed(math.sqrt(finite(np.mean, values[i] ** 2)), 3), _UNKNOWN),
                 or_dash(fixed(finite(np.max, np.abs(values[i])), 2), _UNKNOWN),
             ]
         )
     table = Table(
-        "Readings used and residuals of the likelihood fit: reading minus predicted reading.",
-        ["beam", "readings used", "without value", "rms / µm", "largest / µm"],
+        "Residuals of the likelihood fit: reading minus predicted reading. Left out: readings that the fit did not use.",
+        ["beam", "residuals", "without value", "left out", "rms / µm", "largest / µm"],
         rows,
     )
 
@@ -288,6 +297,9 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
                     markersize=1.5,
                 )
             axes.axhline(0, color="#888888", linewidth=0.6)
+            if not np.isfinite(rows_of).any():
+                axes.text(0.5, 0.5, "no valid value", transform=axes.transAxes, ha="center", va="center")
+                axes.set_yticks([])
             axes.set_ylabel("µm")
             axes.annotate(
                 name,
@@ -299,12 +311,11 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
                 fontweight="bold",
                 color=LOOK.get(name, (canvas.BLACK, None))[0],
             )
-        panels[0].set_title("Residual of the likelihood fit")
         panels[0].legend(
             panels[0].get_lines()[: values.shape[1]],
             [f"profile {j + 1}" for j in range(values.shape[1])],
             loc="lower center",
-            bbox_to_anchor=(0.6, 1.0),
+            bbox_to_anchor=(0.5, 1.0),
             ncols=6,
             handlelength=1.2,
             columnspacing=1.0,

@@ -9,23 +9,10 @@ import xarray as xr
 
 import errormotion.datasets  # noqa: F401 - registers ds.em
 from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.text import SECOND_OF_ARC, UM, percent, significant
+from errormotion.report.text import SECOND_OF_ARC, UM, fixed, significant
 
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
-_GROUPS = {
-    "beams": "beam calibration (origin and direction)",
-    "beam": "beam calibration (origin and direction)",
-    "reference": "cold reference",
-    "cold_reference": "cold reference",
-    "bar_radius": "radius of the bar",
-    "bar": "bar",
-    "noise": "sensor noise",
-    "independent": "independent from instant to instant (sensor noise)",
-    "expansion": "thermal expansion of the measuring frame",
-    "frame_expansion": "thermal expansion of the measuring frame",
-    "frame": "measuring frame",
-    "temperature": "temperature of the measuring frame",
-}
+_INDEPENDENT = "sensor noise, independent from instant to instant"
 
 
 def groups_at(errors: xr.Dataset) -> dict[str, np.ndarray]:
@@ -71,7 +58,7 @@ def table(errors: xr.Dataset, when: str) -> Table:
 
 def readable(group: str) -> str:
     """Return the name of a group of sources in words."""
-    return _GROUPS.get(group, group.replace("_", " "))
+    return _INDEPENDENT if group == "independent" else group.replace("_", " ")
 
 
 def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:
@@ -82,7 +69,7 @@ def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:
     if not total > 0:
         return None
     name = max(shares, key=lambda group: shares[group] if math.isfinite(shares[group]) else -1.0)
-    return readable(name), percent(round(shares[name] / total, 2))
+    return readable(name), f"{fixed(100 * shares[name] / total, 0)} %"
 
 
 def twist_table(errors: xr.Dataset, places: dict[str, xr.Dataset], names: dict[str, str]) -> Table:

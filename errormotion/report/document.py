@@ -114,6 +114,7 @@ class Part:
     key_figures: Sequence[KeyFigure]
     summary: Sequence[str]
     sections: Sequence[Section]
+    overview: Figure | None = None
 
 
 @dataclass(frozen=True)

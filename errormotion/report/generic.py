@@ -40,7 +40,11 @@ def part(source: Source, key: str) -> Part:
         [
             Section("errors", "Error motions", _curves(errors, key)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors)),
-            Section("quality", "Data quality", [*quality.sentences(errors, source.raw), _further(errors)]),
+            Section(
+                "quality",
+                "Data quality",
+                [*quality.notes(errors), *quality.sentences(errors, source.raw), _further(errors)],
+            ),
             Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
         ],
     )
@@ -139,6 +143,7 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
             axes.set_ylabel(unit)
             if not np.isfinite(values).any():
                 axes.text(0.5, 0.5, "not observed", transform=axes.transAxes, ha="center", va="center", color="#555555")
+                axes.set_yticks([])
                 continue
             for place, pick in enumerate(picks):
                 canvas.curve(axes, x, values[pick], expanded[pick], colour=canvas.COLOURS[place % len(canvas.COLOURS)])
@@ -150,7 +155,7 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
     shown = f" {len(picks)} of {flat.sizes['other_']} curves over {listed(others)} are shown." if others else ""
     caption = f"Error motions over {along}, actual minus commanded. Bands: expanded uncertainty, k = 2.{shown}"
     spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(budget.FREEDOMS))
-    return [Figure(canvas.draw(paint, f"{key}-errors", 5.2), caption, f"Error motions over {along}: {spans}.")]
+    return [Figure(canvas.draw(paint, f"{key}-errors", 4.6), caption, f"Error motions over {along}: {spans}.")]
 
 
 def _span(errors: xr.Dataset, name: str, index: int) -> str:

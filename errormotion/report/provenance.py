@@ -114,7 +114,7 @@ def blocks(errors: xr.Dataset, provenance: Mapping[str, Any]) -> list[Block]:
 
 
 def _flat(value: Any) -> list[tuple[str, str]]:
-    return [(".".join(path) or "value", text(leaf)) for path, leaf in walk(value)]
+    return [(".".join(path), text(leaf)) for path, leaf in walk(value) if path]
 
 
 def text(value: Any) -> str:

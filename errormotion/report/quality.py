@@ -74,6 +74,12 @@ def _residual(errors: xr.Dataset, i: int) -> list[Cell | str]:
     return [fixed(math.sqrt(finite(np.mean, residual**2)), 3), fixed(finite(np.max, np.abs(residual)), 3)]
 
 
+def notes(errors: xr.Dataset) -> list[Block]:
+    """Return what the method itself remarked."""
+    found = np.atleast_1d(np.asarray(errors.attrs.get("notes", []), dtype=object))
+    return [Text(str(note), "warning") for note in found if str(note).strip()]
+
+
 def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
     """Return what is to be said of completeness: instants, gaps in time, and what the raw dataset counted."""
     blocks: list[Block] = []
@@ -91,19 +97,24 @@ def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
         known = float(np.isfinite(errors[name].values).mean())
         if known < 1:
             blocks.append(Text(f"{name} is determined at {percent(known)} of the instants.", "warning"))
-    counted = counts(raw) if raw is not None else {}
+    counted = counts(errors, raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())
         blocks.append(Text(f"Counted while measuring: {words}."))
     return blocks
 
 
-def counts(raw: xr.Dataset) -> dict[str, str]:
-    """Return what a raw dataset says of dropped, missing and invalid samples, by name."""
+def counts(errors: xr.Dataset, raw: xr.Dataset | None) -> dict[str, str]:
+    """Return what result and raw dataset say of dropped and invalid samples, by name."""
     found = {}
-    if "dropped" in raw.attrs:
-        found["dropped samples"] = integer(float(raw.attrs["dropped"]))
-    for reason, number in _reasons(raw.attrs.get("invalid")).items():
+    attributes = {} if raw is None else raw.attrs
+    for name in ("dropped", "dropped_samples", "invalid_samples"):
+        if name in attributes:
+            found[name.removesuffix("_samples") + " samples"] = integer(float(attributes[name]))
+        elif name in errors:
+            values = np.atleast_1d(np.asarray(errors[name].values, float))
+            found[name.removesuffix("_samples") + " samples"] = " + ".join(integer(value) for value in values)
+    for reason, number in _reasons(attributes.get("invalid")).items():
         found[f"invalid because of {str(reason).replace('_', ' ')}"] = integer(float(number))
     return found
 

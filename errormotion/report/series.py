@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.report.document import Source
+from errormotion.report.provenance import read
 from errormotion.report.text import SECOND_OF_ARC, UM
 
 QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")
@@ -50,9 +51,9 @@ def curves(errors: xr.Dataset) -> dict[str, Curve]:
     nothing = np.full(n, np.nan)
     found = dict.fromkeys(QUANTITIES, (nothing, nothing))
     if "displacement" in errors:
-        moved = errors["displacement"].transpose("level", "lateral", "time")
-        sigma = errors["displacement_u"].transpose("level", "lateral", "time") if "displacement_u" in errors else None
-        for i in range(min(moved.sizes["level"], 2)):
+        moved = errors["displacement"].transpose(..., "lateral", "time")
+        sigma = errors["displacement_u"].transpose(..., "lateral", "time") if "displacement_u" in errors else None
+        for i in range(min(moved.shape[0], 2)):
             for j, axis in enumerate("XY"):
                 u = nothing if sigma is None else sigma.values[i, j]
                 found[f"{axis}{i + 1}"] = (moved.values[i, j], u)
@@ -77,7 +78,14 @@ def running(errors: xr.Dataset) -> np.ndarray | None:
 
 
 def end_of_running(errors: xr.Dataset) -> int | None:
-    """Return the index of the last instant at which the spindle turns; None where it never does or is not known."""
+    """Return the index of the last instant of running; None where the spindle never turns or it is not known.
+
+    The setting ``running_end`` of the method goes before the recorded speed.
+    """
+    stated = read(errors).get("settings", {}).get("running_end")
+    if isinstance(stated, (int, float)):
+        before = np.flatnonzero(errors["time"].values <= stated + 1e-6)
+        return int(before[-1]) if before.size else None
     turning = running(errors)
     return int(np.flatnonzero(turning)[-1]) if turning is not None and turning.any() else None
 
@@ -90,15 +98,17 @@ def last_known(values: np.ndarray, index: int | None = None) -> int | None:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that was done to the machine, at a time in minutes."""
+    """Something that was done to the machine, at a time in minutes; ``axes`` had their compensation changed."""
 
     minute: float
     what: str
+    axes: tuple[str, ...] = ()
 
 
 def events(source: Source) -> list[Event]:
     """Return what the schedule in the settings says was done after the start, in order of time."""
     schedule = source.settings.get("schedule")
+    zero = float(source.errors.attrs.get("reference_time", 0.0))
     if not isinstance(schedule, (list, tuple)):
         return []
     found = []
@@ -107,7 +117,8 @@ def events(source: Source) -> list[Event]:
             at = _seconds(entry.get("at", entry.get("time")))
             what = _done(entry)
             if math.isfinite(at) and what:
-                found.append(Event(at / 60, what))
+                axes = entry.get("compensation")
+                found.append(Event((at - zero) / 60, what, tuple(axes) if isinstance(axes, Mapping) else ()))
     return sorted(found, key=lambda event: event.minute)
 
 

@@ -17,6 +17,7 @@ from errormotion.report.spindle_figures import LOOK
 from errormotion.report.text import fixed, integer, listed
 
 _NEEDED = ("beam_origin", "beam_direction", "bar_axis_point", "bar_axis_direction", "bar_radius")
+_PATCH = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
 _TAIL = 7e-3  # length of a beam drawn behind its origin, m
 
 
@@ -103,23 +104,18 @@ def figure(errors: xr.Dataset, key: str) -> Figure | None:
     factor = _exaggeration(moved)
     side = [i for i in range(3) if i != setup.along]
     views = [(side[0], setup.along), (side[1], setup.along), (side[0], side[1])]
-    reach = setup.radius + _TAIL + 8e-3
-    low, high = _ends(setup)
-    below = low - _TAIL - 4e-3
-    tall, wide = high - below + 2e-3, 2 * reach
+    limits = np.array([_limits(setup, i) for i in range(3)])
+    spans = np.ptp(limits, axis=1)
+    wide = [spans[a] for a, _ in views]
 
     def paint(drawing: Canvas) -> None:
-        panels = drawing.subplots(1, 3, width_ratios=[wide, wide, wide])
+        panels = drawing.subplots(1, 3, width_ratios=wide)
         for axes, view in zip(panels, views, strict=True):
             _view(axes, setup, view, moved, factor)
-            centre = setup.axis_point[list(view)]
-            axes.set_xlim(*(1e3 * (centre[0] + np.array([-reach, reach]))))
-            if view[1] == setup.along:
-                axes.set_ylim(1e3 * below, 1e3 * (high + 2e-3))
-            else:
-                axes.set_ylim(*(1e3 * (centre[1] + np.array([-reach, reach]))))
+            axes.set_xlim(*(1e3 * limits[view[0]]))
+            axes.set_ylim(*(1e3 * limits[view[1]]))
 
-    svg = canvas.draw(paint, key, min(0.55 + (canvas.WIDTH - 1.3) / 3 * tall / wide, 5.0))
+    svg = canvas.draw(paint, key, min(0.6 + (canvas.WIDTH - 1.4) / sum(wide) * max(spans[b] for _, b in views), 6.5))
     drift = (
         f" Dashed: the bar at the end of running, its displacement drawn {integer(factor)} times larger."
         if factor
@@ -128,7 +124,7 @@ def figure(errors: xr.Dataset, key: str) -> Figure | None:
     caption = (
         f"Set-up in machine coordinates, to scale: bar of {fixed(2e3 * setup.radius, 3)} mm diameter, levels of "
         f"evaluation, and the beams from the start of their measuring range (dots) to the bar. Thin lines lead back to "
-        f"the sensors, which are not drawn; a ring is a beam that comes out of the page.{drift}"
+        f"the sensors, which are not drawn; a ring is a beam along the line of sight.{drift}"
     )
     alt = (
         f"Views {listed(['XYZ'[a] + 'XYZ'[b] for a, b in views])} of a bar with the beams {listed(setup.names)}; "
@@ -164,6 +160,14 @@ def table(errors: xr.Dataset) -> Table | None:
     )
 
 
+def _limits(setup: Setup, i: int) -> tuple[float, float]:
+    """Return what is shown along one machine axis, m: bar, beams, and room for their names."""
+    tails = setup.origin[:, i] - _TAIL * setup.direction[:, i]
+    bar = np.array(_ends(setup)) if i == setup.along else setup.axis_point[i] + setup.radius * np.array([-1.0, 1.0])
+    room = 2e-3 if i == setup.along else 6e-3
+    return float(min(tails.min() - 5e-3, bar[0] - room)), float(max(tails.max() + 5e-3, bar[1] + room))
+
+
 def _ends(setup: Setup) -> tuple[float, float]:
     """Lowest and highest place of the drawn bar along its main axis."""
     k = setup.along
@@ -197,10 +201,10 @@ def _moved(errors: xr.Dataset, setup: Setup) -> np.ndarray | None:
 
 
 def _exaggeration(moved: np.ndarray | None) -> int:
-    """1, 2 or 5 times a power of ten that draws the largest displacement about 2 mm long; 0 where there is none."""
+    """1, 2 or 5 times a power of ten that draws the largest displacement at most 4 mm long; 0 where there is none."""
     if moved is None:
         return 0
-    wanted = 2e-3 / np.abs(moved).max()
+    wanted = 4e-3 / np.abs(moved).max()
     power = 10 ** math.floor(math.log10(wanted))
     return int(max(step * power for step in (1, 2, 5) if step * power <= wanted)) if wanted >= 1 else 0
 
@@ -230,8 +234,10 @@ def _view(axes: Axes, setup: Setup, view: tuple[int, int], moved: np.ndarray | N
                 linewidth=0.8,
                 linestyle=(0, (4, 2)),
             )
+    tails = 1e3 * (setup.origin - _TAIL * setup.direction)[:, list(view)]
     for i, name in enumerate(setup.names):
-        _beam(axes, setup, view, i, name)
+        twins = [j for j in range(len(tails)) if np.linalg.norm(tails[j] - tails[i]) < 3 and j != i]
+        _beam(axes, setup, view, i, name, 4 * np.sign(twins[0] - i) if twins else 0.0)
 
 
 def _bar_from_the_side(axes: Axes, setup: Setup, view: tuple[int, int], low: float, high: float) -> None:
@@ -246,7 +252,16 @@ def _bar_from_the_side(axes: Axes, setup: Setup, view: tuple[int, int], low: flo
         axes.plot(
             [middle[0] - reach, middle[0] + reach], [middle[1]] * 2, color="#666666", linewidth=0.6, dashes=(2, 2)
         )
-        axes.text(middle[0] - reach - 0.6, middle[1], f"L{i + 1}", ha="right", va="center", color="#444444", fontsize=7)
+        axes.text(
+            middle[0] - reach - 0.6,
+            middle[1],
+            f"L{i + 1}",
+            ha="right",
+            va="center",
+            color="#444444",
+            fontsize=7,
+            bbox=_PATCH,
+        )
 
 
 def _moved_bar(
@@ -262,7 +277,8 @@ def _moved_bar(
     axes.plot(*outline.T, color="#222222", linewidth=0.8, linestyle=(0, (4, 2)))
 
 
-def _beam(axes: Axes, setup: Setup, view: tuple[int, int], i: int, name: str) -> None:
+def _beam(axes: Axes, setup: Setup, view: tuple[int, int], i: int, name: str, aside: float) -> None:
+    """Draw one beam; ``aside`` moves its name across the beam, in points."""
     plane = list(view)
     colour = LOOK.get(name, (canvas.BLACK, None))[0]
     origin, hit = 1e3 * setup.origin[i][plane], 1e3 * setup.hit[i][plane]
@@ -281,7 +297,7 @@ def _beam(axes: Axes, setup: Setup, view: tuple[int, int], i: int, name: str) ->
     axes.annotate(
         name,
         back,
-        xytext=(-3 * sense, 0) if flat else (0, -3 * sense),
+        xytext=(-3 * sense, aside) if flat else (2 * aside, -3 * sense),
         textcoords="offset points",
         ha=("right" if sense > 0 else "left") if flat else "center",
         va="center" if flat else ("top" if sense > 0 else "bottom"),

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
 from errormotion.kinematics.iso import iso_names
 from errormotion.report import budget, iso230_3, provenance, quality, setup_drawing, spindle_figures
-from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Text, estimate
+from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
 from errormotion.report.series import (
     QUANTITIES,
     WHAT,
     Curve,
+    Event,
     curves,
     end_of_running,
     events,
@@ -19,7 +23,7 @@ from errormotion.report.series import (
     minutes_of,
     unit_of,
 )
-from errormotion.report.text import fixed, integer, minutes
+from errormotion.report.text import finite, fixed, integer, listed, minutes
 
 
 def part(source: Source, key: str) -> Part:
@@ -28,16 +32,17 @@ def part(source: Source, key: str) -> Part:
     return Part(
         "Thermal drift of the spindle",
         _key_figures(errors),
-        _summary(errors),
+        _summary(source),
         [
             Section("iso", "Thermal drift values (ISO 230-3)", _values(errors)),
-            Section("drift", "Drift over time", _drift(source, key), page_break=True),
+            Section("drift", "Drift over time", _drift(source, key)),
             Section("temperatures", "Temperatures", _temperatures(source, key)),
-            Section("setup", "Set-up", _setup(errors, key), page_break=True),
+            Section("setup", "Set-up", _setup(errors, key)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors)),
-            Section("quality", "Residuals and data quality", _quality(source, key), page_break=True),
+            Section("quality", "Residuals and data quality", _quality(source, key)),
             Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
         ],
+        spindle_figures.overview(errors, events(source), f"{key}-overview"),
     )
 
 
@@ -67,7 +72,8 @@ def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     ]
 
 
-def _summary(errors: xr.Dataset) -> list[str]:
+def _summary(source: Source) -> list[str]:
+    errors = source.errors
     time, found, stop = minutes_of(errors), curves(errors), end_of_running(errors)
     if time.size < 2:
         return ["The record holds fewer than two instants: there is no drift to report."]
@@ -78,15 +84,15 @@ def _summary(errors: xr.Dataset) -> list[str]:
     )
     if by_size:
         words += _largest(errors, found[by_size[0]], by_size[0])
-    first = [(name, iso230_3.cell(errors, name, "range_60min")) for name in QUANTITIES]
-    known = [f"d({name}) {_with_uncertainty(value)} {unit_of(name)[0]}" for name, value in first if value.text != "—"]
-    if known:
-        words.append(f"Range within the first 60 min: {', '.join(known)}.")
+    words += _changes(errors, events(source))
+    words += _first_hour(errors)
     words += _still_moving(errors, by_size)
     place = stop if stop is not None else time.size - 1
     largest = budget.largest(errors.isel(time=place), "EZ")
     if largest:
         words.append(f"The largest share in the variance of Z {_when(errors)}: {largest[0]}, {largest[1]}.")
+    if errors.attrs.get("beams") == "nominal":
+        words.append("The beams were taken from the drawing, not detected: the bar cannot be placed better than that.")
     unseen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if not np.isfinite(errors[name].values).any()]
     if unseen:
         names = iso_names("spindle")
@@ -125,6 +131,51 @@ def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
     ]
 
 
+def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
+    """Say what a switched compensation did: the change from just before it to a minute later, or the next event."""
+    time, words = minutes_of(errors), []
+    for i, event in enumerate(done):
+        until = min([event.minute + 1.0, time[-1], *(later.minute for later in done[i + 1 : i + 2])])
+        before, after = np.flatnonzero(time < event.minute), np.flatnonzero(time <= until)
+        for axis in event.axes:
+            freedom = f"E{axis}"
+            known = np.isfinite(errors[freedom].values)
+            first, last = last_known(errors[freedom].values, before[-1] if before.size else -1), after[known[after]]
+            if first is None or not last.size or time[last[-1]] <= event.minute:
+                continue
+            pair = errors.isel(time=[first, int(last[-1])])
+            change = pair.em.combine([-1.0, 1.0], "time")
+            size = unit_of(axis)[1]
+            values = [
+                estimate(value / size, 2 * math.sqrt(max(variance, 0.0)) / size)
+                for value, variance in (
+                    (float(pair[freedom][0]), float(pair["covariance"].sel(dof=freedom, dof_=freedom)[0])),
+                    (float(pair[freedom][1]), float(pair["covariance"].sel(dof=freedom, dof_=freedom)[1])),
+                    (float(change.value.sel(dof=freedom)), float(change.covariance.sel(dof=freedom, dof_=freedom))),
+                )
+            ]
+            told = [f"{_with_uncertainty(value)} µm" for value in values]
+            words.append(
+                f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min: {axis} at the "
+                f"functional point went from {told[0]} to {told[1]} by {fixed(time[last[-1]], 1)} min, "
+                f"a change of {told[2]}."
+            )
+    return words
+
+
+def _first_hour(errors: xr.Dataset) -> list[str]:
+    """Say the ranges of the first 60 min: Z, the largest lateral one, the largest tilt."""
+    told = []
+    for names in (("Z",), ("X1", "X2", "Y1", "Y2"), ("A", "B")):
+        values = {name: iso230_3.value_of(errors, name, "range_60min")[0] for name in names}
+        known = {name: value for name, value in values.items() if math.isfinite(value)}
+        if known:
+            name = max(known, key=lambda quantity: known[quantity])
+            cell = iso230_3.cell(errors, name, "range_60min")
+            told.append(f"d({name}) {_with_uncertainty(cell)} {unit_of(name)[0]}")
+    return [f"Largest ranges within the first 60 min: {listed(told)}."] if told else []
+
+
 def _still_moving(errors: xr.Dataset, by_size: list[str]) -> list[str]:
     if not by_size:
         return []
@@ -135,7 +186,9 @@ def _still_moving(errors: xr.Dataset, by_size: list[str]) -> list[str]:
     if np.isfinite(slope):
         cell = iso230_3.cell(errors, name, "end_slope")
         verdict = "still drifting" if abs(slope) > 2 * slope_u else "steady within the uncertainty"
-        words.append(f"At the end of running d({name}) is {verdict}: {_with_uncertainty(cell)} {unit_of(name)[0]}/h.")
+        words.append(
+            f"{_when(errors).capitalize()} d({name}) is {verdict}: {_with_uncertainty(cell)} {unit_of(name)[0]}/h."
+        )
     if np.isfinite(constant):
         cell = iso230_3.cell(errors, name, "time_constant")
         words.append(f"d({name}) approaches its end value with a time constant of {_with_uncertainty(cell)} min.")
@@ -152,7 +205,14 @@ def _values(errors: xr.Dataset) -> list[Block]:
     if not found:
         return [Text("The result holds no ISO 230-3 values.", "note")]
     meaning = "; ".join(f"{name}: {WHAT[name]}" for name in QUANTITIES)
-    return [*found, Text(f"{meaning}. Level L1 is the one nearer to the end face of the bar.", "note")]
+    setup = setup_drawing.setup_of(errors)
+    if setup is not None and setup.levels.size == 2:
+        heights = [f"{'xyz'[setup.along]} = {fixed(1e3 * height, 3)} mm" for height in setup.levels]
+        meaning += f". L1: {heights[0]}; L2: {heights[1]}"
+    sensor = str(errors.attrs.get("iso_temperature_sensor", ""))
+    if sensor:
+        meaning += f". Per kelvin: of the temperature sensor '{sensor}'"
+    return [*found, Text(f"{meaning}.", "note")]
 
 
 def _drift(source: Source, key: str) -> list[Block]:
@@ -166,7 +226,33 @@ def _drift(source: Source, key: str) -> list[Block]:
 
 def _temperatures(source: Source, key: str) -> list[Block]:
     figure = spindle_figures.temperatures(source.errors, events(source), f"{key}-temperature")
-    return [figure] if figure is not None else [Text("No temperatures were recorded with this test.", "note")]
+    if figure is None:
+        return [Text("No temperatures were recorded with this test.", "note")]
+    return [figure, _temperature_table(source.errors)]
+
+
+def _temperature_table(errors: xr.Dataset) -> Table:
+    values = errors["temperature"].transpose("time", "sensor").values
+    names = errors["sensor"].values if "sensor" in errors.coords else np.arange(1, values.shape[1] + 1)
+    stop = end_of_running(errors)
+    rows: list[list[Cell | str]] = []
+    for name, column in zip(names, values.T, strict=True):
+        first, last = np.flatnonzero(np.isfinite(column))[:1], last_known(column, stop)
+        start = column[first[0]] if first.size else math.nan
+        end = column[last] if last is not None else math.nan
+        spans = (start, end, finite(np.min, column), finite(np.max, column))
+        rows.append(
+            [
+                str(name),
+                *(or_dash(fixed(value, 2), "no valid reading") for value in spans),
+                or_dash(fixed(end - start, 2, signed=True), "no valid reading"),
+            ]
+        )
+    return Table(
+        "Temperatures in °C, and their change in K from the start to the end of running.",
+        ["sensor", "start", _when(errors).removeprefix("at the "), "lowest", "highest", "change"],
+        rows,
+    )
 
 
 def _setup(errors: xr.Dataset, key: str) -> list[Block]:
@@ -201,7 +287,7 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
 
 def _quality(source: Source, key: str) -> list[Block]:
     errors = source.errors
-    blocks = quality.sentences(errors, source.raw)
+    blocks = quality.notes(errors) + quality.sentences(errors, source.raw)
     table = quality.table(errors)
     if table is not None:
         blocks.append(table)

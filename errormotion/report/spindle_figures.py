@@ -27,6 +27,17 @@ LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
 }
 
 
+def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
+    """Return all displacements in one panel, for the summary; None where all are unknown."""
+    found = [line for name, line in curves(errors).items() if name not in ("A", "B")]
+    found = [line for line in found if np.isfinite(line.values).any()]
+    if not found:
+        return None
+    svg = _stack(errors, [found], ["µm"], done, key, titles=["Displacement"], height=1.9)
+    caption = f"All displacements in one scale.{_events_in_words(done)}"
+    return Figure(svg, caption, _in_words("All displacements over time", [found], minutes_of(errors)))
+
+
 def displacements(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
     """Return the displacement curves with their bands: X, Y and Z above one another; None where all are unknown."""
     found = curves(errors)
@@ -202,18 +213,32 @@ def _time_axis(axes: Axes, time: np.ndarray) -> None:
 def _mark_events(axes: Axes, done: Sequence[Event], *, named: bool) -> None:
     low, high = axes.get_xlim()
     inside = [event for event in done if low + 0.005 * (high - low) < event.minute < high]
-    for i, event in enumerate(inside):
-        axes.axvline(event.minute, color="#555555", linewidth=0.7, linestyle=(0, (2, 2)))
-        if named:
+    for event in inside:
+        axes.axvline(event.minute, color="#999999", linewidth=0.6, linestyle=(0, (2, 2)), zorder=0.5)
+    if named:
+        for minute, name in _named_together(inside, 0.03 * (high - low)):
             axes.annotate(
-                str(i + 1),
-                (event.minute, 1.0),
+                name,
+                (minute, 1.0),
                 xycoords=("data", "axes fraction"),
                 xytext=(0, 2),
                 textcoords="offset points",
                 ha="center",
                 fontsize=7,
             )
+
+
+def _named_together(inside: Sequence[Event], near: float) -> list[tuple[float, str]]:
+    """Return place and name of events by number; those closer than ``near`` share one name."""
+    groups: list[list[int]] = []
+    for i, event in enumerate(inside):
+        if groups and event.minute - inside[groups[-1][-1]].minute < near:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return [
+        (float(np.mean([inside[i].minute for i in group])), ", ".join(str(i + 1) for i in group)) for group in groups
+    ]
 
 
 def _events_in_words(done: Sequence[Event]) -> str:

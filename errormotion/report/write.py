@@ -146,7 +146,7 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
 
 def _truth(sources: Sequence[Source]) -> str:
     if any(source.errors.attrs.get("method") == "twin" for source in sources):
-        return "they are the truth of a virtual machine"
+        return "the values are the truth of a virtual machine"
     return ""
 
 
@@ -169,10 +169,21 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
     return [
         ("Machine", machine),
         ("Test", known("test", "name")),
-        ("Measured", known("started", "start", "utc_start", "start_utc", "created")),
+        ("Measured", _moment(known("started", "start", "created"))),
         ("Operator", known("operator")),
         ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
         ("Reference state", str(attributes.get("reference", DASH))),
         ("Instruments", serials or ", ".join(row["model"] or row["name"] for row in instruments) or DASH),
         ("Run", known("id", "run")),
     ]
+
+
+def _moment(text: str) -> str:
+    """Return an ISO 8601 time as people read it; any other text as it is."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return text
+    if moment.tzinfo is None:
+        return moment.strftime("%Y-%m-%d %H:%M")
+    return moment.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
