@@ -1,8 +1,8 @@
 """Averages of fixed length over records of any length, at the speed of memory.
 
-A drift record is billions of samples that become one mean every half second. The kernels here add up in double precision and
-turn back to a window only where its sum shows that a NaN is in it; the loops around them hand out slices, so that a record
-larger than memory passes through in constant space.
+A drift record is billions of samples that become one mean every half second. The kernels here add up in double
+precision and turn back to a window only where its sum shows that a NaN is in it; the loops around them hand out slices,
+so that a record larger than memory passes through in constant space.
 """
 
 from __future__ import annotations

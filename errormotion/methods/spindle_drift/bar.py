@@ -116,9 +116,7 @@ def start_axis(origin: Array, direction: Array, distance: Array, radius: float, 
     flat[:, 2] = 0.0
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     tau = (point[:, 2] - levels[0]) / (levels[1] - levels[0])
-    rows = np.column_stack(
-        [(1 - tau) * flat[:, 0], (1 - tau) * flat[:, 1], tau * flat[:, 0], tau * flat[:, 1]]
-    )
+    rows = np.column_stack([(1 - tau) * flat[:, 0], (1 - tau) * flat[:, 1], tau * flat[:, 0], tau * flat[:, 1]])
     if not np.linalg.cond(rows) < 1e8:
         return np.full(4, np.nan)
     return np.linalg.solve(rows, np.sum(flat * point, axis=1) + radius)
@@ -181,9 +179,7 @@ def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, leve
     return a, A + a * along[:, None]
 
 
-def state_jacobian(
-    q: Array, distance: Array, origin: Array, direction: Array, levels: Array
-) -> tuple[Array, Array]:
+def state_jacobian(q: Array, distance: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
     """Return the derivatives of axis direction a and end point E with respect to all that was read and assumed.
 
     Parameters

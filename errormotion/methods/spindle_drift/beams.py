@@ -112,7 +112,8 @@ def likelihood_fit(
     used = np.isfinite(distance) & np.isfinite(centre).all(axis=-1)
     if used.sum() <= UNKNOWNS:
         raise MethodError(
-            f"Beam {name}: {used.sum()} of {used.size} readings are valid; a beam has {UNKNOWNS} unknowns and needs more."
+            f"Beam {name}: {used.sum()} of {used.size} readings are valid; a beam has {UNKNOWNS} unknowns and needs "
+            "more."
         )
     direction = direction / np.linalg.norm(direction)
     origin, direction = _first_shift(distance, centre, radius, origin, direction, used)
@@ -170,7 +171,7 @@ def _gauss_newton(
             break
         step, *_ = np.linalg.lstsq(jacobian[meets], (distance - model)[meets])
         origin = origin + step[:3]
-        direction = _turn(direction, step[3:])
+        direction = _turn(direction, np.asarray(step[3:], np.float64))
         if np.abs(step[:3]).max() < 1e-13 and np.abs(step[3:]).max() < 1e-11:
             model, jacobian = sphere_reading(origin, direction, centre, radius)
             if np.isfinite(model[used]).all():
@@ -240,9 +241,8 @@ def circles_and_line(
 
 
 def _arc(s: Array, readings: Array, radius: float) -> tuple[float, float]:
-    """Fit y = y0 + (R - sqrt(R^2 - (s - s0)^2)) with R free; return the place s0 and the reading y0 of its lowest point."""
-    curve = np.polynomial.Polynomial.fit(s, readings, 2)
-    c, b, a = curve.convert().coef
+    """Fit y = y0 + (R - sqrt(R^2 - (s - s0)^2)) with R free; return s0 and y0 of the lowest point."""
+    c, b, a = (float(x) for x in np.linalg.lstsq(np.vander(s, 3, increasing=True), readings)[0])
     start = np.array([-b / (2 * a), c - b * b / (4 * a), 1 / (2 * a)])
     unit = np.array([1e-3, 1e-3, radius])
 

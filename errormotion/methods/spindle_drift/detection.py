@@ -66,7 +66,9 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     parameters = ["px", "py", "pz", "ux", "uy", "uz"]
 
     def vectors(values: Array, unit: str) -> xr.DataArray:
-        return xr.DataArray(values, coords={"beam": beam_axis, "direction": axis}, dims=("beam", "direction"), attrs={"units": unit})
+        return xr.DataArray(
+            values, coords={"beam": beam_axis, "direction": axis}, dims=("beam", "direction"), attrs={"units": unit}
+        )
 
     extras = {
         "beam_origin": vectors(np.array([b.origin for b in found]), "m"),
@@ -87,7 +89,9 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
             dims=("beam", "profile", "step"),
             attrs={"units": "m"},
         ),
-        "noise": xr.DataArray(np.array([b.noise for b in found]), coords={"beam": beam_axis}, dims="beam", attrs={"units": "m"}),
+        "noise": xr.DataArray(
+            np.array([b.noise for b in found]), coords={"beam": beam_axis}, dims="beam", attrs={"units": "m"}
+        ),
         "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), coords={"beam": beam_axis}, dims="beam"),
     }
     ds = build_errors(

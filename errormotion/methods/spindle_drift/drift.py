@@ -27,8 +27,6 @@ from errormotion.methods.spindle_drift.uncertainty import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from errormotion.methods.spindle_drift.settings import Settings
@@ -55,9 +53,7 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     """Bring a record down to means in one pass and constant memory; ``raw`` has its channels in order."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
-    slow_averagers = {
-        name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow
-    }
+    slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     for time, part in slices(raw):
@@ -173,7 +169,9 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         ),
         method=method,
         method_version=version,
-        provenance=provenance.make(settings, raw, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]),
+        provenance=provenance.make(
+            settings, raw, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]
+        ),
         influence=influence,
         sources=names,
         source_groups=groups,
@@ -206,7 +204,9 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     direction = np.asarray(raw["nominal_direction" if nominal else "beam_direction"].values, np.float64)
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
         lost = [c for c, o, u in zip(CHANNELS, origin, direction, strict=True) if not np.isfinite([*o, *u]).all()]
-        raise MethodError(f"The beam of {', '.join(lost)} is not known (NaN): expected origin and direction of all five.")
+        raise MethodError(
+            f"The beam of {', '.join(lost)} is not known (NaN): expected origin and direction of all five."
+        )
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     flat = direction[:SIDE, :2] / np.linalg.norm(direction[:SIDE, :2], axis=1, keepdims=True)
     for i, j in ((0, 2), (0, 3), (1, 2), (1, 3)):
@@ -234,7 +234,9 @@ def _count_unknown(averages: Averages, notes: list[str]) -> None:
     for channel, row, counts in zip(CHANNELS, averages.mean, averages.count, strict=True):
         unknown = np.isnan(row)
         if unknown.all():
-            raise MethodError(f"Channel {channel} has no valid reading in the whole record: check the sensor and its cable.")
+            raise MethodError(
+                f"Channel {channel} has no valid reading in the whole record: check the sensor and its cable."
+            )
         if unknown.any():
             first, last = averages.time[unknown][[0, -1]]
             notes.append(
@@ -259,8 +261,8 @@ def _reference_windows(averages: Averages, mean: Array, settings: Settings) -> N
     if not known.any():
         lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]
         raise MethodError(
-            f"The reference state at {begin:.1f} s has no valid reading of {', '.join(lost) or 'all channels at once'}. "
-            "Choose another one with reference_time and reference_average."
+            f"The reference state at {begin:.1f} s has no valid reading of {', '.join(lost) or 'all channels at once'}"
+            ". Choose another one with reference_time and reference_average."
         )
     return np.flatnonzero(known)
 
@@ -279,7 +281,9 @@ def _frame_expansion(raw: xr.Dataset, record: Record, settings: Settings, notes:
     per_kelvin = np.asarray(raw["frame_expansion"].transpose("channel", "direction").values, np.float64)
     change = temperature - temperature[np.isfinite(temperature)][0] if np.isfinite(temperature).any() else temperature
     if np.isnan(change).any():
-        notes.append(f"The frame's temperature is unknown in {int(np.isnan(change).sum())} means; the errors there are NaN.")
+        notes.append(
+            f"The frame's temperature is unknown in {int(np.isnan(change).sum())} means; the errors there are NaN."
+        )
     return np.asarray(per_kelvin[:, :, None] * change)
 
 
@@ -324,9 +328,11 @@ def _within_reference(independent: Array, influence: Array, reference: NDArray[n
 
 
 def _sensors(raw: xr.Dataset) -> list[str]:
-    return [str(name) for name in raw["sensor"].values] if "sensor" in raw.coords else [
-        f"T{k + 1}" for k in range(raw.sizes.get("sensor", 0))
-    ]
+    return (
+        [str(name) for name in raw["sensor"].values]
+        if "sensor" in raw.coords
+        else [f"T{k + 1}" for k in range(raw.sizes.get("sensor", 0))]
+    )
 
 
 def _extras(
@@ -339,12 +345,14 @@ def _extras(
     radius: float,
     levels: Array,
     time: Array,
-) -> Mapping[str, xr.DataArray]:
+) -> dict[str, xr.DataArray]:
     channel = ("channel", list(CHANNELS))
     axis = ("direction", list("xyz"))
 
     def over_channel(values: Array, unit: str) -> xr.DataArray:
-        return xr.DataArray(values, coords={"channel": channel, "time": time}, dims=("channel", "time"), attrs={"units": unit})
+        return xr.DataArray(
+            values, coords={"channel": channel, "time": time}, dims=("channel", "time"), attrs={"units": unit}
+        )
 
     # What the fitted bar would have shown; zero but for rounding, where the fit is exact.
     S = origin[:, None] + direction[:, None] * mean[:, :, None]
@@ -355,15 +363,21 @@ def _extras(
     first = int(np.flatnonzero(np.isfinite(state.E).all(axis=1))[0])
     vectors = {"beam_origin": (origin, "m"), "beam_direction": (direction, "1")}
     extras = {
-        name: xr.DataArray(values, coords={"channel": channel, "direction": axis}, dims=("channel", "direction"), attrs={"units": unit})
+        name: xr.DataArray(
+            values, coords={"channel": channel, "direction": axis}, dims=("channel", "direction"), attrs={"units": unit}
+        )
         for name, (values, unit) in vectors.items()
     }
     extras |= {
         "fit_residual": over_channel(residual, "m"),
         "distance_mean": over_channel(averages.mean, "m"),
         "valid_fraction": over_channel(averages.count / np.maximum(averages.expected, 1), "1"),
-        "bar_axis_point": xr.DataArray(state.E[first], coords={"direction": axis}, dims="direction", attrs={"units": "m"}),
-        "bar_axis_direction": xr.DataArray(state.a[first], coords={"direction": axis}, dims="direction", attrs={"units": "1"}),
+        "bar_axis_point": xr.DataArray(
+            state.E[first], coords={"direction": axis}, dims="direction", attrs={"units": "m"}
+        ),
+        "bar_axis_direction": xr.DataArray(
+            state.a[first], coords={"direction": axis}, dims="direction", attrs={"units": "1"}
+        ),
         "bar_radius": xr.DataArray(radius, attrs={"units": "m"}),
         "level_height": xr.DataArray(levels, coords={"level": ["L1", "L2"]}, dims="level", attrs={"units": "m"}),
     }

@@ -1,9 +1,9 @@
 """ISO 230-3 values of a spindle drift: what a certificate states, with what is known of each number.
 
-Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. Of each,
-the range over a period and the difference between its end and its start; which is which is part of the name, since the
-two differ as soon as a curve turns back. The uncertainty of a range is that of the difference between the two instants
-that carry it.
+Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. Of
+each, the range over a period and the difference between its end and its start; which is which is part of the name,
+since the two differ as soon as a curve turns back. The uncertainty of a range is that of the difference between the two
+instants that carry it.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class Series:
     variance: Array
 
     def difference_uncertainty(self, k: int, i: int, j: int) -> float:
-        """Standard uncertainty of quantity k at instant i minus at instant j."""
+        """Return the standard uncertainty of quantity k at instant i minus at instant j."""
         if i == j:
             return 0.0
         shared = self.influence[:, k, i] - self.influence[:, k, j]
         return float(np.sqrt(shared @ shared + self.variance[k, i] + self.variance[k, j]))
 
     def weighted(self, k: int, index: NDArray[np.int64], weights: Array) -> tuple[float, float]:
-        """Value and standard uncertainty of a weighted sum of quantity k over some instants."""
+        """Return value and standard uncertainty of a weighted sum of quantity k over some instants."""
         shared = self.influence[:, k, index] @ weights
         own = self.variance[k, index] @ weights**2
         return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own))

@@ -10,7 +10,7 @@ from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.detection import identify_beams
 from errormotion.methods.spindle_drift.drift import identify_drift
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
 if TYPE_CHECKING:
@@ -36,32 +36,32 @@ class SpindleDrift:
     needs: ClassVar[Needs] = Needs(
         instruments=("spindle_frame",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
     )
-    Settings: ClassVar[type[PluginSettings]] = Settings
+    Settings: ClassVar[type[PluginSettings]] = DriftSettings
 
     def acquire(
         self,
         bench: Bench,
-        settings: Settings,
+        settings: DriftSettings,
         *,
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition``."""
-        from errormotion.methods.spindle_drift import acquisition  # noqa: PLC0415 - identification never needs it
+        from errormotion.methods.spindle_drift import acquisition
 
         if settings.procedure == "beam_detection":
             return acquisition.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, inputs.get("beams"), done)
 
-    def append_dim(self, settings: Settings) -> str:
+    def append_dim(self, settings: DriftSettings) -> str:
         """Return ``channel`` for a beam detection (beam by beam), ``time`` for a drift record."""
         return "channel" if settings.procedure == "beam_detection" else "time"
 
-    def progress(self, settings: Settings) -> float:
+    def progress(self, settings: DriftSettings) -> float:
         """Return the expected length: beams, or seconds of drift."""
         return 5.0 if settings.procedure == "beam_detection" else settings.duration
 
-    def identify(self, raw: xr.Dataset, settings: Settings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: DriftSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
 
         Parameters
@@ -77,7 +77,7 @@ class SpindleDrift:
         MethodError
             The data do not determine the answer.
         """
-        settings = settings or Settings()
+        settings = settings or DriftSettings()
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
         validate(checked)
         if checked.attrs["schema"] != SCHEMA:
@@ -85,10 +85,8 @@ class SpindleDrift:
         part = identify_beams if "step" in raw.dims else identify_drift
         return part(checked, settings, self.info.id, self.info.version)
 
-    def plan(self, settings: Settings | None = None) -> xr.Dataset:
+    def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
-        from errormotion.methods.spindle_drift.planning import plan  # noqa: PLC0415 - a plan is no part of measuring
+        from errormotion.methods.spindle_drift.planning import plan
 
-        return plan(self, settings or Settings())
-
-
+        return plan(self, settings or DriftSettings())

@@ -66,7 +66,9 @@ def segment_steps(distance: Array, rate: float, steps: int, dwell: float, averag
         No large move out and back, or a period that does not fit ``dwell``.
     """
     if average > 0.5 * dwell:
-        raise MethodError(f"Averaging {average:g} s from the middle of a rest of {dwell:g} s: expected at most {dwell / 2:g} s.")
+        raise MethodError(
+            f"Averaging {average:g} s from the middle of a rest of {dwell:g} s: expected at most {dwell / 2:g} s."
+        )
     tick = max(1, round(rate * _TICK))
     ticks = distance.size // tick
     if ticks < 10:
@@ -87,7 +89,9 @@ def segment_steps(distance: Array, rate: float, steps: int, dwell: float, averag
     first = np.round((start + (np.arange(steps) + 0.5) * period) * rate).astype(np.int64)
     length = max(1, round(average * rate))
     if first[-1] + length > distance.size:
-        raise MethodError("The record ends before the last step does; record on until the machine is back at its start.")
+        raise MethodError(
+            "The record ends before the last step does; record on until the machine is back at its start."
+        )
     rests = distance[first[:, None] + np.arange(length)]
     count = np.isfinite(rests).sum(axis=1)
     total = np.where(np.isfinite(rests), rests, 0.0).sum(axis=1)
@@ -106,7 +110,8 @@ def _large_moves(level: Array, seconds: float, steps: int, dwell: float) -> tupl
     least = round(0.95 * dwell * steps / seconds)
     if change.size <= least:
         raise MethodError(
-            f"The record holds {level.size * seconds:.1f} s; a scan of {steps} steps needs more than {steps * dwell:g} s."
+            f"The record holds {level.size * seconds:.1f} s; a scan of {steps} steps needs more than "
+            f"{steps * dwell:g} s."
         )
     # The pair of changes, at least a scan apart, that is largest together.
     before = np.maximum.accumulate(change)

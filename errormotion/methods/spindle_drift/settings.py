@@ -6,16 +6,17 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from errormotion.datasets.units import Angle, Length, Speed, Time
+from errormotion.datasets.units import Angle, Frequency, Length, Speed, Time
 from errormotion.plugins import PluginSettings
+
 
 class Event(PluginSettings):
     """Something that happens at a stated time of a drift test: a spindle speed, or a compensation on or off."""
 
     at: Time = Field(description="time since the start of the test")
-    spindle_speed: Speed | None = Field(None, ge=0, description="spindle speed from here on, 1/min")
+    spindle_speed: Speed | None = Field(default=None, ge=0, description="spindle speed from here on, 1/min")
     compensation: dict[Literal["X", "Y", "Z"], bool] | None = Field(
-        None, description="thermal compensation of the control by axis, on (true) or off (false)"
+        default=None, description="thermal compensation of the control by axis, on (true) or off (false)"
     )
 
     @model_validator(mode="after")
@@ -25,53 +26,90 @@ class Event(PluginSettings):
         return self
 
 
+class Layout(PluginSettings):
+    """The set-up that a plan assumes."""
+
+    bar_radius: Length = Field(default=5e-3, gt=0, description="radius of the bar")
+    standoff: Length = Field(default=1e-3, gt=0, description="reading of each sensor at the start")
+    levels: tuple[Length, Length] = Field(
+        default=(0.01, 0.05), description="z of the levels L1 and L2 above the bar's end"
+    )
+    noise: Length = Field(default=0.3e-6, gt=0, description="standard deviation of one sample")
+    rate: Frequency = Field(default=20e3, gt=0, description="samples per second")
+    step_noise: Length = Field(
+        default=0.6e-6, gt=0, description="standard deviation of one step's mean in a beam detection"
+    )
+
+
 class Settings(PluginSettings):
     """Settings of ``spindle_drift``."""
 
     procedure: Literal["drift", "beam_detection"] = Field(
-        "drift", description="what to acquire; identification sees from the data which of the two they are"
+        default="drift", description="what to acquire; identification sees from the data which of the two they are"
     )
 
     # Drift: acquisition
-    duration: Time = Field(5 * 3600.0, gt=0, description="length of the drift record")
-    schedule: tuple[Event, ...] = Field((), description="spindle speeds and compensation over time")
+    duration: Time = Field(default=5 * 3600.0, gt=0, description="length of the drift record")
+    schedule: tuple[Event, ...] = Field(default=(), description="spindle speeds and compensation over time")
 
     # Drift: identification
-    average: Time = Field(0.5, gt=0, description="length of one mean; whole turns of the spindle cancel its run-out")
-    min_valid: float = Field(0.5, ge=0, le=1, description="share of valid samples below which a mean is unknown")
-    reference_time: Time = Field(0.0, ge=0, description="beginning of the reference state, from the record's start")
+    average: Time = Field(
+        default=0.5, gt=0, description="length of one mean; whole turns of the spindle cancel its run-out"
+    )
+    min_valid: float = Field(
+        default=0.5, ge=0, le=1, description="share of valid samples below which a mean is unknown"
+    )
+    reference_time: Time = Field(
+        default=0.0, ge=0, description="beginning of the reference state, from the record's start"
+    )
     reference_average: Time | None = Field(
-        None, gt=0, description="length of the reference state; default one mean"
+        default=None, gt=0, description="length of the reference state; default one mean"
     )
     functional_point: tuple[Length, Length, Length] | None = Field(
-        None, description="where the errors are stated; default the bar's end on its axis, to 0.1 mm"
+        default=None, description="where the errors are stated; default the bar's end on its axis, to 0.1 mm"
     )
     beams: Literal["raw", "nominal"] = Field(
-        "raw", description="the beams of the raw dataset, or the nominal ones, to see what their detection is worth"
+        default="raw",
+        description="the beams of the raw dataset, or the nominal ones, to see what their detection is worth",
     )
-    nominal_origin_uncertainty: Length = Field(1e-4, ge=0, description="standard uncertainty of a nominal origin")
-    nominal_direction_uncertainty: Angle = Field(5e-3, ge=0, description="standard uncertainty of a nominal direction")
+    nominal_origin_uncertainty: Length = Field(
+        default=1e-4, ge=0, description="standard uncertainty of a nominal origin"
+    )
+    nominal_direction_uncertainty: Angle = Field(
+        default=5e-3, ge=0, description="standard uncertainty of a nominal direction"
+    )
     noise: Literal["auto", "stated"] = Field(
-        "auto", description="the stated noise of the readings, raised where the record shows more (auto)"
+        default="auto", description="the stated noise of the readings, raised where the record shows more (auto)"
     )
-    bar_radius_uncertainty: Length = Field(0.0, ge=0, description="standard uncertainty of the bar's radius")
-    compensate_frame: bool = Field(True, description="correct the beams for the frame's expansion, where it is known")
-    frame_temperature: str = Field("frame", description="name of the temperature sensor on the measuring frame")
+    bar_radius_uncertainty: Length = Field(default=0.0, ge=0, description="standard uncertainty of the bar's radius")
+    compensate_frame: bool = Field(
+        default=True, description="correct the beams for the frame's expansion, where it is known"
+    )
+    frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
     frame_expansion_uncertainty: float = Field(
-        0.1, ge=0, description="relative standard uncertainty of the frame's expansion"
+        default=0.1, ge=0, description="relative standard uncertainty of the frame's expansion"
     )
     unseen_rotation: Angle = Field(
-        2e-5, ge=0, description="standard deviation of the rotation about the spindle axis, which no sensor sees"
+        default=2e-5,
+        ge=0,
+        description="standard deviation of the rotation about the spindle axis, which no sensor sees",
     )
-    running_end: Time | None = Field(None, gt=0, description="end of running; default where the speed goes to zero")
+    running_end: Time | None = Field(
+        default=None, gt=0, description="end of running; default where the speed goes to zero"
+    )
     iso_temperature: str | None = Field(
-        None, description="temperature sensor for the change per kelvin; default the one that changes most"
+        default=None, description="temperature sensor for the change per kelvin; default the one that changes most"
     )
 
     # Beam detection
-    sphere_radius: Length = Field(5e-3, gt=0, description="radius of the sphere in the spindle")
-    depths: tuple[Length, ...] = Field((0.2e-3, 1.0e-3, 1.8e-3), min_length=1, description="readings at which to scan")
-    scan_length: Length = Field(2e-3, gt=0, description="length of one scan")
-    steps: int = Field(101, ge=5, description="rests of one scan, both ends included")
-    dwell: Time = Field(1.0, gt=0, description="rest at each step")
-    step_average: Time = Field(0.3, gt=0, description="length of the mean, from the middle of each rest")
+    sphere_radius: Length = Field(default=5e-3, gt=0, description="radius of the sphere in the spindle")
+    depths: tuple[Length, ...] = Field(
+        default=(0.2e-3, 1.0e-3, 1.8e-3), min_length=1, description="readings at which to scan"
+    )
+    scan_length: Length = Field(default=2e-3, gt=0, description="length of one scan")
+    steps: int = Field(default=101, ge=5, description="rests of one scan, both ends included")
+    dwell: Time = Field(default=1.0, gt=0, description="rest at each step")
+    step_average: Time = Field(default=0.3, gt=0, description="length of the mean, from the middle of each rest")
+
+    # Planning
+    layout: Layout = Field(default_factory=Layout, description="the set-up that a plan assumes")
