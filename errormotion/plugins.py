@@ -216,7 +216,7 @@ _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo] | type[MethodInfo], tuple[s
 def _name_and_version(dist: Distribution | None) -> str:
     try:
         return f"{dist.name} {dist.version}" if dist is not None else "unknown"
-    except (AttributeError, KeyError, TypeError):  # a distribution without readable metadata
+    except (AttributeError, KeyError, OSError, TypeError):  # a distribution without readable metadata
         return "unknown"
 
 

@@ -13,6 +13,8 @@ from errormotion.testing.builtin import builtin_subjects
 from errormotion.testing.kit import Check, CheckResult, run_check
 from errormotion.testing.subjects import InstrumentSubject, MethodSubject, load_object
 
+SIMULATED = "sim://cframe?seed=3"
+
 
 def check_plugin(group: Group, plugin_id: str, *, address: str | None = None) -> list[CheckResult]:
     """Run every check on one plugin of the registry.
@@ -80,7 +82,7 @@ def subjects_of(
             )
         if address is None and not cls.info.simulator:
             raise PluginError(f"The instrument '{plugin_id}' has no simulator; give the address of a real one.")
-        stated = InstrumentSubject(cls, address or f"sim://cframe/{plugin_id}?seed=3")
+        stated = InstrumentSubject(cls, address or SIMULATED)
     subjects = stated if isinstance(stated, tuple) else (stated,)
     if address is None:
         return subjects

@@ -67,11 +67,12 @@ class InstrumentSubject:
         ``make(address, record)`` returns a driver, where ``plugin(address, Settings(**settings), record=record)``
         would not do (a driver of several addresses). ``record`` is a path or None.
     faults : tuple of str, optional
-        Names of the faults to try; default: what the simulator offers in its ``faults``.
+        Names of the faults to try; default: ``FAULTS`` of the simulator's module.
     harmless : tuple of str
         Faults that a driver must get over without loss.
     drop_fault, split_fault : str
-        Fault that leaves samples out, and fault that cuts the frames into pieces.
+        Fault that leaves samples out (asked for with ``fault_at=10``, from the tenth on), and fault that cuts the
+        frames into pieces.
     plausible : (float, float), optional
         Lowest and highest believable reading in SI units; default by kind from ``PLAUSIBLE``. None: no bounds.
     blocks : int
@@ -92,8 +93,8 @@ class InstrumentSubject:
     drop_fault: str = "drop"
     split_fault: str = "split"
     plausible: tuple[float, float] | None = None
-    blocks: int = 6
-    time_limit: float = 5.0
+    blocks: int = 3
+    time_limit: float = 10.0
     dead_address: str = "tcp://127.0.0.1:9"
 
     def build(self, *, address: str = "", fault: str = "", record: Path | None = None) -> Any:
@@ -112,8 +113,8 @@ class InstrumentSubject:
             return ()
         if self.faults is not None:
             return self.faults
-        simulator = getattr(self.plugin.info, "simulator", None)
-        return tuple(load_object(simulator).faults) if simulator else ()
+        simulator = self.plugin.info.simulator
+        return tuple(load_object(f"{simulator.partition(':')[0]}:FAULTS")) if simulator else ()
 
     @property
     def simulated(self) -> bool:
