@@ -204,10 +204,10 @@ class Schedule:
         return share
 
     @property
-    def kinks(self) -> Array:
-        """Times at which something has a kink, s, sorted."""
-        slews = [e.time + shift for e in self.events if e.compensation for shift in (0.0, SLEW)]
-        return np.unique(np.concatenate([self.phase_times, self.speed_times, np.array(slews, dtype=float)]))
+    def cuts(self) -> Array:
+        """Times of every kink, and five pieces of each slew of the compensation, s, sorted."""
+        slews = [event.time + np.linspace(0, SLEW, 6) for event in self.events if event.compensation]
+        return np.unique(np.concatenate([self.phase_times, self.speed_times, *slews]))
 
 
 def _vector(value: Any, name: str) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,8 @@ _BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
 
 
 @dataclass(frozen=True)
-class _Nodes:
-    """The slow motion over one chunk of time, ready for the kernel."""
+class _Piece:
+    """The slow motion over a piece of time in which it hardly bends, ready for the kernel."""
 
     times: Array
     slow: Array
@@ -57,7 +58,7 @@ class Sensing:
     sphere_radius: float
     state: ThermalState
     sensors_on_for: float
-    _chunks: dict[int, _Nodes] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _chunks: dict[int, tuple[_Piece, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def axis(self, t: Array) -> tuple[Array, Array]:
         """Return the point of the axis of rotation at the end of the bar, m, and its direction, each (n, 3)."""
@@ -76,40 +77,39 @@ class Sensing:
         keys = np.array([kernels.stream_key(self.seed, _BAR_NOISE, channel) for channel in chosen])
         span = GRID * CHUNK
         for chunk in range(int(first / rate / span), int((first + out.shape[1]) / rate / span) + 1):
-            nodes = self._nodes(chunk)
-            kernels.rotating_bar(
-                out,
-                first,
-                rate,
-                nodes.times,
-                nodes.slow[chosen],
-                nodes.turns,
-                nodes.pattern[chosen],
-                self.frame.noise[chosen],
-                keys,
-                self.frame.range,
-            )
+            for piece in self._pieces(chunk):
+                kernels.rotating_bar(
+                    out,
+                    first,
+                    rate,
+                    piece.times,
+                    piece.slow[chosen],
+                    piece.turns,
+                    piece.pattern[chosen],
+                    self.frame.noise[chosen],
+                    keys,
+                    self.frame.range,
+                )
 
-    def _nodes(self, chunk: int) -> _Nodes:
-        """Return the slow motion of one chunk of time; always the same numbers, whoever asks."""
-        nodes = self._chunks.get(chunk)
-        if nodes is None:
+    def _pieces(self, chunk: int) -> tuple[_Piece, ...]:
+        """Return the slow motion of one chunk of time, cut where it bends; the same numbers whoever asks."""
+        pieces = self._chunks.get(chunk)
+        if pieces is None:
             grid = (chunk * CHUNK + np.arange(CHUNK + 1)) * GRID
-            kinks = self.state.schedule.kinks
-            times = np.union1d(grid, kinks[(kinks > grid[0]) & (kinks < grid[-1])])
-            middle = np.array([grid[CHUNK // 2]])
-            point, axis = self.axis(middle)
-            origin = self.frame.origins(self.state.warming("frame", middle))[:, 0]
-            nodes = _Nodes(
-                times,
-                self.still(times),
-                self.state.schedule.turning(times),
-                self.bar.pattern(origin, self.frame.true_direction, point[0], axis[0]),
-            )
+            cuts = self.state.schedule.cuts
+            cuts = np.concatenate([grid[:1], cuts[(cuts > grid[0]) & (cuts < grid[-1])], grid[-1:]])
+            pieces = tuple(self._piece(np.union1d(grid[(grid > a) & (grid < b)], [a, b])) for a, b in pairwise(cuts))
             if len(self._chunks) >= 64:
                 self._chunks.clear()
-            self._chunks[chunk] = nodes
-        return nodes
+            self._chunks[chunk] = pieces
+        return pieces
+
+    def _piece(self, times: Array) -> _Piece:
+        middle = np.array([(times[0] + times[-1]) / 2])
+        point, axis = self.axis(middle)
+        origin = self.frame.origins(self.state.warming("frame", middle))[:, 0]
+        pattern = self.bar.pattern(origin, self.frame.true_direction, point[0], axis[0])
+        return _Piece(times, self.still(times), self.state.schedule.turning(times), pattern)
 
     def read_sphere(self, out: Array, first: int, rate: float, chosen: Channels, motion: StepProgram) -> None:
         """Fill ``out`` (chosen, n) with the samples first .. first + n - 1 on the stepped sphere."""

@@ -91,16 +91,16 @@ class ThermalState:
 
 
 def seeded_ambient(rng: np.random.Generator) -> Ambient:
-    """Return the air of a good workshop: a daily wave of 0.2 K and a wander of some hundredths of a kelvin."""
+    """Return the air of a good workshop: a daily wave of 0.1 K and a wander of hundredths of a kelvin."""
     period = np.array([86400.0, *(rng.uniform(*span) for span in ((9000, 15000), (4000, 7000), (1500, 3000)))])
-    amplitude = np.array([0.2, 0.06, 0.04, 0.02]) * rng.uniform(0.8, 1.2, 4)
+    amplitude = np.array([0.1, 0.03, 0.02, 0.01]) * rng.uniform(0.8, 1.2, 4)
     return Ambient(20.0 + rng.uniform(-0.5, 0.5), amplitude, 2 * np.pi / period, rng.uniform(0, 2 * np.pi, 4))
 
 
 def seeded_state(kind: MachineKind, rng: np.random.Generator, schedule: Schedule) -> ThermalState:
-    """Return the thermal side of one machine: the tables, with amplitudes off by up to two percent."""
+    """Return the thermal side of one machine: the tables, with amplitudes off by up to 1.5 percent."""
     network = ThermalNetwork.of(kind.capacity, kind.links, kind.to_air, kind.heat_share)
     growth = np.array([[kind.growth[dof].get(body, 0.0) * 1e-6 for body in network.names] for dof in _DOF])
-    growth *= rng.uniform(0.98, 1.02, (6, 1))
+    growth *= rng.uniform(0.985, 1.015, (6, 1))
     correction = np.array([kind.compensation[axis][0] for axis in "XYZ"]) * rng.uniform(0.99, 1.01, 3)
     return ThermalState(kind, network, seeded_ambient(rng), growth, correction, schedule)
