@@ -144,9 +144,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def _mistake(details: ErrorDetails, model: type[BaseModel], prefix: Sequence[Key]) -> str:
     path = tuple(details["loc"])
     kind, message, found = details["type"], details["msg"], details["input"]
-    place = dotted((*prefix, *_without_tags(model, path))) or "(whole file)"
+    place = dotted((*prefix, *_walk(model, path)[1])) or "(whole file)"
     if kind == "extra_forbidden":
-        known = {name for owner in _models(_descend(model, path[:-1])) for name in _names(owner)}
+        known = {name for owner in _models(_walk(model, path[:-1])[0]) for name in _names(owner)}
         return f"{place}: unknown key; {nearest(str(path[-1]), known)}"
     if kind == "missing":
         return f"{place}: missing; expected {_wanted(model, path)}"
@@ -173,7 +173,7 @@ def _short(value: Any) -> str:
 
 def _wanted(model: type[BaseModel], path: Sequence[Key]) -> str:
     """Return in words what belongs at a path."""
-    for owner in _models(_descend(model, path[:-1])):
+    for owner in _models(_walk(model, path[:-1])[0]):
         for name, field in owner.model_fields.items():
             if path[-1] not in (name, field.alias):
                 continue
@@ -209,7 +209,7 @@ def _models(annotations: Iterable[Any]) -> list[type[BaseModel]]:
 
 
 def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
-    """Return what stands below a key; empty if the key is none (pydantic's tag of a union member)."""
+    """Return what stands below a key; empty if there is no such key."""
     below: list[Any] = []
     for option in (option for annotation in annotations for option in _options(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel):
@@ -222,22 +222,21 @@ def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
     return below
 
 
-def _descend(model: type[BaseModel], path: Sequence[Key]) -> list[Any]:
-    """Return the annotations that may stand at a path, skipping the tags of unions."""
-    here: list[Any] = [model]
-    for key in path:
-        here = _step(here, key) or here
-    return here
+def _has_tag(model: type[BaseModel], key: Key) -> bool:
+    """Whether pydantic calls this member of a union by ``key``: by its name, or by what its discriminator says."""
+    tags = [tag for field in model.model_fields.values() for tag in get_args(field.annotation)]
+    return key == model.__name__ or key in tags
 
 
-def _without_tags(model: type[BaseModel], path: Sequence[Key]) -> list[Key]:
-    """Return a path without the tags that pydantic puts in for members of unions."""
+def _walk(model: type[BaseModel], path: Sequence[Key]) -> tuple[list[Any], list[Key]]:
+    """Return what may stand at a path, and the path without pydantic's tags for members of unions."""
     here: list[Any] = [model]
     kept: list[Key] = []
-    for number, key in enumerate(path):
+    for key in path:
         below = _step(here, key)
-        options = [option for annotation in here for option in _options(annotation)]
-        if below or len(options) == 1 or number == len(path) - 1:
+        options = _models(here)
+        tagged = [option for option in options if _has_tag(option, key)] if len(options) > 1 else []
+        if below or not tagged:
             kept.append(key)
-        here = below or here
-    return kept
+        here = below or tagged or here
+    return here, kept
