@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Subject = TypeVar("Subject")
 
@@ -90,24 +90,24 @@ def require(condition: bool, message: str) -> None:
 
 def run_check(check: Check[Subject], subject: Subject) -> CheckResult:
     """Run one check in a thread of its own and return its result; a check that hangs fails at its time limit."""
-    if reason := check.why_not(subject):
-        return CheckResult(check.name, True, f"does not apply: {reason}", 0.0, skipped=True)
     box: list[CheckResult] = []
     start = time.perf_counter()
 
+    def result(ok: bool, message: str, **more: Any) -> CheckResult:
+        return CheckResult(check.name, ok, message, time.perf_counter() - start, **more)
+
     def work() -> None:
-        trace = ""
         try:
-            ok, message = True, check.function(subject)
+            if reason := check.why_not(subject):
+                box.append(result(True, f"does not apply: {reason}", skipped=True))
+            else:
+                box.append(result(True, check.function(subject)))
         except CheckFailedError as failure:
-            ok, message = False, str(failure)
+            box.append(result(False, str(failure)))
         except Exception as error:  # noqa: BLE001 - a plugin under test may raise anything
-            ok, message, trace = False, f"{type(error).__name__}: {error}", traceback.format_exc()
-        box.append(CheckResult(check.name, ok, message, time.perf_counter() - start, trace=trace))
+            box.append(result(False, f"{type(error).__name__}: {error}", trace=traceback.format_exc()))
 
     worker = threading.Thread(target=work, name=f"check-{check.name}", daemon=True)
     worker.start()
     worker.join(check.limit)
-    if box:
-        return box[0]
-    return CheckResult(check.name, False, f"still running after {check.limit:g} s", time.perf_counter() - start)
+    return box[0] if box else result(False, f"still running after {check.limit:g} s")

@@ -67,7 +67,7 @@ class InstrumentSubject:
         ``make(address, record)`` returns a driver, where ``plugin(address, Settings(**settings), record=record)``
         would not do (a driver of several addresses). ``record`` is a path or None.
     faults : tuple of str, optional
-        Names of the faults to try; default: ``FAULTS`` of the simulator's module.
+        Names of the faults to try; default: what the simulator's class offers in its ``faults``.
     harmless : tuple of str
         Faults that a driver must get over without loss.
     drop_fault, split_fault : str
@@ -114,7 +114,7 @@ class InstrumentSubject:
         if self.faults is not None:
             return self.faults
         simulator = self.plugin.info.simulator
-        return tuple(load_object(f"{simulator.partition(':')[0]}:FAULTS")) if simulator else ()
+        return tuple(getattr(load_object(simulator), "faults", ())) if simulator else ()
 
     @property
     def simulated(self) -> bool:
