@@ -79,6 +79,7 @@ class Reader:
         self._prompt = prompt
         self._queue: deque[_Entry] = deque()
         self._queued = 0
+        self._handed_over = 0
         self._text = b""
         self._reply: bytes | None = None
         self._listening = False
@@ -123,6 +124,8 @@ class Reader:
             else:
                 values[into], reasons[into] = entry.chunk.values[part], entry.chunk.reasons[part]
             done += n
+        self._handed_over += size
+        self._transport.handed_over(self._handed_over)
 
     def _await_samples(self, timeout: float) -> None:
         start = time.monotonic()

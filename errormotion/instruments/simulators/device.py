@@ -19,8 +19,6 @@ class SimulatedDevice:
     ----------
     address : Address
         ``sim://machine/device?seed=...``
-    faults : tuple of str
-        What of the fault menu it offers.
     line_end : bytes
         What ends a request.
     default_name : str
@@ -34,28 +32,39 @@ class SimulatedDevice:
         Where its wire ends.
     """
 
-    def __init__(
-        self, address: Address, *, faults: tuple[str, ...], line_end: bytes, default_name: str, every: int = 1
-    ) -> None:
+    def __init__(self, address: Address, *, line_end: bytes, default_name: str, every: int = 1) -> None:
         self.name = address.path or default_name
         self.params = address.params
-        self.fault: Fault = parse_fault(address, faults, every=every)
+        self.fault: Fault = parse_fault(address, self.faults, every=every)
         self._line_end = line_end
         self._buffer = b""
         self._answers = 0
         seed = int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *self.name.encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
-        self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
-        self.url = self._server.url
         pace = address.number("pace", 0.0)
         self.world.attach(self, pace or None)
+        try:
+            self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
+        except BaseException:
+            self.world.detach(self)
+            raise
+        self.url = self._server.url
         self._server.start()
+
+    faults: tuple[str, ...] = ()
+    """What of the fault menu the device offers."""
+
+    _drops_answers = True
+    """Whether ``drop`` and ``disconnect`` count answers; else they are about samples."""
 
     def close(self) -> None:
         """End the device; with the last one of its world the world ends."""
         self._server.close()
         self.world.detach(self)
+
+    def handed_over(self, samples: int) -> None:
+        """Take note of how many samples of the running stream its reader has had."""
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request, given without its line end."""
@@ -65,7 +74,10 @@ class SimulatedDevice:
         """Send an answer, with whatever fault is due."""
         number, fault = self._answers, self.fault
         self._answers += 1
-        if fault.kind == "silence" and self._silent():
+        if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self._drops_answers):
+            return
+        if fault.kind == "disconnect" and self._drops_answers and number >= fault.at:
+            self._server.hang_up()
             return
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data

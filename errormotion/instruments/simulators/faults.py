@@ -59,14 +59,18 @@ class Fault:
         return (number - self.at) % self.every == 0
 
     def pieces(self, data: bytes) -> Iterator[bytes]:
-        """Yield what goes out at once: all, or with ``split`` 1, 2, ... 7, 1, 2, ... bytes."""
+        """Yield what goes out at once: all, or with ``split`` 1 to 7 bytes at first, then a good many, but never whole.
+
+        A thousand and nine is a prime: no frame's length divides it.
+        """
         if self.kind != "split":
             yield data
             return
-        place, size = 0, 1
+        place = count = 0
         while place < len(data):
+            size = count % 7 + 1 if count < 50 else 1009
             yield data[place : place + size]
-            place, size = place + size, size % 7 + 1
+            place, count = place + size, count + 1
 
 
 def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -> Fault:

@@ -19,7 +19,6 @@ from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
 from errormotion.instruments.transports import Address
 
-FAULTS = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
 _UNKNOWN = "E220 Unknown command"
 _BAD_PARAMETER = "E204 Received unsupported parameter"
 
@@ -27,19 +26,27 @@ Array = np.ndarray[Any, Any]
 
 
 class SimulatedOptoNCDT(SimulatedDevice):
-    """A sensor of the frame: the device's name is its channel, X1 X2 Y1 Y2 or Z."""
+    """A sensor of the frame: the device's name is its channel, X1 X2 Y1 Y2 or Z.
+
+    Further parameters of the address: ``model`` (ILD2300 or ILD1420) and ``range`` (mm).
+    """
+
+    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
+    _drops_answers = False
 
     def __init__(self, address: Address) -> None:
         self.rate = 20e3
-        self.position = 0
+        self.start = self.position = 0
+        self.taken: int | None = None
         self.counter_on = False
         self.output = False
         self.sync = "NONE"
         self._number = 0
         self._starting = False
-        super().__init__(address, faults=FAULTS, line_end=LINE_END, default_name="X1", every=1000)
+        super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self.model = address.params.get("model", "ILD2300")
-        self._range = self.world.machine.frame.range
+        own_range = self.world.machine.frame.range * 1e3 if self.model == "ILD2300" else 10.0
+        self._range = address.number("range", own_range) * 1e-3
 
     @property
     def channel(self) -> str:
@@ -50,6 +57,10 @@ class SimulatedOptoNCDT(SimulatedDevice):
         """End the device."""
         self._stop()
         super().close()
+
+    def handed_over(self, samples: int) -> None:
+        """Take note of how many samples of the running stream its reader has had."""
+        self.taken = samples
 
     # ------------------------------------------------------------------ commands
 
@@ -133,8 +144,9 @@ class SimulatedOptoNCDT(SimulatedDevice):
         with self._server.lock:
             if not self.output:
                 return
-            for piece in self.fault.pieces(data):
-                self._server.send(piece)
+            heard = all(self._server.send(piece) for piece in self.fault.pieces(data))
+        if not heard:  # nobody is there any more
+            self._stop()
         if self.fault.kind == "disconnect" and first + size > self.fault.at:
             self._server.hang_up()
             self._stop()

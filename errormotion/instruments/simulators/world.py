@@ -1,8 +1,9 @@
 """The virtual world: one machine, one clock, and the thread that makes the samples of all channels in lockstep.
 
 The clock advances only while samples stream (or by ``elapse``). Nobody waits for real time unless a pace is asked
-for: a block of samples is made for every streaming channel, then sent, and sending waits for the readers. So the clock
-runs exactly as fast as the slowest reader.
+for: a block of samples is made for every streaming channel, then sent, and sending waits for the readers. The time of
+the world is that of the last sample that its readers have handed over, so that what else is asked (a temperature)
+belongs to it, although the samples under way are further on; and when the streams end, the world goes on from there.
 """
 
 from __future__ import annotations
@@ -23,11 +24,17 @@ LEAD_IN = (0.5, 2.5)  # s between the order to step and the first motion: nobody
 
 
 class Stream(Protocol):
-    """A channel that wants samples."""
+    """A channel that wants samples.
+
+    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
+    reader has handed over, None where it does not tell.
+    """
 
     rate: float
     sync: str
+    start: int
     position: int
+    taken: int | None
 
     @property
     def channel(self) -> str:
@@ -59,8 +66,6 @@ class VirtualWorld:
     ----------
     machine : VirtualMachine
         The twin, which knows the truth.
-    time : float
-        Simulated seconds since the start of the schedule.
     pace : float or None
         Simulated seconds per second; None = as fast as the readers.
     """
@@ -72,7 +77,8 @@ class VirtualWorld:
         self.seed = seed
         self.machine = VirtualMachine(name, seed, warm=warm)
         self.pace: float | None = None
-        self.time = 0.0
+        self._front = 0.0  # time up to which samples have been made
+        self._settings_of_clock = 0
         self.tool = "bar"
         self.motion: StepProgram | None = None
         self._programs = 0
@@ -119,6 +125,17 @@ class VirtualWorld:
         return self.name, self.seed, self.machine.sensors_on_for > 0
 
     @property
+    def time(self) -> float:
+        """Simulated seconds since the start of the schedule."""
+        with self._change:
+            seen = [(each.start + each.taken) / each.rate for each in self._streams if each.taken is not None]
+            return min(seen, default=self._front)
+
+    def _set_clock(self, time: float) -> None:
+        self._front = time
+        self._settings_of_clock += 1
+
+    @property
     def streaming(self) -> bool:
         """Whether any channel streams."""
         return bool(self._streams)
@@ -131,7 +148,7 @@ class VirtualWorld:
             self._refuse_while_streaming("start a schedule")
             self.machine.start(schedule)
             self._schedule = tuple(schedule)
-            self.time = 0.0
+            self._set_clock(0.0)
             self.motion = None
 
     def mount(self, tool: str) -> None:
@@ -148,7 +165,7 @@ class VirtualWorld:
             raise InstrumentError(f"Time passes forwards only; found {seconds} s")
         with self._change:
             self._refuse_while_streaming("let time pass")
-            self.time += seconds
+            self._set_clock(self._front + seconds)
 
     def run_steps(
         self, start: Sequence[float], direction: Sequence[float], step: float, count: int, dwell: float, travel: float
@@ -161,7 +178,7 @@ class VirtualWorld:
                 raise InstrumentError("The machine is still stepping; wait until its program has ended")
             rng = np.random.default_rng([abs(self.seed), self._programs])
             self._programs += 1
-            begin = self.time + rng.uniform(*LEAD_IN)
+            begin = self._front + rng.uniform(*LEAD_IN)
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
             return self.motion
 
@@ -210,7 +227,8 @@ class VirtualWorld:
             if stream.sync == "MASTER":
                 starting, self._armed = [*self._armed, stream], []
             for each in starting:
-                each.position = _first_sample(self.time, each.rate)
+                each.start = each.position = _first_sample(self._front, each.rate)
+                each.taken = None
             self._streams.extend(starting)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._generate, name=f"sim-world-{self.name}", daemon=True)
@@ -223,14 +241,17 @@ class VirtualWorld:
             if stream in self._armed:
                 self._armed.remove(stream)
             if stream in self._streams:
+                seen = self.time
                 self._streams.remove(stream)
                 if stream.sync == "MASTER":
                     slaves = [each for each in self._streams if each.sync == "SLAVE"]
                     self._armed.extend(slaves)
                     self._streams = [each for each in self._streams if each not in slaves]
+                if not self._streams:
+                    self._set_clock(seen)
 
     def _generate(self) -> None:
-        wall, began = time.monotonic(), self.time
+        wall, began = time.monotonic(), 0.0
         running = False
         while True:
             with self._change:
@@ -240,15 +261,15 @@ class VirtualWorld:
                 if self._thread is not threading.current_thread():
                     return
                 if not running:
-                    wall, began, running = time.monotonic(), self.time, True
-                streams, now, pace = tuple(self._streams), self.time, self.pace
+                    wall, began, running = time.monotonic(), self._front, True
+                streams, setting, pace = tuple(self._streams), self._settings_of_clock, self.pace
             fastest = max(streams, key=lambda stream: stream.rate)
             size = BLOCK if pace is None else max(1, round(PACED_BLOCK * pace * fastest.rate))
             until = (fastest.position + size) / fastest.rate
             self._make(streams, until)
             with self._change:
-                if self.time == now:  # nobody has set the clock meanwhile
-                    self.time = until
+                if self._settings_of_clock == setting:  # nobody has set the clock meanwhile
+                    self._front = until
             if pace is not None:
                 time.sleep(max(0.0, wall + (until - began) / pace - time.monotonic()))
 

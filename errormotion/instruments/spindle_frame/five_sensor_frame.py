@@ -6,6 +6,7 @@ master of the others: they are started first, and it last, so that sample 0 is t
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -16,11 +17,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.point_lds.optoncdt.codec import LOST, OVERRUN
 from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT, count_reasons
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
 from errormotion.instruments.spindle_frame.geometry import FrameGeometry
 from errormotion.instruments.spindle_frame.settings import CHANNELS, FrameSettings
 from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.recording import read_index, write_index
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 
 WARM_UP = 2 * 3600.0
@@ -34,10 +37,10 @@ class FiveSensorFrame:
     ----------
     address : str
         Of the frame as a whole, where the settings do not give one for each sensor: ``sim://cframe?seed=3`` stands for
-        ``sim://cframe/X1?seed=3`` and so on, ``replay://session.rec`` for ``replay://session.X1.rec`` and so on.
+        ``sim://cframe/X1?seed=3`` and so on; ``replay://session.rec`` is a recording of all five.
     settings : FrameSettings, optional
     record : Path, optional
-        ``session.rec`` records each sensor to ``session.X1.rec`` and so on.
+        ``session.rec`` names the recordings of the sensors, which lie beside it: ``session.X1.rec`` and so on.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -76,7 +79,7 @@ class FiveSensorFrame:
         if place.scheme == "sim":
             return {name: place.with_path(name) for name in CHANNELS}
         if place.scheme == "replay":
-            return {name: f"replay://{_for_channel(Path(place.path), name)}" for name in CHANNELS}
+            return {name: f"replay://{path}" for name, path in read_index(Path(place.path)).items()}
         raise InstrumentError(
             f"'{self.address}' is the address of one device, but five sensors are connected: give 'addresses' in the "
             "settings, one URL for each of " + ", ".join(CHANNELS)
@@ -94,12 +97,12 @@ class FiveSensorFrame:
         """
         if self._sensors:
             return
+        records = {} if self._record is None else write_index(self._record, CHANNELS)
         settings = OptoSettings(**{name: getattr(self.settings, name) for name in SensorSettings.model_fields})
         sensors: dict[str, OptoNCDT] = {}
         try:
             for name, address in self.addresses.items():
-                record = None if self._record is None else _for_channel(self._record, name)
-                sensor = sensors[name] = OptoNCDT(address, settings, record=record)
+                sensor = sensors[name] = OptoNCDT(address, settings, record=records.get(name))
                 sensor.name = name
                 try:
                     sensor.open()
@@ -195,7 +198,7 @@ class FiveSensorFrame:
         ------
         Samples
             ``values`` (channel, block) in m. Sample 0 is the same instant for all. Reasons of missing values begin
-            with the channel.
+            with the channel; ``dropped`` counts the instants at which any channel lost its sample.
 
         Raises
         ------
@@ -237,10 +240,9 @@ class FiveSensorFrame:
     ) -> Samples:
         dropped, invalid = 0, {}
         if reasons.any():
+            dropped = int(np.isin(reasons, (LOST, OVERRUN)).any(axis=0).sum())
             for sensor, why in zip(sensors, reasons, strict=True):
-                lost, found = count_reasons(why, f"{sensor.name} ")
-                dropped += lost
-                invalid.update(found)
+                invalid.update(count_reasons(why, f"{sensor.name} ")[1])
         return Samples(values, first, self.rate, max(sensor.host_time for sensor in sensors), dropped, invalid)
 
     def _open_sensors(self) -> dict[str, OptoNCDT]:
@@ -253,9 +255,6 @@ def _stop(sensors: list[OptoNCDT]) -> None:
     """Stop the master first, then its slaves, while nobody is held back by a full queue."""
     for sensor in sensors:
         sensor.drain()
+    end = time.monotonic() + 1.0
     for sensor in sensors:
-        sensor.stop()
-
-
-def _for_channel(path: Path, channel: str) -> Path:
-    return path.with_name(f"{path.stem}.{channel}{path.suffix}")
+        sensor.stop(max(end - time.monotonic(), 0.05))

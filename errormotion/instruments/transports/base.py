@@ -80,6 +80,12 @@ class Transport(ABC):
         self._rest = tail + self._rest
         return head + found
 
+    def handed_over(self, samples: int) -> None:  # noqa: B027 - most transports do not care
+        """Told how many samples of the running stream the caller has had by now.
+
+        A real device does not care. A virtual clock does: it counts the time that its reader has seen.
+        """
+
     @abstractmethod
     def _send(self, data: bytes) -> None: ...
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from zlib import crc32
@@ -28,6 +29,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayEr
 from errormotion.instruments.transports.base import Transport
 
 FORMAT = "errormotion-session/1"
+INDEX_FORMAT = "errormotion-sessions/1"
 
 
 class Recorder:
@@ -81,6 +83,10 @@ class RecordingTransport(Transport):
         data = self._inner.read(max_bytes, timeout)
         self._recorder.frame("R", data)
         return data
+
+    def handed_over(self, samples: int) -> None:
+        """Pass on how far the reader is."""
+        self._inner.handed_over(samples)
 
     def close(self) -> None:
         """Close the connection, then the recording; idempotent."""
@@ -198,3 +204,29 @@ class ReplayTransport(Transport):
                 f"{self.url}: the driver stops, but the recording goes on with {left_writes} writes "
                 f"and {left_bytes} bytes from the device"
             )
+
+
+def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
+    """Write the recording of an instrument with several transports: a list of theirs, which lie beside it.
+
+    Returns the path for each part. Raises InstrumentError where the file is there or cannot be made.
+    """
+    files = {part: path.with_name(f"{path.stem}.{part}{path.suffix}") for part in parts}
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(f"{INDEX_FORMAT}\n" + "".join(f"{part} {each.name}\n" for part, each in files.items()))
+    except OSError as error:
+        raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+    return files
+
+
+def read_index(path: Path) -> dict[str, Path]:
+    """Return the recordings that a list names, by part; ReplayError where it is no such list."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReplayError(f"The recording {path} cannot be read: {error}") from None
+    pairs = [line.partition(" ") for line in lines[1:]]
+    if not lines or lines[0] != INDEX_FORMAT or not all(name for _, _, name in pairs):
+        raise ReplayError(f"{path} is no list of recordings: expected a first line '{INDEX_FORMAT}'")
+    return {part: path.with_name(name) for part, _, name in pairs}

@@ -17,7 +17,7 @@ class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
     ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine) and ``close()``.
+    machine), ``close()`` and ``handed_over(samples)``.
     """
 
     simulated = True
@@ -41,6 +41,10 @@ class SimulatedTransport(Transport):
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         return self._inner.read(max_bytes, timeout)
+
+    def handed_over(self, samples: int) -> None:
+        """Tell the simulator how far its reader is."""
+        self._device.handed_over(samples)
 
     def close(self) -> None:
         """Close the connection and end the device; idempotent."""

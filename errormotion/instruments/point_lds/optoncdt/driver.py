@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
 
 Sync = Literal["NONE", "MASTER", "SLAVE"]
+ON_FOR = "operating time"  # (m)
 BLOCK_SECONDS = 0.5
 QUEUE_SECONDS = 2.0
 SMALLEST_QUEUE = 4096
@@ -58,8 +59,7 @@ class OptoNCDT(Driver):
     settings: OptoSettings
     name = "optoncdt"
     _reader: Reader | None = None
-    _size = 1
-    _started = 0
+    _lost: InstrumentError | None = None
 
     @property
     def rate(self) -> float:
@@ -73,11 +73,8 @@ class OptoNCDT(Driver):
 
     def identify(self) -> Identity:
         """Ask the sensor who it is (GETINFO)."""
-        facts = {
-            key.strip().lower(): value.strip()
-            for key, mark, value in (line.partition(":") for line in self.command("GETINFO"))
-            if mark
-        }
+        facts = self._facts()
+        facts.pop(ON_FOR, None)
         return Identity(
             manufacturer="Micro-Epsilon",
             model=facts.get("name", "unknown"),
@@ -87,9 +84,13 @@ class OptoNCDT(Driver):
             details={"address": self.address, **facts},
         )
 
+    def _facts(self) -> dict[str, str]:
+        parts = [line.partition(":") for line in self.command("GETINFO")]
+        return {key.strip().lower(): value.strip() for key, mark, value in parts if mark}
+
     def on_for(self) -> float:
         """Return for how long the sensor says that it has been on, s; 0 where it does not say."""
-        stated = re.match(r"([\d.]+)", str(self.identify().details.get("operating time", "")))  # (m)
+        stated = re.match(r"([\d.]+)", self._facts().get(ON_FOR, ""))
         return float(stated[1]) if stated else 0.0
 
     def configure(self, settings: OptoSettings) -> None:
@@ -119,6 +120,8 @@ class OptoNCDT(Driver):
         InstrumentTimeoutError
             It does not answer.
         """
+        if self._lost is not None:
+            raise InstrumentError(f"{self.name} is lost ({self._lost}); close and open it again")
         request = text.encode("ascii") + LINE_END
         timeout = self.settings.timeout
         if self._reader is not None:
@@ -202,15 +205,20 @@ class OptoNCDT(Driver):
         if self._reader is not None:
             self._reader.drain()
 
-    def stop(self) -> None:
-        """Stop the stream and its thread; idempotent. A sensor that is gone is no error here: ``fill`` has told it."""
+    def stop(self, timeout: float | None = None) -> None:
+        """Stop the stream and its thread; idempotent.
+
+        A sensor that does not confirm it within ``timeout`` s is no error here (``fill`` has told it, or will tell it
+        at the next start), but it has to be opened again.
+        """
         reader, self._reader = self._reader, None
         if reader is None:
             return
         try:
-            reader.stop(b"OUTPUT NONE" + LINE_END, self.settings.timeout)
-        except InstrumentError:
+            reader.stop(b"OUTPUT NONE" + LINE_END, self.settings.timeout if timeout is None else timeout)
+        except InstrumentError as error:
             reader.abandon()
+            self._lost = error
 
     def _connect(self) -> Transport:
         baudrate = self.settings.line_speed(self.address)
@@ -223,6 +231,7 @@ class OptoNCDT(Driver):
         )
 
     def _begin(self) -> None:
+        self._lost = None
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
         self.configure(self.settings)
 

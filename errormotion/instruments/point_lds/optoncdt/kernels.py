@@ -35,8 +35,8 @@ GARBLED_RAW = -1
 LAST_ERROR_CODE = max(ERROR_CODES)
 
 # Places in the state of `assemble`.
-NUMBER, PENDING, HAS_PENDING, JUMP_RAW, JUMP_AHEAD, HAS_JUMP, ORPHANS, ANCHORED, BASE = range(9)
-STATE_SIZE = 9
+NUMBER, PENDING, HAS_PENDING, JUMP_RAW, JUMP_AHEAD, HAS_JUMP, ORPHANS, ANCHORED, BASE, DOUBT = range(10)
+STATE_SIZE = 10
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
@@ -94,7 +94,8 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
     """Pair distances with their counters and number the samples; return how many there are.
 
     A counter that jumps is believed when the next one is further on in the same direction round the 18 bits: then
-    samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both garbled.
+    samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both garbled,
+    and so is a distance behind a counter that had none.
 
     Parameters
     ----------
@@ -117,7 +118,10 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
         if not counter:
             if value & FOLLOWING:
                 state[ORPHANS] += 1
+                state[DOUBT] = 1
                 continue
+            if state[DOUBT]:
+                raw, state[DOUBT] = np.int64(GARBLED_RAW), 0
             raws[count], numbers[count] = raw, state[NUMBER]
             state[NUMBER] += 1
             count += 1
@@ -126,10 +130,13 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
             if state[HAS_PENDING]:
                 state[ORPHANS] += 1
                 raw = np.int64(GARBLED_RAW)
+            if state[DOUBT]:
+                raw, state[DOUBT] = np.int64(GARBLED_RAW), 0
             state[PENDING], state[HAS_PENDING] = raw, 1
             continue
         if not state[HAS_PENDING]:
             state[ORPHANS] += 1
+            state[DOUBT] = 1
             continue
         state[HAS_PENDING] = 0
         raw = np.int64(GARBLED_RAW) if suspect else state[PENDING]

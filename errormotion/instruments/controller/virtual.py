@@ -1,0 +1,204 @@
+"""The controller of the virtual machine: JSON lines over TCP.
+
+A request is ``{"id": 1, "op": "mount", "tool": "bar"}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
+``{"id": 1, "ok": false, "error": "..."}``, each on a line of its own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport, open_transport
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+
+LINE_END = b"\n"
+
+# ---------------------------------------------------------------------- codec
+
+
+def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
+    """Return a request as bytes."""
+    return json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
+
+
+def decode_answer(line: bytes, number: int) -> Any:
+    """Return the result in an answer.
+
+    Raises
+    ------
+    ProtocolError
+        Not an answer, or that of another request.
+    InstrumentError
+        The controller refuses.
+    """
+    try:
+        answer = json.loads(line)
+        matches, ok = answer["id"] == number, answer["ok"]
+        content = answer["result"] if ok else answer["error"]
+    except (ValueError, KeyError, TypeError):
+        raise ProtocolError(f"Expected an answer in JSON to request {number}; found {line[:200]!r}") from None
+    if not matches:
+        raise ProtocolError(f"Expected the answer to request {number}; found {line[:200]!r}")
+    if not ok:
+        raise InstrumentError(f"The controller refuses: {content}")
+    return content
+
+
+def event_fields(event: Any) -> dict[str, Any]:
+    """Return an event (a mapping, or an object with these attributes) as JSON takes it."""
+    names = ("time", "spindle_speed", "compensation")
+    found = event if isinstance(event, Mapping) else {name: getattr(event, name, None) for name in names}
+    if found.get("time") is None or set(found) - set(names):
+        raise InstrumentError(f"Expected an event with time, spindle_speed and compensation; found {event!r}")
+    fields: dict[str, Any] = {name: found[name] for name in names if found.get(name) is not None}
+    if "compensation" in fields:
+        fields["compensation"] = dict(fields["compensation"])
+    return fields
+
+
+# ---------------------------------------------------------------------- driver
+
+
+class ControllerSettings(PluginSettings):
+    """Settings of the virtual controller."""
+
+    timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
+
+
+class VirtualController(Driver):
+    """The control of the virtual machine.
+
+    Parameters
+    ----------
+    address : str
+        ``sim://cframe/controller?seed=3``, ``tcp://host:port``, ``replay://file``.
+    settings : ControllerSettings, optional
+    record : Path, optional
+        Recording of the session.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="virtual_controller",
+        kind="controller",
+        summary="Controller of the virtual machine: tool, spindle, compensation, step programs",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+    )
+    Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
+    settings: ControllerSettings
+    _number = 0
+
+    def identify(self) -> Identity:
+        """Ask the controller who it is."""
+        facts = self._call("identify")
+        return Identity(
+            manufacturer=str(facts["manufacturer"]),
+            model=str(facts["model"]),
+            serial_number=str(facts["serial_number"]),
+            simulated=self.transport.simulated,
+            details={"address": self.address},
+        )
+
+    def configure(self, settings: ControllerSettings) -> None:
+        """Use other settings from now on."""
+        self.settings = settings
+
+    def read(self) -> dict[str, Any]:
+        """Return the state now."""
+        return self.state()
+
+    def state(self) -> dict[str, Any]:
+        """Return what the control shows.
+
+        ``time`` (s since the start of the schedule), ``spindle_speed`` (1/min), ``compensation`` (axis to on or off),
+        ``position`` (m), ``tool``, ``stepping`` (whether a step program waits or runs), ``alarms`` (list of str).
+        """
+        return dict(self._call("state"))
+
+    def mount(self, tool: str) -> None:
+        """Put ``"bar"`` or ``"sphere"`` into the spindle."""
+        self._call("mount", tool=tool)
+
+    def start(self, schedule: Iterable[Any]) -> None:
+        """Begin anew, cold, at time 0 with a schedule of events.
+
+        An event has ``time`` (s), and optionally ``spindle_speed`` (1/min) and ``compensation`` (axis to on or off).
+        The first sample of the next stream is taken at time 0.
+
+        Raises
+        ------
+        InstrumentError
+            A stream is running, or the machine cannot do that.
+        """
+        self._call("start", schedule=[event_fields(event) for event in schedule])
+
+    def elapse(self, seconds: float) -> None:
+        """Let simulated time pass without samples: go on with a schedule where an earlier session stopped."""
+        self._call("elapse", seconds=float(seconds))
+
+    def run_steps(
+        self,
+        start: Sequence[float],
+        direction: Sequence[float],
+        step: float,
+        count: int,
+        dwell: float = 1.0,
+        travel: float = 0.1,
+    ) -> dict[str, Any]:
+        """Step the mounted sphere along a line; returns at once.
+
+        The motion begins some time after the next sample; that time is short but not known. The sphere rests
+        ``dwell`` s at each of ``count`` places and travels ``travel`` s between two.
+
+        Parameters
+        ----------
+        start : (3,)
+            Commanded centre of the sphere at the first place, m.
+        direction : (3,)
+            Of the steps.
+        step : float
+            m.
+        count : int
+        dwell, travel : float
+            s.
+
+        Returns
+        -------
+        dict
+            ``duration`` of the motion and ``longest_lead_in`` before it, s.
+        """
+        return dict(
+            self._call(
+                "run_steps",
+                start=[float(x) for x in start],
+                direction=[float(x) for x in direction],
+                step=float(step),
+                count=int(count),
+                dwell=float(dwell),
+                travel=float(travel),
+            )
+        )
+
+    def _call(self, op: str, **arguments: Any) -> Any:
+        self._number += 1
+        self.transport.write(encode_request(self._number, op, arguments))
+        return decode_answer(self.transport.read_until(LINE_END), self._number)
+
+    def _connect(self) -> Transport:
+        self._number = 0
+        return open_transport(
+            self.address,
+            simulator=self.info.simulator,
+            recorder=self._record,
+            timeout=self.settings.timeout,
+        )
+
+    def _begin(self) -> None:
+        self.identify()

@@ -1,0 +1,189 @@
+"""Thermocouple modules that speak DCON (ADAM-4018, ICP DAS I-7018): ASCII on RS-485 or behind a serial server.
+
+All of the protocol is from memory (m) and kept in this one file.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar
+
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport, open_transport
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+
+LINE_END = b"\r"
+OPEN_SENSOR = 9999.0  # degC: this and more, either sign, is no temperature but an open or overrun input
+UNDER_RANGE = "-0000"  # the ADAM way to say the same
+_VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
+
+
+# ---------------------------------------------------------------------- codec
+
+
+def checksum(text: str) -> str:
+    """Return the checksum of a request or answer: the sum of its characters, two hexadecimal digits."""
+    return f"{sum(text.encode('ascii')) & 0xFF:02X}"
+
+
+def encode(text: str, *, with_checksum: bool = False) -> bytes:
+    """Return a request or answer as bytes, with its end."""
+    return (text + (checksum(text) if with_checksum else "")).encode("ascii") + LINE_END
+
+
+def decode(line: bytes, *, with_checksum: bool = False) -> str:
+    """Return the text of an answer without its checksum and end.
+
+    Raises
+    ------
+    ProtocolError
+        Not ASCII, or a wrong checksum.
+    """
+    try:
+        text = line.removesuffix(LINE_END).decode("ascii")
+    except UnicodeDecodeError:
+        raise ProtocolError(f"Expected a line of ASCII; found {line!r}") from None
+    if not with_checksum:
+        return text
+    body, check = text[:-2], text[-2:]
+    if check != checksum(body):
+        raise ProtocolError(f"The answer '{body}' has the checksum '{check}'; expected '{checksum(body)}'")
+    return body
+
+
+def parse_temperatures(text: str) -> list[float]:
+    """Return the temperatures (degC) of an answer such as ``>+025.12+026.00``; NaN for an open sensor.
+
+    Raises
+    ------
+    ProtocolError
+        Anything else.
+    """
+    values = _VALUE.findall(text)
+    if not text.startswith(">") or not values or ">" + "".join(values) != text:
+        raise ProtocolError(f"Expected temperatures such as '>+025.12+026.00'; found '{text}'")
+    return [
+        float("nan") if value == UNDER_RANGE or abs(float(value)) >= OPEN_SENSOR else float(value) for value in values
+    ]
+
+
+def format_temperatures(temperatures: list[float]) -> str:
+    """Return the answer with these temperatures (degC), NaN as an open sensor."""
+    return ">" + "".join("+9999.9" if t != t else f"{t:+07.2f}" for t in temperatures)
+
+
+# ---------------------------------------------------------------------- driver
+
+
+class DconSettings(PluginSettings):
+    """Settings of a DCON thermometer."""
+
+    channels: tuple[str, ...] = Field(
+        default=("frame", "ambient", "spindle_front", "spindle_rear", "column"),
+        description="what the inputs measure, from the first one on",
+        min_length=1,
+    )
+    unit: int = Field(default=1, description="address of the module on its line", ge=0, le=255)
+    checksum: bool = Field(default=False, description="whether the module is set to use checksums")
+    baudrate: int = Field(default=9600, description="of a serial line", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+
+
+class DconTemperature(Driver):
+    """A DCON thermocouple module: ``#AA`` asks for all inputs.
+
+    Parameters
+    ----------
+    address : str
+        ``serial:///dev/ttyUSB1?baudrate=9600``, ``tcp://host:port``, ``sim://cframe/thermometer``, ``replay://file``.
+    settings : DconSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    open_sensors : tuple of str
+        Channels that had no value in the last reading.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="dcon_temperature",
+        kind="thermometer",
+        summary="Thermocouple module with the DCON protocol (ADAM-4018, I-7018), RS-485 or TCP",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.dcon:SimulatedDcon",
+    )
+    Settings: ClassVar[type[DconSettings]] = DconSettings
+    settings: DconSettings
+    open_sensors: tuple[str, ...] = ()
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of what is measured."""
+        return self.settings.channels
+
+    def identify(self) -> Identity:
+        """Ask the module for its name and firmware."""
+        name, firmware = (self._ask(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
+        return Identity(
+            manufacturer="DCON",
+            model=name,
+            serial_number=f"unit {self._unit}",
+            firmware=firmware,
+            simulated=self.transport.simulated,
+            details={"address": self.address},
+        )
+
+    def configure(self, settings: DconSettings) -> None:
+        """Use other settings from now on; the module's own are made with the maker's tool."""
+        self.settings = settings
+
+    def read(self) -> dict[str, float]:
+        """Return the temperatures now, degC by channel; NaN for an open sensor, which ``open_sensors`` then names.
+
+        Raises
+        ------
+        ProtocolError
+            The answer is none, or holds fewer values than there are channels.
+        InstrumentTimeoutError
+            Silence.
+        """
+        values = parse_temperatures(">" + self._ask(f"#{self._unit}", ">"))
+        if len(values) < len(self.channels):
+            raise ProtocolError(
+                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(values)}"
+            )
+        reading = dict(zip(self.channels, values, strict=False))
+        self.open_sensors = tuple(name for name, value in reading.items() if value != value)
+        return reading
+
+    @property
+    def _unit(self) -> str:
+        return f"{self.settings.unit:02X}"
+
+    def _ask(self, request: str, expected: str) -> str:
+        """Send a request and return the answer behind the start that was expected."""
+        with_checksum = self.settings.checksum
+        self.transport.write(encode(request, with_checksum=with_checksum))
+        answer = decode(self.transport.read_until(LINE_END, limit=512), with_checksum=with_checksum)
+        if answer.startswith("?"):
+            raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
+        if not answer.startswith(expected):
+            raise ProtocolError(f"'{request}': expected an answer that begins with '{expected}'; found '{answer}'")
+        return answer.removeprefix(expected)
+
+    def _connect(self) -> Transport:
+        return open_transport(
+            self.address,
+            simulator=self.info.simulator,
+            recorder=self._record,
+            timeout=self.settings.timeout,
+            baudrate=self.settings.baudrate,
+        )
+
+    def _begin(self) -> None:
+        self.identify()
