@@ -144,6 +144,7 @@ class Averager:
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._own: bool | None = None
+        self._lone: tuple[NDArray[np.float64], NDArray[np.floating[Any]]] | None = None
         self._index = -1
         self._sum = np.zeros(channels)
         self._count = np.zeros(channels, np.int64)
@@ -154,13 +155,17 @@ class Averager:
         """Take in ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
         if time.size == 0:
             return self._averages([], [], [], [])
+        if self._lone is not None:
+            time, values = np.append(self._lone[0], time), np.concatenate([self._lone[1], values], axis=1)
+            self._lone = None
         if self._own is None:
+            if time.size == 1:  # one sample does not tell how far apart they lie
+                self._lone = time.copy(), values.copy()
+                return self._averages([], [], [], [])
             self._start = float(time[0])
-            interval = float(np.median(np.diff(time[:1000]))) if time.size > 1 else np.inf
-            self._own = interval > 0.5 * self._length
+            self._own = float(np.median(np.diff(time[:1000]))) > 0.5 * self._length
         if self._own:
-            counts = np.isfinite(values).astype(np.int64)
-            return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
+            return _each(time, values)
         # A thousandth of a window forgives the rounding of times that were written as decimals.
         first = int(np.floor((time[0] - self._start) / self._length + 1e-3))
         last = int(np.floor((time[-1] - self._start) / self._length + 1e-3))
@@ -191,6 +196,8 @@ class Averager:
 
     def finish(self) -> Averages:
         """Return the last, possibly shorter window."""
+        if self._lone is not None:
+            return _each(*self._lone)
         if not self._samples:
             return self._averages([], [], [], [])
         last = self._averages([self._sum], [self._count], [self._time], [self._samples])
@@ -205,6 +212,12 @@ class Averager:
         enough = count >= np.maximum(1, self._minimum * expected)
         mean = np.where(enough, total / np.maximum(count, 1), np.nan)
         return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
+
+
+def _each(time: NDArray[np.float64], values: NDArray[np.floating[Any]]) -> Averages:
+    """Return every sample as a window of its own."""
+    counts = np.isfinite(values).astype(np.int64)
+    return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
 
 
 def join(parts: list[Averages]) -> Averages:

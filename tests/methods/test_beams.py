@@ -1,0 +1,118 @@
+"""Beam detection from a stepped sphere."""
+
+import numpy as np
+import pytest
+
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.beams import (
+    across,
+    circles_and_line,
+    fisher_bound,
+    likelihood_fit,
+    sphere_reading,
+)
+
+R = 5e-3
+U0 = np.array([-1.0, 0, 0])
+P0 = np.array([6e-3, 0, 0.01])
+SCANS = np.array([[0.0, 1, 0], [0, 0, 1]] * 3)
+DEPTHS = np.repeat([0.2e-3, 1e-3, 1.8e-3], 2)
+CENTRE = (P0 + (DEPTHS + R)[:, None] * U0)[:, None] + np.linspace(-1e-3, 1e-3, 101)[:, None] * SCANS[:, None]
+NOISE = 0.5e-6
+
+
+def true_beam(rng):
+    u = U0 + rng.normal(0, 5e-3, 2) @ across(U0)
+    return P0 + rng.normal(0, 1e-4, 3), u / np.linalg.norm(u)
+
+
+def test_exact_readings_give_the_exact_beam():
+    P, u = true_beam(np.random.default_rng(0))
+    beam = likelihood_fit(sphere_reading(P, u, CENTRE, R)[0], CENTRE, R, P0, U0)
+    np.testing.assert_allclose(beam.origin, P, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(beam.direction, u, rtol=0, atol=1e-11)
+
+
+def test_jacobian_is_that_of_finite_differences():
+    P, u = true_beam(np.random.default_rng(1))
+    _, jacobian = sphere_reading(P, u, CENTRE, R)
+    h = 1e-7
+    for k, e in enumerate(np.eye(3) * h):
+        numeric = (sphere_reading(P + e, u, CENTRE, R)[0] - sphere_reading(P - e, u, CENTRE, R)[0]) / (2 * h)
+        np.testing.assert_allclose(jacobian[..., k], numeric, atol=1e-7)
+    for k, e in enumerate(across(u) * h):
+        turned = [(u + s * e) / np.linalg.norm(u + s * e) for s in (1, -1)]
+        numeric = (sphere_reading(P, turned[0], CENTRE, R)[0] - sphere_reading(P, turned[1], CENTRE, R)[0]) / (2 * h)
+        np.testing.assert_allclose(jacobian[..., 3 + k], numeric, atol=1e-7)
+
+
+def test_spread_meets_the_bound_and_the_stated_covariance():
+    rng = np.random.default_rng(2)
+    seeds = 150
+    bound_ratio, stated_ratio, paper_ratio = [], [], []
+    for _ in range(seeds):
+        P, u = true_beam(rng)
+        readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
+        beam = likelihood_fit(readings, CENTRE, R, P0, U0)
+        error = np.concatenate([beam.origin - P, beam.direction - u])
+        bound = np.sqrt(np.diag(fisher_bound(P, u, CENTRE, R, NOISE)))
+        bound_ratio.append(error / bound)
+        stated_ratio.append(error / np.sqrt(np.diag(beam.covariance)))
+        paper = circles_and_line(readings, CENTRE, SCANS, R, U0)
+        paper_ratio.append(np.concatenate([paper[0] - P, paper[1] - u]) / bound)
+    # The spread of a standard deviation from 150 draws is 1 / sqrt(300) = 6 %; three of it.
+    spread = np.sqrt(np.mean(np.square(bound_ratio), axis=0))
+    assert (spread < 1.0 + 3 * 0.058).all()
+    assert (spread > 1.0 - 3 * 0.058).all()
+    inside = np.mean(np.abs(stated_ratio) < 1.96, axis=0)
+    assert (np.abs(inside - 0.95) < 3 * np.sqrt(0.05 * 0.95 / seeds)).all()
+    # The construction throws readings away; along the beam it keeps only the lowest points.
+    assert np.sqrt(np.mean(np.square(paper_ratio), axis=0))[0] > 1.2
+
+
+def test_outliers_are_named_and_left_out():
+    rng = np.random.default_rng(3)
+    P, u = true_beam(rng)
+    readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
+    readings[2, 40] += 50e-6
+    readings[5, 7] -= 20e-6
+    beam = likelihood_fit(readings, CENTRE, R, P0, U0)
+    assert beam.left_out.tolist() == [[2, 40], [5, 7]]
+    assert np.abs(beam.origin - P).max() < 5 * 0.5e-6
+
+
+def test_missed_steps_are_unknown_and_do_no_harm():
+    rng = np.random.default_rng(4)
+    P, u = true_beam(rng)
+    readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
+    readings[0, :30] = np.nan
+    beam = likelihood_fit(readings, CENTRE, R, P0, U0)
+    assert np.isnan(beam.residual[0, :30]).all()
+    assert np.abs(beam.origin - P).max() < 5 * 0.7e-6
+
+
+def test_a_beam_far_from_nominal_is_found():
+    rng = np.random.default_rng(5)
+    P, u = P0 + [3e-4, 4e-4, -4e-4], U0 + [0, 0.04, -0.03]
+    u = u / np.linalg.norm(u)
+    readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
+    beam = likelihood_fit(readings, CENTRE, R, P0, U0)
+    assert np.abs(beam.origin - P).max() < 5 * 0.5e-6
+
+
+@pytest.mark.parametrize(
+    ("readings", "message"),
+    [(np.full(CENTRE.shape[:2], np.nan), "0 of 606 readings"), (np.full(CENTRE.shape[:2], 0.5), "does not settle")],
+    ids=["nothing", "nonsense"],
+)
+def test_hopeless_readings_are_refused_in_words(readings, message):
+    with pytest.raises(MethodError, match=message):
+        likelihood_fit(readings, CENTRE, R, P0, U0, "X1")
+
+
+def test_scans_along_one_line_through_one_point_leave_a_freedom_open():
+    rng = np.random.default_rng(6)
+    one = np.broadcast_to(CENTRE[2, 50], (1, 40, 3)).copy()
+    readings = sphere_reading(P0, U0, one, R)[0] + rng.normal(0, NOISE, (1, 40))
+    with pytest.raises(MethodError, match="freedom of the beam open"):
+        likelihood_fit(readings, one, R, P0, U0)
