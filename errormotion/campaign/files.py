@@ -141,57 +141,89 @@ def load_campaign(path: str | Path) -> CampaignPlan:
     """
     path = Path(path)
     data = tomlfile.read_toml(path, error=BenchError)
-    table, mistakes = tomlfile.check(data, CampaignTable)
-    if table is None:
-        raise BenchError(tomlfile.report(path, mistakes))
-    return parse_campaign(path.read_text(encoding="utf-8-sig"), path, load_bench(path.parent / table.bench))
+    bench = data.get("bench")
+    plan = load_bench(path.parent / bench) if isinstance(bench, str) else None
+    return parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
     """Check the text of a bench file; ``source`` is for the messages."""
-    table, mistakes = tomlfile.check(tomllib.loads(text), BenchTable)
+    data = tomllib.loads(text)
+    table, mistakes = tomlfile.check(data, BenchTable)
     instruments = []
-    for name, entry in table.instruments.items() if table else ():
-        settings, found = _settings("instruments", entry.driver, entry.model_extra or {}, ("instruments", name))
+    for name, entry in _tables(data.get("instruments")):
+        if not isinstance(entry.get("driver"), str):
+            continue
+        own = {key: value for key, value in entry.items() if key not in InstrumentTable.model_fields}
+        settings, found = _settings("instruments", entry["driver"], own, ("instruments", name))
         mistakes += found
         if settings is not None:
-            driver = plugins.get("instruments", entry.driver)
-            instruments.append(BenchInstrument(name, driver, entry.address, settings))
+            driver = plugins.get("instruments", entry["driver"])
+            instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
     return BenchPlan(table.name, table.machine, tuple(instruments), source, text)
 
 
-def parse_campaign(text: str, source: Path, bench: BenchPlan) -> CampaignPlan:
-    """Check the text of a campaign file against its bench; ``source`` is for the messages."""
-    table, mistakes = tomlfile.check(tomllib.loads(text), CampaignTable)
-    tests: list[TestPlan] = []
+def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
+    """Check the text of a campaign file against its bench; ``source`` is for the messages.
+
+    Without a bench the text has at least the mistake that it names none, and BenchError tells it with all others.
+    """
+    data = tomllib.loads(text)
+    table, mistakes = tomlfile.check(data, CampaignTable)
+    for number, entry in _tables(data.get("test")):
+        if isinstance(entry.get("method"), str):
+            mistakes += _method_mistakes(entry, ("test", number), bench)
     earlier: list[str] = []
-    for number, entry in enumerate(table.test if table else ()):
-        place: tuple[str | int, ...] = ("test", number)
-        if entry.name in earlier:
-            mistakes.append(
-                f"{tomlfile.dotted((*place, 'name'))}: expected a name of its own; found '{entry.name}' again"
-            )
-        for key, test in entry.inputs.items():
-            if test not in earlier:
-                where = tomlfile.dotted((*place, "inputs", key))
-                mistakes.append(f"{where}: expected the name of an earlier test; found '{test}'; "
-                                f"{tomlfile.nearest(test, earlier)}")  # fmt: skip
-        earlier.append(entry.name)
-        settings, found = _settings("methods", entry.method, entry.settings, place)
-        mistakes += found
-        if settings is None:
-            continue
-        method = plugins.get("methods", entry.method)
-        lacking = [kind for kind in method.needs.instruments if kind not in bench.kinds]
-        if lacking:
-            mistakes.append(f"{tomlfile.dotted(place)}: the method '{entry.method}' needs {' and '.join(lacking)}; "
-                            f"the bench {bench.source} offers {', '.join(bench.kinds)}")  # fmt: skip
-        tests.append(TestPlan(entry.name, method, settings, entry.inputs))
-    if table is None or mistakes:
+    for number, test in enumerate(table.test if table else ()):
+        mistakes += _name_mistakes(test, ("test", number), earlier)
+        earlier.append(test.name)
+    if table is None or bench is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return CampaignPlan(table.name, bench, tuple(tests), Path(table.runs), source, text)
+    tests = tuple(
+        TestPlan(
+            test.name,
+            plugins.get("methods", test.method),
+            _settings("methods", test.method, test.settings, ())[0],
+            test.inputs,
+        )
+        for test in table.test
+    )
+    return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text)
+
+
+def _tables(value: Any) -> list[tuple[str | int, dict[str, Any]]]:
+    """Return the tables below a key with their keys or numbers, whatever else may be wrong with the file."""
+    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [(key, entry) for key, entry in pairs if isinstance(entry, dict)]
+
+
+def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], bench: BenchPlan | None) -> list[str]:
+    settings = entry.get("settings", {})
+    found, mistakes = _settings("methods", entry["method"], settings if isinstance(settings, dict) else {}, place)
+    if found is not None and bench is not None:
+        lacking = [
+            kind for kind in plugins.get("methods", entry["method"]).needs.instruments if kind not in bench.kinds
+        ]
+        if lacking:
+            mistakes.append(
+                f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs {' and '.join(lacking)}; "
+                f"the bench {bench.source} offers {', '.join(bench.kinds)}"
+            )
+    return mistakes
+
+
+def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:
+    mistakes = []
+    if test.name in earlier:
+        mistakes.append(f"{tomlfile.dotted((*place, 'name'))}: expected a name of its own; found '{test.name}' again")
+    for key, name in test.inputs.items():
+        if name not in earlier:
+            where = tomlfile.dotted((*place, "inputs", key))
+            known = tomlfile.nearest(name, earlier)
+            mistakes.append(f"{where}: expected the name of an earlier test; found '{name}'; {known}")
+    return mistakes
 
 
 def _settings(

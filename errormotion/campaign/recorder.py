@@ -36,7 +36,7 @@ class Recorder:
     dim : str
         The dimension that grows.
     expected : float
-        Expected total length.
+        Expected total length; in seconds where the samples have a ``sample_rate``.
     attrs : dict
         Attributes for the store, where the method does not set them.
     """

@@ -43,7 +43,7 @@ class Progress(Protocol):
         """Begin a part of a test; ``total`` in the unit of :meth:`advance`, None where it is not known."""
 
     def advance(self, done: float) -> None:
-        """Say how much of the part is done."""
+        """Say how much of the part is done: seconds of evenly spaced samples, else items."""
 
 
 class Quiet:
@@ -249,7 +249,6 @@ class _Session:
         folder.take_reserve()
         log.info("acquire", extra={"data": {"test": test.name, "method": method.info.id, "samples": before}})
         self.progress.stage("measuring", expected)
-        self.progress.advance(before)
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
@@ -262,7 +261,8 @@ class _Session:
                 for chunk in chunks:
                     recorder.put(chunk)
                     taken += chunk.sizes.get(dim, 0)
-                    self.progress.advance(taken)
+                    rate = chunk.attrs.get("sample_rate") if dim == "time" else None
+                    self.progress.advance(taken / rate if rate else taken)
         finally:
             folder.give_reserve()
             folder.data["samples"] = {

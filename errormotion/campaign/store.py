@@ -62,7 +62,7 @@ class RawStore:
         self._arrays: dict[str, _Column] = {}
         for name, array in sorted(self._group.arrays()):
             metadata = json.loads((path / name / "zarr.json").read_text(encoding="utf-8"))
-            if dim in metadata["dimension_names"]:
+            if dim in _dims(metadata):
                 self._arrays[name] = _Column(path / name, array, metadata, dim)
             else:
                 self._static[name] = metadata
@@ -89,13 +89,16 @@ class RawStore:
         dim : str
             The dimension that grows.
         expected : float
-            Expected total length, to size the chunks.
+            Expected total length, to size the chunks; in seconds where the samples have a ``sample_rate``.
         """
         if dim not in first.dims:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
         growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}
         packings = {name: _packing(variable) for name, variable in growing.items()}
-        block = _block_length(growing, packings, dim, expected)
+        length = (
+            expected * float(first.attrs["sample_rate"]) if dim == "time" and "sample_rate" in first.attrs else expected
+        )
+        block = _block_length(growing, packings, dim, length)
         skeleton = first.isel({dim: slice(0, 0)}).drop_vars(
             [n for n in first.variables if n not in _stored(first, dim)]
         )
@@ -223,7 +226,7 @@ class _Column:
     def __init__(self, path: Path, array: Any, metadata: dict[str, Any], dim: str) -> None:
         self.path = path
         self.array = array
-        self.dims = tuple(metadata["dimension_names"])
+        self.dims = _dims(metadata)
         self.axis = self.dims.index(dim)
         self.block = int(array.chunks[self.axis])
         self.packing = {
@@ -276,9 +279,13 @@ def committed_length(path: Path, dim: str) -> int:
     """Return the samples that a reader of a store sees; 0 before the first commit."""
     root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     for metadata in root.get("consolidated_metadata", {}).get("metadata", {}).values():
-        if dim in metadata["dimension_names"]:
-            return int(metadata["shape"][metadata["dimension_names"].index(dim)])
+        if dim in _dims(metadata):
+            return int(metadata["shape"][_dims(metadata).index(dim)])
     return 0
+
+
+def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(metadata.get("dimension_names") or ())  # a scalar has none
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -1,0 +1,66 @@
+"""A bench opens all its instruments or none, and says which did not come up and why."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from errormotion import plugins
+from errormotion.campaign.bench import OpenBench
+from errormotion.campaign.files import BenchPlan, load_bench
+from errormotion.errors import BenchError
+
+SECOND = '[instruments.other]\ndriver = "counter"\naddress = "tcp://10.0.0.5:10001"\n'
+
+
+@pytest.fixture
+def bench(lab: None, write: Callable[..., Path]) -> Callable[[str], BenchPlan]:
+    def read(text: str = "") -> BenchPlan:
+        return load_bench(write('name = "a"', bench=text).parent / "bench.toml")
+
+    return read
+
+
+def test_offers_its_instruments_by_kind_and_closes_them(bench: Callable[..., BenchPlan]) -> None:
+    opened = plugins.get("instruments", "counter").opened
+    with OpenBench(bench()) as table:
+        assert table.machine == "lab machine"
+        assert table.has_kind("counter")
+        assert not table.has_kind("thermometer")
+        assert table.of_kind("counter").address == "sim://counter"
+        assert opened == ["sim://counter"]
+        record = table.answers[0].record()
+    assert opened == []
+    assert record["identity"]["serial_number"] == "17"
+    assert record["settings"]["block"] == 100
+
+
+def test_failed_connections_are_told_as_a_tree_and_nothing_stays_open(bench: Callable[..., BenchPlan]) -> None:
+    with pytest.raises(BenchError) as caught, OpenBench(bench(SECOND + "refuses = true")):
+        pass
+    assert str(caught.value).splitlines() == [
+        "Bench 'Table': 1 of 2 instruments did not come up.",
+        "├── counter (counter, sim://counter): Lab Counter, serial number 17",
+        "└── other (counter, tcp://10.0.0.5:10001): InstrumentError: tcp://10.0.0.5:10001: nobody listens there",
+    ]
+    assert plugins.get("instruments", "counter").opened == []
+
+
+def test_kind_that_is_missing_or_there_twice_is_refused(bench: Callable[..., BenchPlan]) -> None:
+    with OpenBench(bench(SECOND)) as table:
+        with pytest.raises(BenchError, match="expected a thermometer; it offers counter"):
+            table.of_kind("thermometer")
+        with pytest.raises(BenchError, match="expected one counter; found counter, other"):
+            table.of_kind("counter")
+
+
+def test_operator_is_asked_only_where_something_is_real(bench: Callable[..., BenchPlan]) -> None:
+    asked: list[str] = []
+    with OpenBench(bench(), asked.append) as table:
+        table.ask("Mount the bar.")
+    assert asked == []
+    with OpenBench(bench("simulated = false"), asked.append) as table:
+        table.ask("Mount the bar.")
+    assert asked == ["Mount the bar."]
+    with OpenBench(bench("simulated = false")) as table, pytest.raises(BenchError, match="nobody can be asked here"):
+        table.ask("Mount the bar.")

@@ -1,0 +1,93 @@
+"""Every mistake in a bench or campaign file is told at once: file, key, expected, found, nearest."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from errormotion.campaign.files import load_bench, load_campaign
+from errormotion.errors import BenchError
+
+pytestmark = pytest.mark.usefixtures("lab")
+
+
+def complaints(path: Path, load: Callable[[Path], object]) -> list[str]:
+    with pytest.raises(BenchError) as caught:
+        load(path)
+    head, *mistakes = str(caught.value).split("\n  - ")
+    assert head == f"{path}: {len(mistakes)} mistake" + "s" * (len(mistakes) > 1)
+    return mistakes
+
+
+def test_good_files_carry_settings_in_si_and_defaults(write: Callable[..., Path]) -> None:
+    path = write(
+        'name = "a"\nsettings = {level = "25 mm"}', 'name = "b"\ninputs = {zero = "a"}', bench='rate = "20 kHz"'
+    )
+    plan = load_campaign(path)
+    assert [test.name for test in plan.tests] == ["a", "b"]
+    assert plan.tests[0].settings.level == pytest.approx(0.025)
+    assert plan.tests[0].settings.count == 1000
+    assert plan.tests[1].inputs == {"zero": "a"}
+    assert plan.bench.machine == "lab machine"
+    assert plan.bench.instruments[0].address == "sim://counter"
+    assert plan.bench.instruments[0].settings.rate == 20000.0
+
+
+def test_all_mistakes_of_a_bench_file_are_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        'schema = "errormotion.bench/2"\nname = "Table"\n'
+        '[instruments.a]\ndriver = "countr"\n'
+        '[instruments.b]\ndriver = "counter"\nrate = 20\nblok = 3\n'
+        '[instruments.c]\naddress = "tcp://10.0.0.5:10001"\n'
+    )
+    schema, machine, driver, unknown, rate, block = complaints(path, load_bench)
+    assert schema.startswith("schema: expected 'errormotion.bench/1'; found \"errormotion.bench/2\"")
+    assert machine == "machine: missing; expected a string"
+    assert driver == 'instruments.c.driver: missing; expected the id of an instrument plugin, such as "optoncdt"'
+    assert unknown.startswith("instruments.a.driver: No instrument plugin 'countr'")
+    assert unknown.endswith("Did you mean 'counter'?")
+    assert rate == "instruments.b.rate: expected a frequency with its unit, such as '20 kHz'; found 20"
+    assert block.startswith("instruments.b.blok: unknown key; did you mean 'block'?")
+
+
+def test_all_mistakes_of_a_campaign_file_are_told_at_once(write: Callable[..., Path]) -> None:
+    path = write('name = "a"\nsettings = {level = 25, cuont = 3}', 'name = "a"\ninputs = {zero = "first"}')
+    level, unknown, twice, earlier = complaints(path, load_campaign)
+    assert level == "test[0].settings.level: expected a length with its unit, such as '5 mm'; found 25"
+    assert unknown.startswith("test[0].settings.cuont: unknown key; did you mean 'count'?")
+    assert twice == "test[1].name: expected a name of its own; found 'a' again"
+    assert earlier == "test[1].inputs.zero: expected the name of an earlier test; found 'first'; Known here: a"
+
+
+def test_name_that_makes_no_folder_name_is_refused_together_with_wrong_settings(write: Callable[..., Path]) -> None:
+    name, level = complaints(write('name = "../a"\nsettings = {level = 25}'), load_campaign)
+    assert name.startswith("test[0].name: expected ")
+    assert name.endswith('; found "../a"')
+    assert level.startswith("test[0].settings.level: ")
+
+
+def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is_measured(
+    write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from errormotion import plugins
+
+    path = write('name = "a"')
+    method = plugins.get("methods", "ramp")
+    monkeypatch.setattr(method, "needs", plugins.Needs(("counter", "thermometer"), "errormotion.raw.ramp/1"))
+    (mistake,) = complaints(path, load_campaign)
+    assert (
+        mistake
+        == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} offers counter"
+    )
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BenchError, match=r"nowhere\.toml: cannot be read: No such file or directory"):
+        load_bench(tmp_path / "nowhere.toml")
+
+
+def test_broken_toml_is_told_with_its_line(write: Callable[..., Path]) -> None:
+    path = write('name = "a')
+    with pytest.raises(BenchError, match=r"campaign\.toml, line 7, column 10: not TOML"):
+        load_campaign(path)

@@ -1,0 +1,90 @@
+"""A real process is killed, stopped, and cut off in the middle of an acquisition; the run goes on in another one."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.campaign import runner
+from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.store import committed_length
+from errormotion.datasets.provenance import of
+
+RATE = 1000
+REAL_TIME = 'real_time = true\nrate = "1 kHz"\nblock = 50'
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def wait_for(tmp_path: Path, process: "subprocess.Popen[str]", samples: int) -> RunFolder:
+    """Return the run folder once that many samples are on disk."""
+    for _ in range(1200):
+        for folder in list_runs(tmp_path / "runs"):
+            if (folder.raw / "zarr.json").exists() and committed_length(folder.raw, "time") >= samples:
+                return folder
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    raise AssertionError(f"{samples} samples did not come")
+
+
+def held(folder: RunFolder) -> int:
+    """Return how many samples are on disk; all of them are what they should be."""
+    with datasets.load(folder.raw) as raw:
+        count = int(raw.sizes["time"])
+        np.testing.assert_array_equal(raw["distance"].values[0], np.arange(count) * 1e-6)
+    return count
+
+
+def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
+    tmp_path: Path, write: Callable[..., Path], command: Start, lab: None
+) -> None:
+    campaign = write(
+        'name = "first"\nsettings = {count = 100}', 'name = "long"\nsettings = {count = 4500}', bench=REAL_TIME
+    )
+    process = command("run", campaign)
+    folder = wait_for(tmp_path, process, 1500)
+    before = committed_length(folder.raw, "time")
+    time.sleep(1.0)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = held(folder)
+    # a second later at most a second is missing: what was there a second before the end is there
+    assert kept >= before
+    assert kept >= before + 0.1 * RATE, "nothing came to the disk within a second"
+    assert RunFolder.open(folder.path).data["status"] == "running"
+    assert folder.data["test"] == "long"
+    process = command("run", "--resume", "--runs", tmp_path / "runs", "--json")
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    found = json.loads(out)
+    assert [test["status"] for test in found["tests"]] == ["finished", "finished"]
+    assert found["tests"][1]["folder"] == str(folder.path)
+    assert held(folder) == 4500
+    assert of(datasets.load(Path(found["tests"][1]["errors"])))["settings"]["count"] == 4500
+    starts = [step["samples"] for step in RunFolder.open(folder.path).data["steps"] if step["outcome"] == "started"]
+    assert starts == [0, kept]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopping_leaves_a_run_folder_that_is_whole_and_resumes(
+    tmp_path: Path, write: Callable[..., Path], command: Start, lab: None, number: signal.Signals
+) -> None:
+    process = command("run", write('name = "long"\nsettings = {count = 2500}', bench=REAL_TIME))
+    folder = wait_for(tmp_path, process, 700)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Interrupted" in err
+    assert "Traceback" not in err
+    folder = RunFolder.open(folder.path)
+    assert folder.data["status"] == "interrupted"
+    assert folder.data["samples"]["count"] == held(folder) >= 700
+    (folder,) = runner.resume(runs=tmp_path / "runs")
+    assert folder.finished
+    assert held(folder) == 2500

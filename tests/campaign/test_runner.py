@@ -1,0 +1,205 @@
+"""The runner brings everything to disk before it uses it, and goes on where a run ended."""
+
+import errno
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from errormotion import datasets, plugins
+from errormotion.campaign import runner
+from errormotion.campaign.files import CampaignPlan, load_campaign
+from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.store import RawStore
+from errormotion.errors import BenchError, RunError
+
+STEP = 1e-6
+Plan = Callable[..., CampaignPlan]
+
+
+def whole(folder: RunFolder, count: int) -> None:
+    """Sample i is i micrometres: nothing is lost, doubled or out of place."""
+    with datasets.load(folder.raw) as raw:
+        np.testing.assert_array_equal(raw["distance"].values[0], np.arange(count) * STEP)
+
+
+def test_run_folder_holds_all_that_the_result_rests_on(plan: Plan) -> None:
+    (folder,) = runner.run(plan('name = "a"\nsettings = {level = "25 mm"}'))
+    data = json.loads((folder.path / "run.json").read_text())
+    assert folder.path.name.split("-")[1:] == ["a", data["id"]]
+    assert data["schema"] == "errormotion.run/1"
+    assert data["status"] == "finished"
+    assert data["settings"] == {"count": 1000, "level": 0.025, "asks": "", "needs_file": None}
+    assert data["campaign"]["text"].startswith('schema = "errormotion.campaign/1"')
+    assert data["bench"]["machine"] == "lab machine"
+    assert data["instruments"][0]["identity"]["serial_number"] == "17"
+    assert data["instruments"][0]["address"] == "sim://counter"
+    assert data["samples"] == {"dim": "time", "count": 1000, "dropped": 10, "invalid": {"dark": 20}}
+    assert [step["step"] for step in data["steps"]] == ["acquire", "acquire", "identify"]
+    assert data["software"]["errormotion"]
+    assert data["errors"] == f"errors/ramp-{data['settings_hash']}/errors.nc"
+    whole(folder, 1000)
+    errors = datasets.load(folder.path / data["errors"])
+    assert float(errors["EX"][-1]) == pytest.approx(999e-6)
+    provenance = json.loads(errors.attrs["provenance"])
+    assert provenance["instruments"][0]["identity"]["serial_number"] == "17"
+    assert all("time" in json.loads(line) for line in folder.log.read_text().splitlines())
+
+
+def test_run_folder_can_be_moved(plan: Plan, tmp_path: Path) -> None:
+    first, second = runner.run(plan('name = "a"', 'name = "b"\ninputs = {zero = "a"}'))
+    (tmp_path / "elsewhere").mkdir()
+    for folder in (first, second):
+        shutil.move(folder.path, tmp_path / "elsewhere")
+    moved = list_runs(tmp_path / "elsewhere")
+    assert [folder.data["test"] for folder in moved] == ["a", "b"]
+    assert str(tmp_path / "runs") not in json.dumps({k: v for k, v in moved[1].data.items() if k != "campaign"})
+    assert moved[1].errors is not None
+    assert moved[1].errors.exists()
+    assert (moved[1].path / moved[1].data["inputs"]["zero"]).resolve() == moved[0].errors.resolve()  # type: ignore[union-attr]
+
+
+def test_result_of_an_earlier_test_reaches_the_later_one(plan: Plan) -> None:
+    folders = runner.run(plan('name = "a"', 'name = "b"\ninputs = {zero = "a"}'))
+    with datasets.load(folders[1].raw) as raw, datasets.load(folders[0].errors or "") as errors:
+        assert raw.attrs["offset"] == float(errors["EX"][0])
+
+
+def test_settings_are_on_disk_even_if_the_first_sample_never_came(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "broken").touch()
+    with pytest.raises(RunError, match="1000 samples are kept"):
+        runner.run(plan('name = "a"\nsettings = {count = 5000}', bench=f'breaks = "{tmp_path / "broken"}"'))
+    (folder,) = list_runs(tmp_path / "runs")
+    assert folder.data["status"] == "failed"
+    assert folder.data["settings"]["count"] == 5000
+
+
+def test_breakdown_keeps_what_was_measured_and_resume_goes_on_behind_it(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "broken").touch()
+    broken = plan('name = "a"\nsettings = {count = 5000}', bench=f'breaks = "{tmp_path / "broken"}"')
+    with pytest.raises(RunError, match="Test 'a' failed: the counter fell off the table") as caught:
+        runner.run(broken)
+    (folder,) = list_runs(tmp_path / "runs")
+    assert f"the log is {folder.log}" in str(caught.value)
+    last = json.loads(folder.log.read_text().splitlines()[-1])
+    assert "InstrumentError: the counter fell off the table" in last["traceback"]
+    assert plugins.get("instruments", "counter").opened == []
+    whole(folder, 1000)
+    with pytest.raises(RunError, match="1000 samples are kept"):
+        runner.resume(broken)
+    (tmp_path / "broken").unlink()
+    (folder,) = runner.resume(broken)
+    assert folder.data["status"] == "finished"
+    assert folder.data["reason"] == ""
+    whole(folder, 5000)
+
+
+def test_failed_identification_keeps_the_raw_data_and_is_redone_without_the_bench(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}')
+    with pytest.raises(RunError, match="The raw data is complete and kept"):
+        runner.run(made)
+    (tmp_path / "needed").touch()
+    monkeypatch.setattr(plugins.get("instruments", "counter"), "open", lambda self: pytest.fail("the bench was opened"))
+    (folder,) = runner.resume(made)
+    assert folder.finished
+    whole(folder, 1000)
+
+
+def test_resume_steps_over_finished_tests(plan: Plan, tmp_path: Path) -> None:
+    made = plan('name = "a"', f'name = "b"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}', 'name = "c"')
+    with pytest.raises(RunError, match="Test 'b' failed"):
+        runner.run(made)
+    before = {folder.data["test"]: folder for folder in list_runs(tmp_path / "runs")}
+    (tmp_path / "needed").touch()
+    folders = runner.resume(runs=tmp_path / "runs")
+    assert [folder.data["test"] for folder in folders] == ["a", "b", "c"]
+    assert folders[0].data["updated"] == before["a"].data["updated"]
+    assert {folder.data["id"] for folder in folders} == {before["a"].data["id"]}
+
+
+def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = plan('name = "a"\nsettings = {count = 4000}', bench="real_time = false")
+    append, room = RawStore.append, 10
+
+    def append_until_full(self: RawStore, chunk: object) -> None:
+        if self.count >= room * 100:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        append(self, chunk)  # type: ignore[arg-type]
+        self.commit()
+
+    monkeypatch.setattr(RawStore, "append", append_until_full)
+    with pytest.raises(RunError, match=r"The disk is full: 1000 samples \(1\.0 s\) are safe in .*raw\.zarr"):
+        runner.run(made)
+    (folder,) = list_runs(tmp_path / "runs")
+    assert folder.data["status"] == "failed"
+    assert folder.data["reason"].startswith("disk full: ")
+    assert not (folder.path / ".reserve").exists()
+    whole(folder, 1000)
+    monkeypatch.setattr(RawStore, "append", append)
+    (folder,) = runner.resume(made)
+    whole(folder, 4000)
+
+
+def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) -> None:
+    setting = f'settings = {{needs_file = "{tmp_path / "needed"}"}}'
+    with pytest.raises(RunError, match="failed"):
+        runner.run(plan(f'name = "a"\n{setting}'))
+    changed = plan(f'name = "a"\n# another text\n{setting}')
+    with pytest.raises(RunError, match=r"has changed since .* was measured\. Go on with the files as they were"):
+        runner.resume(changed)
+    (tmp_path / "needed").touch()
+    (folder,) = runner.resume(runs=tmp_path / "runs")
+    assert folder.finished
+
+
+def test_nothing_to_resume_is_said(plan: Plan) -> None:
+    made = plan('name = "a"')
+    with pytest.raises(RunError, match=r"Nothing to resume in .*runs: 0 campaigns"):
+        runner.resume(made)
+    runner.run(made)
+    with pytest.raises(RunError, match="1 campaigns there, all of them finished"):
+        runner.resume(made)
+
+
+def test_two_processes_cannot_work_on_one_run(plan: Plan, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="failed"):
+        runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
+    (folder,) = list_runs(tmp_path / "runs")
+    with folder.locked(), pytest.raises(RunError, match="another process is working on this run"):
+        runner.resume(runs=tmp_path / "runs")
+
+
+def test_bench_that_does_not_come_up_leaves_no_run_folder(plan: Plan, tmp_path: Path) -> None:
+    with pytest.raises(BenchError, match="did not come up"):
+        runner.run(plan('name = "a"', bench="refuses = true"))
+    assert list_runs(tmp_path / "runs") == []
+
+
+def test_report_that_fails_harms_no_measurement(plan: Plan) -> None:
+    def report(folder: Path) -> Path:
+        raise OSError("no ink")
+
+    folders = runner.run(plan('name = "a"', 'name = "b"'), report=report)
+    assert all(folder.finished for folder in folders)
+    assert folders[0].data["steps"][-1]["reason"] == "OSError: no ink"
+
+
+def test_method_without_data_is_a_failure(plan: Plan) -> None:
+    with pytest.raises(RunError, match="The method 'ramp' yielded no data"):
+        runner.run(plan('name = "a"\nsettings = {count = 0}'))
+
+
+def test_broken_run_json_is_told_and_harms_no_other_run(plan: Plan, tmp_path: Path, write: Callable[..., Path]) -> None:
+    first, _ = runner.run(plan('name = "a"', 'name = "b"'))
+    (first.path / "run.json").write_text("{")
+    with pytest.raises(RunError, match=r"run\.json: is no JSON"):
+        RunFolder.open(first.path)
+    assert [folder.data["test"] for folder in list_runs(tmp_path / "runs")] == ["b"]
+    assert load_campaign(write('name = "a"')).name == "Ramps"
