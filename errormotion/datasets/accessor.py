@@ -258,7 +258,7 @@ class ErrorMotion:
         ds = self._ds.copy()
         E = twists.transform(self._values(), A)
         for k, name in enumerate(DOF):
-            ds[name] = ds[name].copy(data=np.ascontiguousarray(E[..., k]))
+            ds[name] = ds[name].copy(data=E[..., k].copy())
         ds["covariance"] = ds["covariance"].copy(data=twists.transform_covariance(ds["covariance"].values, A))
         if "influence" in ds.variables:
             ds["influence"] = ds["influence"].copy(data=twists.transform(ds["influence"].values, A))

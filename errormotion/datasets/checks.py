@@ -74,10 +74,10 @@ def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]
     return [f"{name}: expected units '{unit}'; found '{found}'. Convert the values and set the attribute"]
 
 
-def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, needed: bool) -> list[str]:
-    """Return what is wrong with the labels of a dimension; the order is free for channels, not for directions."""
+def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, ordered: bool = True) -> list[str]:
+    """Return what is wrong with the labels of a dimension: missing, unknown, twice, or in another order."""
     if dim not in ds.variables:
-        return [f"{dim}: expected a coordinate with the labels {' '.join(labels)}; found none"] if needed else []
+        return [f"{dim}: expected a coordinate with the labels {' '.join(labels)}; found none"]
     variable = ds.variables[dim]
     if variable.dims != (dim,):
         return [f"{dim}: expected a coordinate along '{dim}'; found dims {dims(variable)}"]
@@ -93,9 +93,7 @@ def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, neede
     ]
     if complaints:
         return [f"{what}: {', '.join(complaints)}"]
-    if needed or found == labels:
-        return []
-    return [f"{what}: in another order"]
+    return [f"{what}: in another order"] if ordered and found != labels else []
 
 
 def time_violations(name: str, variable: xr.Variable) -> list[str]:

@@ -98,8 +98,7 @@ def build_errors(
     unseen = np.isnan(E)
     C = np.where(unseen[..., :, None] | unseen[..., None, :], np.nan, C)
     variables: dict[str, Any] = {
-        name: (dims, np.ascontiguousarray(E[..., k]), {"units": unit})
-        for k, (name, unit) in enumerate(zip(DOF, UNITS, strict=True))
+        name: (dims, E[..., k].copy(), {"units": unit}) for k, (name, unit) in enumerate(zip(DOF, UNITS, strict=True))
     }
     variables["covariance"] = ((*dims, "dof", "dof_"), C, {"long_name": "total covariance; m^2, m rad, rad^2"})
     own_coords: dict[str, Any] = {"dof": list(DOF), "dof_": list(DOF)}
@@ -259,7 +258,7 @@ def _shape_violations(ds: xr.Dataset, dims: tuple[Any, ...]) -> list[str]:
     found = []
     for dim in ("dof", "dof_"):
         if dim in ds.sizes:
-            found += label_violations(ds, dim, DOF, needed=True)
+            found += label_violations(ds, dim, DOF)
     expected = {"covariance": (*dims, "dof", "dof_"), "influence": ("source", *dims, "dof")}
     for name, names in expected.items():
         if name not in ds.variables:

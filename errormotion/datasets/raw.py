@@ -47,10 +47,10 @@ def raw_violations(ds: xr.Dataset, raw: RawSchema) -> list[str]:
     for dim, labels in raw.labels.items():
         if dim not in ds.sizes:
             continue
-        if dim not in ds.variables and ds.sizes[dim] != len(labels):
+        if dim in ds.variables or dim == "channel":
+            found += label_violations(ds, dim, labels, ordered=dim != "channel")
+        elif ds.sizes[dim] != len(labels):
             found.append(f"dimension {dim}: expected {len(labels)} ({' '.join(labels)}); found {ds.sizes[dim]}")
-        else:
-            found += label_violations(ds, dim, labels, needed=dim == "channel")
     for row in raw.rows:
         found += list(_row_violations(ds, row))
     return found

@@ -1,6 +1,7 @@
 """Error datasets and raw datasets for the tests of this folder."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,11 @@ from errormotion.datasets import build_errors, provenance
 Build = Callable[..., xr.Dataset]
 
 
-def error_dataset(
-    seed: int = 0, n: int = 7, sources: int = 3, unseen: tuple[int, ...] = (), **changes: Any
-) -> xr.Dataset:
+def error_dataset(seed: int = 0, n: int = 7, unseen: tuple[int, ...] = (), **changes: Any) -> xr.Dataset:
     """Return an error dataset over time with influences in two groups and an independent rest."""
     rng = np.random.default_rng(seed)
     E = rng.normal(size=(n, 6)) * 1e-5
-    F = rng.normal(size=(sources, n, 6)) * 1e-6
+    F = rng.normal(size=(3, n, 6)) * 1e-6
     L = rng.normal(size=(n, 6, 6)) * 1e-6
     E[:, list(unseen)] = np.nan
     arguments: dict[str, Any] = {
@@ -39,8 +38,8 @@ def error_dataset(
         "method_version": "1",
         "provenance": provenance.make({"average": 0.5}, None, [{"serial_number": "7"}], seed=seed),
         "influence": F,
-        "sources": [f"source {k}" for k in range(sources)],
-        "source_groups": ["beams", "beams", "reference"][:sources],
+        "sources": [f"source {k}" for k in range(3)],
+        "source_groups": ["beams", "beams", "reference"],
     }
     return build_errors(**{**arguments, **changes})
 
@@ -93,6 +92,12 @@ def beam_dataset() -> xr.Dataset:
 @pytest.fixture
 def errors() -> Build:
     return error_dataset
+
+
+@pytest.fixture(scope="session")
+def errors_of_seed() -> Callable[[int], xr.Dataset]:
+    """Error datasets of three instants, built once for each seed."""
+    return cache(lambda seed: error_dataset(seed=seed, n=3))
 
 
 @pytest.fixture

@@ -1,0 +1,180 @@
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.datasets import DOF, SCHEMA
+from errormotion.errors import DatasetError
+
+
+def violations(ds: xr.Dataset) -> str:
+    with pytest.raises(DatasetError) as caught:
+        datasets.validate(ds)
+    assert caught.value.violations == datasets.violations(ds)
+    return "\n".join(caught.value.violations)
+
+
+def test_a_result_has_the_schema_its_units_and_its_attributes(errors) -> None:
+    ds = errors()
+    assert datasets.violations(ds) == []
+    assert ds.attrs["schema"] == SCHEMA
+    assert ds.attrs["sign"] == "actual minus commanded, tool side relative to workpiece side"
+    assert [ds[name].attrs["units"] for name in DOF] == ["m"] * 3 + ["rad"] * 3
+    assert ds["covariance"].dims == ("time", "dof", "dof_")
+    assert ds["influence"].dims == ("source", "time", "dof")
+    assert list(ds["source_group"].values) == ["beams", "beams", "reference"]
+    assert ds["time"].attrs["units"] == "s"
+    assert "temperature" in ds.coords
+
+
+def test_one_place_needs_no_dimension(errors) -> None:
+    ds = errors(values=np.zeros(6), covariance=np.eye(6) * 1e-12, dims=(), coords={}, influence=None)
+    assert ds["EX"].dims == ()
+    assert datasets.violations(ds) == []
+
+
+def test_what_is_not_seen_is_nan_in_covariance_and_influence_too(errors) -> None:
+    ds = errors(unseen=(5,))
+    assert np.isnan(ds["covariance"].sel(dof="EC")).all()
+    assert np.isnan(ds["covariance"].sel(dof_="EC")).all()
+    assert np.isnan(ds["influence"].sel(dof="EC")).all()
+    assert np.isfinite(ds["covariance"].sel(dof=list(DOF[:5]), dof_=list(DOF[:5]))).all()
+
+
+def test_a_value_may_be_unknown_at_single_times(errors) -> None:
+    values = np.zeros((7, 6))
+    values[2, 1] = np.nan
+    ds = errors(values=values)
+    assert int(np.isnan(ds["covariance"]).sum()) == 11  # one row and one column of one matrix
+
+
+def test_extra_results_ride_along_but_may_not_take_a_name(errors) -> None:
+    ds = errors(extras={"bar_radius": xr.DataArray(0.005, attrs={"units": "m"})})
+    assert ds["bar_radius"].attrs["units"] == "m"
+    with pytest.raises(DatasetError, match="taken already: EX"):
+        errors(extras={"EX": xr.DataArray(0.0)})
+
+
+def test_all_violations_of_a_result_are_told_at_once(errors) -> None:
+    values = np.zeros((7, 6))
+    values[0, 0] = 0.3
+    values[1, 3] = 0.5
+    with pytest.raises(DatasetError) as caught:
+        errors(values=values, component="saddle", reference=" ", functional_point=(0, 0, 500))
+    told = "\n".join(caught.value.violations)
+    assert len(caught.value.violations) == 5
+    assert "EX = 0.3 m: expected -0.1..0.1 m; is it in mm?" in told
+    assert "EA = 0.5 rad: expected -0.2..0.2 rad" in told
+    assert "component" in told
+    assert "reference" in told
+    assert "500 m: expected within 50 m; is it in mm?" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"values": np.zeros((7, 5))}, r"values: expected shape \(time, 6\); found \(7, 5\)"),
+        ({"covariance": np.zeros((7, 6))}, r"covariance: expected shape \(7, 6, 6\); found \(7, 6\)"),
+        ({"influence": np.zeros((2, 7, 6))}, r"influence: expected shape \(3, 7, 6\)"),
+        ({"source_groups": ["beams"]}, "source_groups: expected 3"),
+        ({"coords": {"time": np.arange(5.0)}}, "do not fit together"),
+        ({"dims": ("cycle",), "coords": {}}, "expected dims from time, position, target, beam; found cycle"),
+        ({"coords": {}}, "time: missing"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(errors, changes, told) -> None:
+    with pytest.raises(DatasetError, match=told):
+        errors(**changes)
+
+
+@pytest.mark.parametrize(
+    ("time", "told"),
+    [
+        ([0, 1, 2, 2, 3, 4, 5.0], "increasing seconds; found 2 s after 2 s"),
+        ([0, 1, 2, np.nan, 3, 4, 5.0], "finite seconds; found nan"),
+    ],
+)
+def test_times_increase(errors, time, told) -> None:
+    with pytest.raises(DatasetError, match=told):
+        errors(coords={"time": np.array(time)})
+
+
+def test_a_covariance_is_symmetric_and_positive(errors) -> None:
+    ds = errors(influence=None)
+    skew = ds.copy(deep=True)
+    skew["covariance"][3, 0, 1] *= 1.001
+    assert violations(skew) == "covariance: expected symmetric matrices; found one that is not"
+    negative = ds.copy(deep=True)
+    negative["covariance"][3, 2, 2] *= -1
+    assert "expected variances of 0 or more" in violations(negative)
+    assert violations(negative).endswith("of EZ")
+    overdone = ds.copy(deep=True)
+    u = np.sqrt(np.diagonal(overdone["covariance"].values[3]))
+    overdone["covariance"][3, 0, 1] = overdone["covariance"][3, 1, 0] = 1.1 * u[0] * u[1]
+    assert "positive semidefinite" in violations(overdone)
+
+
+def test_rounding_of_a_singular_covariance_is_no_violation(errors) -> None:
+    rng = np.random.default_rng(0)
+    F = rng.normal(size=(2, 7, 6)) * 1e-6  # rank 2: four eigenvalues are zero up to rounding
+    C = np.einsum("spi,spj->pij", F, F)
+    assert datasets.violations(errors(covariance=C, influence=F, sources=["a", "b"], source_groups=["a", "b"])) == []
+
+
+def test_influence_is_not_larger_than_the_covariance(errors) -> None:
+    ds = errors()
+    ds["influence"][0, 2, 4] = 1e-4
+    assert "for EB they exceed it" in violations(ds)
+
+
+def test_the_rest_beside_the_influences_is_a_covariance(errors) -> None:
+    F = np.zeros((1, 7, 6))
+    F[0, :, 0] = F[0, :, 1] = 0.9e-6
+    told = "expected the covariance less the influences to be a covariance"
+    with pytest.raises(DatasetError, match=told):
+        # each variance holds its influence, but the two freedoms are not correlated as the common source makes them
+        errors(covariance=np.tile(np.eye(6) * 1e-12, (7, 1, 1)), influence=F, sources=["a"], source_groups=["a"])
+
+
+def test_nan_of_value_and_covariance_go_together(errors) -> None:
+    ds = errors()
+    ds["EY"][2] = np.nan
+    told = violations(ds)
+    assert "covariance: expected NaN exactly where the value is NaN" in told
+    assert "EY" in told
+
+
+def test_missing_freedoms_and_attributes_are_named(errors) -> None:
+    ds = errors().drop_vars(["EB", "EC"])
+    del ds.attrs["frame"]
+    ds.attrs["provenance"] = "none"
+    ds.attrs["operator"] = None
+    told = violations(ds)
+    assert "EB EC: missing" in told
+    assert "attribute 'frame': missing" in told
+    assert "provenance': expected a JSON object" in told
+    assert "attribute 'operator': expected text, a number or a flat array of them; found None" in told
+
+
+def test_a_unit_other_than_si_is_refused(errors) -> None:
+    ds = errors()
+    ds["EX"].attrs["units"] = "um"
+    assert violations(ds) == "EX: expected units 'm'; found 'um'. Convert the values and set the attribute"
+
+
+def test_the_order_of_freedoms_is_fixed(errors) -> None:
+    ds = errors().isel(dof=[1, 0, 2, 3, 4, 5])
+    assert "dof: expected EX EY EZ EA EB EC; found EY EX EZ EA EB EC: in another order" in violations(ds)
+
+
+def test_an_unknown_schema_is_refused_with_the_nearest(errors) -> None:
+    ds = errors().assign_attrs(schema="errormotion.raw.spindle_drfit/1")
+    assert "did you mean 'errormotion.raw.spindle_drift/1'?" in violations(ds)
+    del ds.attrs["schema"]
+    assert "attribute 'schema': missing" in violations(ds)
+
+
+def test_fifty_thousand_instants_are_checked_like_seven(errors) -> None:
+    ds = errors(n=50_000)
+    ds["covariance"][49_999, 0, 1] *= 2
+    assert "symmetric" in violations(ds)
