@@ -40,7 +40,7 @@ def part(source: Source, key: str) -> Part:
             Section("nominal", "Difference to nominal", _nominal(errors)),
             Section("constructions", "Circles and line beside the likelihood fit", _constructions(errors)),
             Section("quality", "Residuals and data quality", [*quality.notes(errors), *_residuals(errors, key)]),
-            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
+            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance)),
         ],
     )
 
@@ -115,10 +115,10 @@ def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
             "arcsec",
             f"{names[off]}, from nominal",
         ),
-        KeyFigure("origin known to", Cell(fixed(2e6 * finite(np.max, sigma[:, :3]), 2)), "µm", "largest U, k = 2"),
+        KeyFigure("origin known to", Cell(significant(2e6 * finite(np.max, sigma[:, :3]))), "µm", "largest U, k = 2"),
         KeyFigure(
             "direction known to",
-            Cell(fixed(2 * finite(np.max, sigma[:, 3:]) / ARCSEC, 1)),
+            Cell(significant(2 * finite(np.max, sigma[:, 3:]) / ARCSEC)),
             "arcsec",
             "largest U, k = 2",
         ),
@@ -279,7 +279,7 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
             ]
         )
     table = Table(
-        "Residuals of the likelihood fit: reading minus predicted reading. Left out: readings that the fit did not use.",
+        "Residuals of the likelihood fit: reading minus predicted reading. Left out: readings not used in the fit.",
         ["beam", "residuals", "without value", "left out", "rms / µm", "largest / µm"],
         rows,
     )

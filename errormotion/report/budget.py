@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 
 import errormotion.datasets  # noqa: F401 - registers ds.em
-from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.text import SECOND_OF_ARC, UM, fixed, significant
+from errormotion.report.document import Cell, Table, estimate, or_dash
+from errormotion.report.text import SECOND_OF_ARC, UM, decimals_of, fixed
 
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
 _INDEPENDENT = "sensor noise, independent from instant to instant"
@@ -34,14 +34,12 @@ def table(errors: xr.Dataset, when: str) -> Table:
     variance = np.array([float(errors["covariance"].isel(dof=i, dof_=i)) for i in range(6)])
     combined = np.sqrt(np.where(variance >= 0, variance, np.nan))
     reason = "not observed by this method"
+    decimals = [decimals_of(value, 3) for value in combined / sizes]
 
     def row(name: str, values: np.ndarray) -> list[Cell | str]:
         return [
             name,
-            *(
-                Cell(significant(v / s)) if math.isfinite(v) else Cell("—", reason=reason)
-                for v, s in zip(values, sizes, strict=True)
-            ),
+            *(or_dash(fixed(v / s, places), reason) for v, s, places in zip(values, sizes, decimals, strict=True)),
         ]
 
     return Table(

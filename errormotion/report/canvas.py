@@ -46,6 +46,7 @@ _STYLE: Any = {
     "axes.labelcolor": "#222222",
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
+    "axes.formatter.useoffset": False,
     "axes.grid": True,
     "grid.color": "#e4e4e4",
     "grid.linewidth": 0.5,

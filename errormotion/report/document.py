@@ -103,7 +103,6 @@ class Section:
     name: str
     title: str
     blocks: Sequence[Block]
-    page_break: bool = False
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
 from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.series import QUANTITIES, curves, end_of_running, minutes_of, unit_of
+from errormotion.report.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
 from errormotion.report.text import fixed
 
 #: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.
+_STEP = "holds the step of a compensation that was switched in this interval"
+_SLOPE_SPAN = 10.0  # min before the end of running, over which an end slope is taken
 _RATES = {"end_slope": (3600.0, "/h"), "per_kelvin": (1.0, "/K")}
 
 
@@ -29,16 +33,33 @@ def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, fl
     return value, uncertainty
 
 
-def cell(errors: xr.Dataset, quantity: str, measure: str) -> Cell:
-    """Return one value in field units with its expanded uncertainty, or a dash and why."""
+def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] = ()) -> Cell:
+    """Return one value in field units with its expanded uncertainty, or a dash and why.
+
+    A value over an interval in which the quantity's compensation was switched carries that as its footnote.
+    """
     value, uncertainty = value_of(errors, quantity, measure)
     size = 60.0 if measure == "time_constant" else unit_of(quantity)[1] / _RATES.get(measure, (1.0, ""))[0]
-    return estimate(
+    made = estimate(
         value / size,
         2 * uncertainty / size,
         reason=why_not(errors, quantity, measure),
         signed=not measure.startswith(("range", "time")),
     )
+    if math.isfinite(value) and holds_step(errors, quantity, measure, done):
+        return replace(made, reason=_STEP)
+    return made
+
+
+def holds_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
+    """Return whether the quantity's compensation was switched within the interval that a measure is taken over."""
+    time, stop = minutes_of(errors), end_of_running(errors)
+    if not (time.size and done):
+        return False
+    running = time[stop] if stop is not None else time[-1]
+    begin = running - _SLOPE_SPAN if measure == "end_slope" else time[0]
+    end = time[0] + 60 if measure.endswith("60min") else time[-1] if measure.endswith("total") else running
+    return any(begin < event.minute <= end and quantity[0] in event.axes for event in done)
 
 
 def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
@@ -62,7 +83,7 @@ def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
     return "too few valid readings in this interval"
 
 
-def tables(errors: xr.Dataset) -> list[Table]:
+def tables(errors: xr.Dataset, done: Sequence[Event] = ()) -> list[Table]:
     """Return the table of drift values and the table of what describes the curves."""
     if "iso_value" not in errors:
         return []
@@ -76,7 +97,7 @@ def tables(errors: xr.Dataset) -> list[Table]:
         "Thermal drift values. Range: highest minus lowest value in the interval. Difference: value at the end of the "
         "interval minus value at its start. After ±: expanded uncertainty, k = 2.",
         head,
-        [[f"d({name})", unit_of(name)[0], *(cell(errors, name, m) for m in intervals)] for name in QUANTITIES],
+        [[f"d({name})", unit_of(name)[0], *(cell(errors, name, m, done) for m in intervals)] for name in QUANTITIES],
         groups,
     )
     second = Table(
@@ -86,10 +107,10 @@ def tables(errors: xr.Dataset) -> list[Table]:
         [
             [
                 f"d({name})",
-                cell(errors, name, "time_constant"),
-                cell(errors, name, "end_slope"),
+                cell(errors, name, "time_constant", done),
+                cell(errors, name, "end_slope", done),
                 f"{unit_of(name)[0]}/h",
-                cell(errors, name, "per_kelvin"),
+                cell(errors, name, "per_kelvin", done),
                 f"{unit_of(name)[0]}/K",
             ]
             for name in QUANTITIES

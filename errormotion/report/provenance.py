@@ -31,7 +31,7 @@ def simulated(*sources: Any) -> str:
     """Return why the data count as simulated, from anything nested; empty where nothing says so."""
     for source in sources:
         for path, value in walk(source):
-            if isinstance(value, str) and value.strip().lower().startswith("sim://"):
+            if isinstance(value, str) and value.strip().lower().startswith(("sim://", "twin://")):
                 return f"instrument address {value.strip()}"
             if path and path[-1] == "simulated" and (value is True or value == 1 or str(value).lower() == "true"):
                 return "the provenance marks them as simulated"

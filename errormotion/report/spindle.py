@@ -34,13 +34,13 @@ def part(source: Source, key: str) -> Part:
         _key_figures(errors),
         _summary(source),
         [
-            Section("iso", "Thermal drift values (ISO 230-3)", _values(errors)),
+            Section("iso", "Thermal drift values (ISO 230-3)", _values(source)),
             Section("drift", "Drift over time", _drift(source, key)),
             Section("temperatures", "Temperatures", _temperatures(source, key)),
             Section("setup", "Set-up", _setup(errors, key)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors)),
             Section("quality", "Residuals and data quality", _quality(source, key)),
-            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance), page_break=True),
+            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance)),
         ],
         spindle_figures.overview(errors, events(source), f"{key}-overview"),
     )
@@ -86,7 +86,7 @@ def _summary(source: Source) -> list[str]:
         words += _largest(errors, found[by_size[0]], by_size[0])
     words += _changes(errors, events(source))
     words += _first_hour(errors)
-    words += _still_moving(errors, by_size)
+    words += _still_moving(errors, by_size, events(source))
     place = stop if stop is not None else time.size - 1
     largest = budget.largest(errors.isel(time=place), "EZ")
     if largest:
@@ -111,8 +111,8 @@ def _what_was_done(errors: xr.Dataset) -> str:
         return f"{length}; {'the spindle stood still' if known else 'the spindle speed was not recorded'}."
     speed = np.asarray(errors["spindle_speed"].values, float)
     turning = speed[np.abs(np.nan_to_num(speed)) > 0]
-    low, high = float(turning.min()), float(turning.max())
-    at = f"{integer(high)} /min" if high - low < 1e-3 * high else f"{integer(low)} to {integer(high)} /min"
+    low, high = (float(value) for value in np.percentile(np.abs(turning), [2, 98]))
+    at = f"{integer(high)} /min" if high - low < 1e-2 * high else f"{integer(low)} to {integer(high)} /min"
     return f"{length}; the spindle turned at {at} until {fixed(time[stop], 1)} min."
 
 
@@ -176,14 +176,14 @@ def _first_hour(errors: xr.Dataset) -> list[str]:
     return [f"Largest ranges within the first 60 min: {listed(told)}."] if told else []
 
 
-def _still_moving(errors: xr.Dataset, by_size: list[str]) -> list[str]:
+def _still_moving(errors: xr.Dataset, by_size: list[str], done: Sequence[Event]) -> list[str]:
     if not by_size:
         return []
     name = by_size[0]
     slope, slope_u = iso230_3.value_of(errors, name, "end_slope")
     constant, _ = iso230_3.value_of(errors, name, "time_constant")
     words = []
-    if np.isfinite(slope):
+    if np.isfinite(slope) and not iso230_3.holds_step(errors, name, "end_slope", done):
         cell = iso230_3.cell(errors, name, "end_slope")
         verdict = "still drifting" if abs(slope) > 2 * slope_u else "steady within the uncertainty"
         words.append(
@@ -200,8 +200,9 @@ def _when(errors: xr.Dataset) -> str:
     return "at the end of running" if stop is not None else "at the end of the record"
 
 
-def _values(errors: xr.Dataset) -> list[Block]:
-    found: list[Block] = list(iso230_3.tables(errors))
+def _values(source: Source) -> list[Block]:
+    errors = source.errors
+    found: list[Block] = list(iso230_3.tables(errors, events(source)))
     if not found:
         return [Text("The result holds no ISO 230-3 values.", "note")]
     meaning = "; ".join(f"{name}: {WHAT[name]}" for name in QUANTITIES)
@@ -279,7 +280,8 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
         Text(
             f"Functional point ({point}) mm in the frame '{errors.attrs.get('frame', 'not stated')}'. Sources that act "
             "on many instants at once are one draw for all of them; differences between instants take their covariance "
-            "into account, so that the uncertainty of a difference may be smaller than that of either value.",
+            "into account, so that the uncertainty of a difference may be smaller than that of either value. "
+            "The budget covers the sources that it names and no others.",
             "note",
         ),
     ]

@@ -41,7 +41,9 @@ def _place(value: float, digits: int) -> int:
     """Power of ten of the last of ``digits`` significant digits, counted after rounding (0.0996 becomes 0.10)."""
     if value == 0 or not math.isfinite(value):
         return 1 - digits
-    return int(f"{abs(value):.{digits - 1}e}".split("e")[1]) - digits + 1
+    number = Decimal(repr(float(value)))
+    place = number.adjusted() - digits + 1
+    return number.quantize(Decimal(1).scaleb(place), rounding=ROUND_HALF_UP).adjusted() - digits + 1
 
 
 def _decimal(value: float, place: int, signed: bool) -> str:
@@ -54,6 +56,11 @@ def _decimal(value: float, place: int, signed: bool) -> str:
 def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
     """Return a number with so many decimals and a true minus; a dash for NaN."""
     return _decimal(value, -decimals, signed) if math.isfinite(value) else DASH
+
+
+def decimals_of(value: float, digits: int) -> int:
+    """Return how many decimals show so many significant digits of a value; 0 for NaN."""
+    return max(-_place(value, digits), 0) if math.isfinite(value) else 0
 
 
 def significant(value: float, digits: int = 2) -> str:

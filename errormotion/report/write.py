@@ -161,14 +161,14 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
                     return provenance.text(holder[name])
         return DASH
 
-    attributes = errors.attrs
+    attributes, test = errors.attrs, known("test", "name")
     instruments = provenance.instruments(source.provenance)
     serials = ", ".join(
         f"{row['model'] or row['name']} no. {row['serial_number']}" for row in instruments if row["serial_number"]
     )
     return [
         ("Machine", machine),
-        ("Test", known("test", "name")),
+        ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
         ("Measured", _moment(known("started", "start", "created"))),
         ("Operator", known("operator")),
         ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),

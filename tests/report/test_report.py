@@ -1,0 +1,308 @@
+"""The page: complete, self-contained, honest about what is unknown, and deaf to hostile names."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.datasets import build_errors
+from errormotion.errors import DatasetError
+from errormotion.report import write_report
+
+VOID = {"meta", "br", "hr", "img", "link", "input", "col", "wbr"}
+
+
+class Page(HTMLParser):
+    """Text, sections and attributes of a page; ``unbalanced`` holds every tag that was not closed in order."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.unbalanced, self.attributes, self.words, self.tags = [], [], [], [], []
+        self.feed(html)
+        self.close()
+        self.unbalanced += self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.unbalanced.append(tag)
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+    def values(self, name):
+        return [value for _, attribute, value in self.attributes if attribute == name]
+
+
+@pytest.fixture
+def read(tmp_path):
+    def write_and_read(errors, **more):
+        path = write_report(errors, tmp_path / "report.html", **more)
+        return Page(path.read_text(encoding="utf-8"))
+
+    return write_and_read
+
+
+@pytest.fixture(scope="module")
+def drift_html(drift, tmp_path_factory):
+    path = tmp_path_factory.mktemp("drift") / "report.html"
+    write_report(drift, path, run={"test": "Warm-up", "operator": "J. Doe"})
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(drift_html):
+    return Page(drift_html)
+
+
+def test_every_tag_is_closed(page):
+    assert page.unbalanced == []
+
+
+def test_nothing_leads_out_of_the_file(page, drift_html):
+    assert "http:" not in drift_html
+    assert "https:" not in drift_html
+    assert "@import" not in drift_html
+    assert not {"script", "link", "iframe", "img", "object", "embed"} & set(page.tags)
+    links = [value for name in ("href", "src", "xlink:href", "data", "action") for value in page.values(name)]
+    assert all(value.startswith("#") for value in links)
+    assert re.findall(r"url\((?!#)", drift_html) == []
+    assert "default-src 'none'" in drift_html
+
+
+def test_a_spindle_report_has_all_its_sections(page):
+    wanted = {"summary", "iso", "drift", "temperatures", "setup", "uncertainty", "quality", "provenance"}
+    assert {f"{name}-1" for name in wanted} <= set(page.values("id"))
+
+
+def test_every_reference_inside_the_page_has_its_target_once(page, drift_html):
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r"url\(#([^)]+)\)", drift_html)) <= set(ids)
+
+
+def test_every_figure_is_described_in_words(page):
+    described = [value for tag, name, value in page.attributes if tag == "figure" and name == "aria-label"]
+    assert page.tags.count("figure") == len(described) >= 6
+    assert all(len(words) > 40 for words in described)
+
+
+def test_the_head_says_who_measured_what_and_when(page):
+    for words in ("C-frame 610", "Warm-up", "J. Doe", "2026-03-02 08:15 UTC", "ILD2300-2 no. 10123"):
+        assert words in page.text
+
+
+def test_the_iso_table_names_range_and_difference(page, drift):
+    stop = np.flatnonzero(drift["spindle_speed"].values > 0)[-1]
+    change = float(drift["EZ"][stop] - drift["EZ"][0]) * 1e6
+    # Uncertainty 0.2 um, so 0.40 expanded, and the value to the same place.
+    assert f"+{change:.2f} ± 0.40" in page.text
+    for words in (
+        "range",
+        "difference",
+        "first 60 min",
+        "to the end of running (103.0 min)",
+        "time constant",
+        "end slope",
+    ):
+        assert words in page.text
+
+
+def test_a_value_that_holds_a_compensation_step_says_so(page):
+    assert "holds the step of a compensation that was switched in this interval" in page.text
+
+
+def test_a_switched_compensation_is_told_with_its_change(page):
+    found = re.search(r"Z compensation off at 101.0 min: .* a change of \+(\d+\.\d+) ±", page.text)
+    # 29.3 um were put in; the warm-up adds about 0.02 um in that minute.
+    assert float(found[1]) == pytest.approx(29.3, abs=0.1)
+
+
+def test_an_unseen_freedom_is_a_dash_with_its_reason_and_never_a_zero(page):
+    row = re.search(r"EC ECC arcsec (.*?) a not observed by this method", page.text)
+    assert row[1].replace("a", "").split() == ["—"] * 3
+    assert "Not observed by this test: EC (ECC)" in page.text
+
+
+def test_an_iso_value_that_could_not_be_found_says_why(read, make_drift):
+    text = read(make_drift(400, minutes=30.0)).text
+    assert "the record is 30.0 min long, shorter than 60 min" in text
+    assert "the curve is not described by one exponential" in text
+
+
+def test_the_budget_names_its_groups_and_adds_up(page, drift):
+    for name in ("beams", "reference", "expansion", "sensor noise", "combined, k = 1", "expanded, k = 2"):
+        assert name in page.text
+
+
+def test_hostile_names_stay_text(read, make_drift):
+    name = '<script>alert("1")</script>&amp;{{ 7*7 }}$\\frac{'
+    drift = make_drift(300, machine=name)
+    drift = drift.assign_coords(sensor=[f"{name}{i}" for i in range(4)] + ["_hidden"])
+    seen = read(drift, run={"operator": name}, title=name)
+    assert "script" not in seen.tags
+    assert name in seen.text
+    assert seen.unbalanced == []
+
+
+def test_simulated_data_cannot_pass_for_real(read, make_drift, simulated_instruments):
+    text = read(make_drift(300, instruments=simulated_instruments)).text
+    assert "SIMULATED DATA" in text
+    assert "sim://cframe/frame?seed=3" in text
+
+
+def test_a_simulated_channel_deep_in_the_settings_is_found(read, make_drift):
+    hidden = [{"name": "frame", "settings": {"channels": [{"address": "SIM://cframe/x1"}]}}]
+    assert "SIMULATED DATA" in read(make_drift(300, instruments=hidden)).text
+
+
+def test_an_identity_that_calls_itself_simulated_is_believed(read, make_drift):
+    assert "SIMULATED DATA" in read(make_drift(300, instruments=[{"identity": {"simulated": True}}])).text
+
+
+def test_measured_data_carry_no_banner(page):
+    assert "SIMULATED" not in page.text
+    assert "REPLAYED" not in page.text
+
+
+def test_a_replayed_recording_is_named(read, make_drift, simulated_instruments):
+    simulated_instruments[0]["address"] = "replay://frame.jsonl"
+    assert "REPLAYED RECORDING" in read(make_drift(300, instruments=simulated_instruments)).text
+
+
+def test_the_report_lives_without_temperature_and_speed(read, make_drift):
+    text = read(make_drift(300, temperature=False, speed=False)).text
+    assert "No temperatures were recorded" in text
+    assert "no temperature was recorded" in text
+    assert "the spindle speed was not recorded" in text
+
+
+def test_a_dead_channel_is_shown_as_such(read, make_drift):
+    drift = make_drift(300)
+    for name in ("fit_residual", "distance_mean"):
+        drift[name][{"channel": 1}] = np.nan
+    drift["valid_fraction"][{"channel": 1}] = 0.0
+    seen = read(drift)
+    assert "no valid value" in seen.text
+    assert re.search(r"X2 0 % 0 % 1 104\.\d min", seen.text)
+    assert seen.unbalanced == []
+
+
+def test_a_quantity_without_any_value_is_named(read, make_drift):
+    drift = make_drift(300)
+    drift["displacement"][{"level": 1}] = np.nan
+    for name in ("iso_value", "iso_uncertainty"):
+        drift[name].loc[{"quantity": ["X2", "Y2"]}] = np.nan
+    assert "X2 could not be determined from this record" in read(drift).text
+
+
+def test_only_the_compulsory_part_of_a_spindle_dataset_is_enough(read, drift):
+    bare = drift.drop_vars([name for name in drift.data_vars if name[0] != "E" and name != "covariance"])
+    bare = bare.drop_dims(["channel", "sensor"], errors="ignore").drop_vars("spindle_speed")
+    seen = read(bare)
+    assert "The result holds no ISO 230-3 values." in seen.text
+    assert "does not hold the geometry" in seen.text
+    assert seen.unbalanced == []
+
+
+@pytest.mark.parametrize("instants", [0, 1, 2])
+def test_a_record_of_almost_nothing_still_gets_a_page(read, drift, instants):
+    assert read(drift.isel(time=slice(0, instants))).unbalanced == []
+
+
+def test_remarks_of_the_method_and_lost_samples_are_passed_on(read, drift):
+    raw = xr.Dataset(attrs={"dropped": 1234, "invalid": '{"out_of_range": 7}'})
+    text = read(drift.assign_attrs(notes=["Sensor X1 was cold."]), raw=raw).text
+    assert "Sensor X1 was cold." in text
+    assert "dropped samples 1 234, invalid because of out of range 7" in text
+
+
+def test_a_long_record_stays_small(make_drift, tmp_path):
+    path = write_report(make_drift(12_000), tmp_path / "report.html")
+    assert path.stat().st_size < 2_000_000
+
+
+def test_an_older_report_is_replaced_and_nothing_is_left_beside(drift, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text("old")
+    assert write_report(drift, path) == path
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_the_dataset_is_left_as_it_was(make_drift, tmp_path):
+    drift = make_drift(300)
+    before = drift.copy(deep=True)
+    write_report(drift, tmp_path / "report.html")
+    xr.testing.assert_identical(drift, before)
+
+
+def test_a_beam_detection_is_reported_with_both_constructions(read, beams):
+    seen = read(beams)
+    assert {"beams-1", "nominal-1", "constructions-1", "quality-1", "provenance-1"} <= set(seen.values("id"))
+    assert "4 of 5 beams were determined" in seen.text
+    assert "Not determined: X2" in seen.text
+    assert "X2 —" in seen.text
+    assert seen.unbalanced == []
+    # 0.7 um were added to each coordinate of the circles-and-line origin: 0.7 sqrt(3) = 1.21.
+    assert "+0.70 +0.70 +0.70 1.21" in seen.text
+    # X1 lies 0.1 mm beside nominal.
+    assert re.search(r"X1 0\.00 ± 0\.\d+ \+100\.00 ± 0\.\d+ 0\.00", seen.text)
+
+
+@pytest.mark.parametrize(("dims", "shape"), [(("position",), (21,)), (("time", "position"), (3, 8)), ((), ())])
+def test_any_component_gets_a_report(read, dims, shape):
+    rng = np.random.default_rng(3)
+    values = rng.normal(0, 1e-6, (*shape, 6))
+    values[..., 5] = np.nan
+    axes = {"time": 3600.0 * np.arange(3), "position": np.linspace(0, 0.5, shape[-1] if shape else 1)}
+    errors = build_errors(
+        values,
+        np.broadcast_to(np.eye(6) * 1e-14, (*shape, 6, 6)),
+        dims=dims,
+        coords={name: axes[name] for name in dims},
+        component="X",
+        machine="gantry",
+        frame="machine",
+        functional_point=[0, 0, 0],
+        reference="cold",
+        method="other",
+        method_version="1",
+        provenance={"settings": {}},
+    )
+    seen = read(errors)
+    assert "EXX" in seen.text
+    assert "not observed" in seen.text
+    assert seen.unbalanced == []
+
+
+def test_several_results_make_several_chapters(read, drift, beams):
+    seen = read([beams, drift])
+    assert "1 Detection of the laser beams" in seen.text
+    assert "2 Thermal drift of the spindle" in seen.text
+    ids = seen.values("id")
+    assert len(ids) == len(set(ids))
+
+
+def test_what_is_no_error_dataset_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="lacks EX, EY, EZ, EA, EB, EC, covariance"):
+        write_report(xr.Dataset(), tmp_path / "report.html")
+    with pytest.raises(DatasetError, match="at least one"):
+        write_report([], tmp_path / "report.html")
+    assert list(tmp_path.iterdir()) == []

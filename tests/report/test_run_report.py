@@ -1,0 +1,56 @@
+"""A run folder becomes a report that lies in it."""
+
+import json
+
+import pytest
+
+from errormotion.datasets import save
+from errormotion.errors import RunError
+from errormotion.report import write_run_report
+
+
+@pytest.fixture
+def run_folder(tmp_path, make_drift):
+    folder = tmp_path / "20260302T081500Z-drift-ab12"
+    (folder / "errors" / "spindle_drift-0123").mkdir(parents=True)
+    save(make_drift(300), folder / "errors" / "spindle_drift-0123" / "errors.nc")
+    run = {"id": "ab12", "test": "drift", "created": "2026-03-02T08:14:00+00:00", "bench": {"name": "Lab 2"}}
+    (folder / "run.json").write_text(json.dumps(run))
+    return folder
+
+
+def test_a_run_folder_gets_its_report(run_folder):
+    path = write_run_report(run_folder)
+    assert path == run_folder / "report.html"
+    text = path.read_text(encoding="utf-8")
+    assert "Thermal drift of the spindle" in text
+    assert "ab12" in text
+
+
+def test_a_second_report_replaces_the_first(run_folder):
+    first = write_run_report(run_folder).stat().st_mtime_ns
+    assert write_run_report(run_folder).stat().st_mtime_ns >= first
+    assert sorted(entry.name for entry in run_folder.iterdir()) == ["errors", "report.html", "run.json"]
+
+
+def test_simulation_told_only_by_the_run_is_seen(run_folder):
+    run = json.loads((run_folder / "run.json").read_text())
+    run["instruments"] = [{"name": "frame", "address": "sim://cframe/frame?seed=3"}]
+    (run_folder / "run.json").write_text(json.dumps(run))
+    assert "SIMULATED DATA" in write_run_report(run_folder).read_text(encoding="utf-8")
+
+
+def test_a_folder_without_results_says_what_to_do(tmp_path):
+    with pytest.raises(RunError, match="errormotion identify"):
+        write_run_report(tmp_path)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RunError, match="nowhere"):
+        write_run_report(tmp_path / "nowhere")
+
+
+def test_a_broken_run_file_is_named(run_folder):
+    (run_folder / "run.json").write_text("{")
+    with pytest.raises(RunError, match=r"run\.json is no JSON"):
+        write_run_report(run_folder)
