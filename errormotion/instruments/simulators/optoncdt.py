@@ -16,8 +16,9 @@ from errormotion.instruments.point_lds.optoncdt.codec import (
     rate_text,
 )
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.faults import stray_bytes
+from errormotion.instruments.simulators.faults import Fault, stray_bytes
 from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import Server
 
 _UNKNOWN = "E220 Unknown command"
 _BAD_PARAMETER = "E204 Received unsupported parameter"
@@ -35,23 +36,15 @@ class SimulatedOptoNCDT(SimulatedDevice):
     _drops_answers = False
 
     def __init__(self, address: Address) -> None:
-        self.rate = 20e3
-        self.start = self.position = 0
-        self.taken: int | None = None
-        self.counter_on = False
-        self.output = False
-        self.sync = "NONE"
-        self._number = 0
+        self._rate = 20e3
+        self._counter = False
+        self._sync = "NONE"
+        self._stream: SensorStream | None = None
         self._starting = False
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
-        self.model = address.params.get("model", "ILD2300")
-        own_range = self.world.machine.frame.range * 1e3 if self.model == "ILD2300" else 10.0
+        self._model = address.params.get("model", "ILD2300")
+        own_range = self.world.machine.frame.range * 1e3 if self._model == "ILD2300" else 10.0
         self._range = address.number("range", own_range) * 1e-3
-
-    @property
-    def channel(self) -> str:
-        """Which beam of the frame it is."""
-        return self.name
 
     def close(self) -> None:
         """End the device."""
@@ -60,7 +53,8 @@ class SimulatedOptoNCDT(SimulatedDevice):
 
     def handed_over(self, samples: int) -> None:
         """Take note of how many samples of the running stream its reader has had."""
-        self.taken = samples
+        if self._stream is not None:
+            self._stream.taken = samples
 
     # ------------------------------------------------------------------ commands
 
@@ -81,9 +75,9 @@ class SimulatedOptoNCDT(SimulatedDevice):
             case ["OUTPUT", "RS422"]:
                 return self._start()
             case ["OUTADD_RS422", ("COUNTER" | "NONE") as what]:
-                self.counter_on = what == "COUNTER"
+                self._counter = what == "COUNTER"
             case ["SYNC", ("NONE" | "MASTER" | "SLAVE") as role]:
-                self.sync = role
+                self._sync = role
             case ["RESETCNT", "COUNTER"] | ["MASTERMV", "NONE"] | ["LASERPOW", "FULL" | "REDUCED" | "OFF"]:
                 pass
             case ["OUTPUT" | "OUTADD_RS422" | "SYNC" | "RESETCNT" | "MASTERMV" | "LASERPOW", *_]:
@@ -94,8 +88,8 @@ class SimulatedOptoNCDT(SimulatedDevice):
 
     def _description(self) -> str:
         lines = (
-            f"Name: {self.model}-{self._range * 1e3:g}",
-            f"Serial: {1000 * self.world.seed + sum(self.name.encode()):08d}",
+            f"Name: {self._model}-{self._range * 1e3:g}",
+            f"Serial: {1000 * abs(self.world.seed) + sum(i * byte for i, byte in enumerate(self.name.encode(), 1)):08d}",
             f"Range: {self._range * 1e3:.2f} mm",
             "Version: 001.000",
             f"Operating time: {self.world.sensors_on_for:.0f} s",
@@ -103,68 +97,123 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return "\r\n".join(lines)
 
     def _set_rate(self, text: str) -> str:
-        for rate in MODELS[self.model].rates:
+        for rate in MODELS[self._model].rates:
             if text == rate_text(rate):
-                self.rate = rate
+                self._rate = rate
                 return ""
         return _BAD_PARAMETER
 
-    # ------------------------------------------------------------------ samples
-
     def _start(self) -> str:
-        if self.channel not in self.world.machine.frame.channels:
+        if self.name not in self.world.machine.frame.channels:
             return "E300 No such beam in the frame of this machine"
-        self._number = 0
-        self.output = self._starting = True
-        if self.fault.kind == "disconnect" and self.fault.at == 0:
-            self._server.hang_up()
+        self._stop()
+        self._stream = SensorStream(
+            self._server,
+            self.fault,
+            self._rng,
+            channel=self.name,
+            rate=self._rate,
+            sync=self._sync,
+            counter=self._counter,
+            measuring_range=self._range,
+        )
+        self._starting = True
         return ""
+
+    def _stop(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.ended = True
+            self.world.end_stream(stream)
 
     def reply(self, data: bytes) -> None:
         """Send an answer; a stream that was just switched on begins behind it."""
         super().reply(data)
-        if self._starting:
-            self._starting = False
-            self.world.begin_stream(self)
+        if self._starting and self._stream is not None:
+            self.world.begin_stream(self._stream)
+        self._starting = False
 
     def _silent(self) -> bool:
-        return self.fault.from_the_start or (self.output and self._number >= self.fault.at > 0)
+        begun = self._stream is not None and self._stream.sent >= self.fault.at
+        return self.fault.from_the_start or begun
 
-    def _stop(self) -> None:
-        self.output = False
-        self.world.end_stream(self)
+
+class SensorStream:
+    """One stream of a sensor, from OUTPUT RS422 to OUTPUT NONE.
+
+    Parameters
+    ----------
+    server : Server
+        The wire.
+    fault : Fault
+        What goes wrong.
+    rng : numpy.random.Generator
+        For stray bytes.
+    channel : str
+        Beam of the frame.
+    rate : float
+        Samples per second.
+    sync : str
+        NONE, MASTER or SLAVE.
+    counter : bool
+        Whether each distance is followed by its counter.
+    measuring_range : float
+        m.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        fault: Fault,
+        rng: np.random.Generator,
+        *,
+        channel: str,
+        rate: float,
+        sync: str,
+        counter: bool,
+        measuring_range: float,
+    ) -> None:
+        self.channel = channel
+        self.rate = rate
+        self.sync = sync
+        self.start = self.position = 0
+        self.taken: int | None = None
+        self.ended = False
+        self.sent = 0
+        self._server = server
+        self._fault = fault
+        self._rng = rng
+        self._counter = counter
+        self._range = measuring_range
 
     def push(self, distances: Array) -> None:
-        """Send the next samples with whatever fault is due."""
-        first, size = self._number, distances.size
-        self._number += size
+        """Send the next samples with whatever fault is due; may wait for the reader."""
+        first, size = self.sent, distances.size
         raws = np.empty(size, dtype=np.int32)
         kernels.quantise(distances, self._range, raws)
-        data = self._spoilt(raws, first) if self.fault.kind else self._encoded(raws, first)
+        data = self._spoilt(raws, first) if self._fault.kind else self._encoded(raws, first)
         with self._server.lock:
-            if not self.output:
+            if self.ended:
                 return
-            heard = all(self._server.send(piece) for piece in self.fault.pieces(data))
-        if not heard:  # nobody is there any more
-            self._stop()
-        if self.fault.kind == "disconnect" and first + size > self.fault.at:
+            self.sent += size
+            heard = all(self._server.send(piece) for piece in self._fault.pieces(data))
+        if self._fault.kind == "disconnect" and self.sent > self._fault.at:
             self._server.hang_up()
-            self._stop()
+            self.ended = True
+        self.ended = self.ended or not heard
 
     def _encoded(self, raws: Array, first: int) -> bytes:
         data = np.empty(6 * raws.size, dtype=np.uint8)
-        used = kernels.encode(raws, first & (1 << COUNTER_BITS) - 1, self.counter_on, data)
+        used = kernels.encode(raws, first & (1 << COUNTER_BITS) - 1, self._counter, data)
         return data[:used].tobytes()
 
     def _spoilt(self, raws: Array, first: int) -> bytes:
-        fault = self.fault
+        fault = self._fault
         numbers = first + np.arange(raws.size)
         begun = numbers >= fault.at
         due = begun & ((numbers - fault.at) % fault.every == 0)
         match fault.kind:
-            case "silence":
-                raws[begun] = -1
-            case "disconnect":
+            case "silence" | "disconnect":
                 raws[begun] = -1
             case "drop":
                 raws[due] = -1

@@ -27,7 +27,7 @@ class Stream(Protocol):
     """A channel that wants samples.
 
     ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
-    reader has handed over, None where it does not tell.
+    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more.
     """
 
     rate: float
@@ -35,6 +35,7 @@ class Stream(Protocol):
     start: int
     position: int
     taken: int | None
+    ended: bool
 
     @property
     def channel(self) -> str:
@@ -286,6 +287,8 @@ class VirtualWorld:
             for stream, values in zip(group, distances, strict=True):
                 stream.position += size
                 stream.push(values)
+                if stream.ended:
+                    self.end_stream(stream)
 
     def _distances(self, first: int, n: int, rate: float, channels: list[str]) -> np.ndarray[Any, Any]:
         if self.tool == "sphere" and self.motion is None:  # parked outside of the frame
