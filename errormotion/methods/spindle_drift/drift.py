@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +11,16 @@ import xarray as xr
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift import iso230_3
-from errormotion.methods.spindle_drift.averaging import Averager, Averages, join, slices
 from errormotion.methods.spindle_drift.bar import SIDE, end_point, fit_axis
+from errormotion.methods.spindle_drift.frame_expansion import frame_warming, readings_per_kelvin
+from errormotion.methods.spindle_drift.record import (
+    average_record,
+    count_unknown,
+    noise,
+    reference_windows,
+    sensors,
+    spin_up,
+)
 from errormotion.methods.spindle_drift.uncertainty import (
     CHANNELS,
     Frame,
@@ -29,46 +36,12 @@ from errormotion.methods.spindle_drift.uncertainty import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from errormotion.methods.spindle_drift.averaging import Averages
     from errormotion.methods.spindle_drift.settings import Settings
 
     Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
-
-# Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
-_CHANCE = 3.3
-_ENOUGH = 30
-
-
-@dataclass(frozen=True)
-class Record:
-    """A drift record brought down to means, on one clock."""
-
-    averages: Averages
-    temperature: Array | None
-    spindle_speed: Array | None
-
-
-def average_record(raw: xr.Dataset, settings: Settings) -> Record:
-    """Bring a record down to means in one pass and constant memory; ``raw`` has its channels in order."""
-    slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
-    averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
-    slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
-    parts: list[Averages] = []
-    slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
-    for time, part in slices(raw):
-        if not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
-            raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
-        parts.append(averager.update(time, part["distance"].transpose("channel", "time").values))
-        for name in slow:
-            values = part[name].transpose(..., "time").values.astype(np.float64)
-            slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
-    parts.append(averager.finish())
-    means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
-    speed = means.get("spindle_speed")
-    if speed is None and "spindle_speed" in raw:
-        speed = np.broadcast_to(np.float64(raw["spindle_speed"].values), (1, join(parts).time.size))
-    return Record(join(parts), means.get("temperature"), None if speed is None else speed[0])
 
 
 def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -87,16 +60,16 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     record = average_record(raw, settings)
     averages = record.averages
     mean = averages.mean.copy()
-    _count_unknown(averages, notes)
-    expansion = _frame_expansion(raw, record, settings, notes)
-    # Two passes: the frame's expansion moves the readings along the normals that the first one finds.
+    count_unknown(averages, notes)
+    spinning_up = spin_up(record, settings)
+    reference = reference_windows(averages, mean, settings, spinning_up)
+    warming = frame_warming(raw, record, settings, notes)
     state = _fit(mean, origin, direction, radius, levels)
-    reference = _reference_windows(averages, mean, settings)
-    frame_change = np.zeros_like(mean)
-    if expansion is not None:
-        frame_change = _readings_of_shift(expansion, state, origin, direction, levels)
-        frame_change -= frame_change[:, reference].mean(axis=1, keepdims=True)
-        mean = mean + frame_change
+    if warming is not None:
+        # The frame's expansion moves the readings along the normals that a first fit finds.
+        per_kelvin = readings_per_kelvin(warming, state, origin, direction, levels)
+        change = per_kelvin * (warming.temperature - warming.temperature[reference].mean())
+        mean = mean + change
         state = _fit(mean, origin, direction, radius, levels)
     then = _fit(mean[:, reference].mean(axis=1, keepdims=True), origin, direction, radius, levels)
     if not np.isfinite(then.E).all():
@@ -106,19 +79,29 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         )
     point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
     frame = Frame(origin, direction, levels, point)
-    sigma = _noise(raw, averages, mean, settings, notes)
+    sigma = noise(raw, averages, settings, notes)
     sigma_then = np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size
     sources: list[Source] = [*reading_sources(sigma_then), *beam_sources(beam_covariance, beam_group)]
     if settings.bar_radius_uncertainty:
         sources.append(radius_source(settings.bar_radius_uncertainty))
-    scaled = []
-    if expansion is not None and settings.frame_expansion_uncertainty:
-        scaled.append(("frame expansion", frame_change * settings.frame_expansion_uncertainty))
+    scaled: list[tuple[str, str, Array]] = []
+    own: list[Array] = []
+    if warming is not None:
+        scaled.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
+        unknown = np.sqrt(np.sum(warming.uncertainty[reference] ** 2)) / reference.size
+        scaled.append(("frame temperature at the reference", "frame temperature", -per_kelvin * unknown))
+        own.append(per_kelvin * warming.uncertainty)
     errors = twist(state, then, point)
-    independent, influence = propagate(state, then, frame, sigma, sources, scaled)
-    _within_reference(independent, influence, reference)
-    names = [s.name for s in sources] + [name for name, _ in scaled]
-    groups = [s.group for s in sources] + [name for name, _ in scaled]
+    coming = averages.time < averages.time[0] + spinning_up - 1e-6
+    if settings.reference_time is None and coming.any():
+        errors[coming] = np.nan
+        notes.append(f"The first {spinning_up:g} s, in which the spindle comes to its speed, are NaN (spin_up).")
+    independent, influence = propagate(state, then, frame, sigma, sources, [effect for *_, effect in scaled], own)
+    # Errors inside the reference state share its noise: what is left of it is 1 - 1/m of each mean.
+    independent[reference] *= 1.0 - 1.0 / reference.size
+    influence[:, reference] = 0.0
+    names = [s.name for s in sources] + [name for name, *_ in scaled]
+    groups = [s.group for s in sources] + [group for _, group, _ in scaled]
     unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
     if np.linalg.norm(unseen) > 0:
         row = np.zeros((1, len(errors), 6))
@@ -137,7 +120,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         iso230_3.quantities(errors, independent, influence, levels - point[2]),
         time,
         temperature=record.temperature,
-        sensors=_sensors(raw) if record.temperature is not None else (),
+        sensors=sensors(raw) if record.temperature is not None else (),
         spindle_speed=record.spindle_speed,
         running_end=settings.running_end,
         sensor=settings.iso_temperature,
@@ -149,7 +132,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     }
     if record.temperature is not None:
         coords["temperature"] = (("time", "sensor"), record.temperature.T, {"units": "degC"})
-        coords["sensor"] = ("sensor", _sensors(raw))
+        coords["sensor"] = ("sensor", sensors(raw))
     if record.spindle_speed is not None:
         coords["spindle_speed"] = ("time", record.spindle_speed, {"units": "1/min"})
     for note in notes:
@@ -228,111 +211,6 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
         return origin, direction, covariance, "beam calibration"
     notes.append("The raw dataset states no beam_covariance: the beams count as exact in the uncertainty.")
     return origin, direction, np.zeros((5, 6, 6)), "beam calibration"
-
-
-def _count_unknown(averages: Averages, notes: list[str]) -> None:
-    for channel, row, counts in zip(CHANNELS, averages.mean, averages.count, strict=True):
-        unknown = np.isnan(row)
-        if unknown.all():
-            raise MethodError(
-                f"Channel {channel} has no valid reading in the whole record: check the sensor and its cable."
-            )
-        if unknown.any():
-            first, last = averages.time[unknown][[0, -1]]
-            notes.append(
-                f"{channel}: {unknown.sum()} of {row.size} means are unknown, between {first:.1f} s and {last:.1f} s "
-                f"({averages.expected.sum() - counts.sum()} samples lost in all); the errors there are NaN."
-            )
-
-
-def _reference_windows(averages: Averages, mean: Array, settings: Settings) -> NDArray[np.int64]:
-    begin = averages.time[0] + settings.reference_time
-    length = settings.reference_average or 0.0
-    inside = (averages.time >= begin - 1e-6) & (averages.time < begin + max(length - 0.5 * settings.average, 1e-6))
-    if not inside.any():
-        later = np.flatnonzero(averages.time >= begin - 1e-6)
-        if later.size == 0:
-            raise MethodError(
-                f"The record ends at {averages.time[-1]:.1f} s; the reference state was to begin at "
-                f"{settings.reference_time:g} s (reference_time)."
-            )
-        inside[later[0]] = True
-    known = inside & np.isfinite(mean).all(axis=0)
-    if not known.any():
-        lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]
-        raise MethodError(
-            f"The reference state at {begin:.1f} s has no valid reading of {', '.join(lost) or 'all channels at once'}"
-            ". Choose another one with reference_time and reference_average."
-        )
-    return np.flatnonzero(known)
-
-
-def _frame_expansion(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> Array | None:
-    """Return how far each beam's origin has moved with the frame's temperature, (5, 3, instant), m."""
-    if not settings.compensate_frame or "frame_expansion" not in raw:
-        return None
-    if record.temperature is None or settings.frame_temperature not in _sensors(raw):
-        notes.append(
-            f"The frame's expansion is known but not its temperature (no sensor '{settings.frame_temperature}'): the "
-            "errors are not corrected for it."
-        )
-        return None
-    temperature = record.temperature[_sensors(raw).index(settings.frame_temperature)]
-    per_kelvin = np.asarray(raw["frame_expansion"].transpose("channel", "direction").values, np.float64)
-    change = temperature - temperature[np.isfinite(temperature)][0] if np.isfinite(temperature).any() else temperature
-    if np.isnan(change).any():
-        notes.append(
-            f"The frame's temperature is unknown in {int(np.isnan(change).sum())} means; the errors there are NaN."
-        )
-    return np.asarray(per_kelvin[:, :, None] * change)
-
-
-def _readings_of_shift(shift: Array, state: State, origin: Array, direction: Array, levels: Array) -> Array:
-    """Return what a shift of the origins (5, 3, instant) does to the readings of an unmoved bar, as a correction."""
-    A = np.column_stack([state.q[:, :2], np.full(len(state.q), levels[0])])
-    S = origin[:, None] + direction[:, None] * state.distance[:, :, None]
-    w = S - A
-    n = w - np.einsum("cti,ti->ct", w, state.a)[..., None] * state.a
-    n[4] = state.a
-    along = np.einsum("cti,ci->ct", n, direction)
-    return np.asarray(np.einsum("cti,cit->ct", n, shift) / along)
-
-
-def _noise(raw: xr.Dataset, averages: Averages, mean: Array, settings: Settings, notes: list[str]) -> Array:
-    """Return the standard uncertainty (5, instant) of the means, m: as stated, or as seen where that is more."""
-    stated = float(raw["distance_noise"])
-    sigma = stated / np.sqrt(np.maximum(averages.count, 1))
-    if settings.noise == "stated":
-        return np.asarray(sigma)
-    for i, channel in enumerate(CHANNELS):
-        # Second differences take out the drift itself; the median takes out steps.
-        second = np.diff(mean[i] / sigma[i], 2) / np.sqrt(6.0)
-        second = second[np.isfinite(second)]
-        if second.size < _ENOUGH:
-            continue
-        seen = float(np.median(np.abs(second)) / 0.674490)
-        # Spread of a median-based deviation of overlapping second differences, from simulation: 1.7 / sqrt(2 n).
-        if seen > 1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size):
-            notes.append(
-                f"{channel}: the means scatter {seen:.2f} times as much as the stated noise of {stated * 1e6:.3g} um a "
-                "sample explains; the uncertainty is raised to what is seen."
-            )
-            sigma[i] *= seen
-    return np.asarray(sigma)
-
-
-def _within_reference(independent: Array, influence: Array, reference: NDArray[np.int64]) -> None:
-    """Errors inside the reference state share their noise with it: what is left of it is 1 - 1/m of each mean."""
-    independent[reference] *= 1.0 - 1.0 / reference.size
-    influence[:5, reference] = 0.0
-
-
-def _sensors(raw: xr.Dataset) -> list[str]:
-    return (
-        [str(name) for name in raw["sensor"].values]
-        if "sensor" in raw.coords
-        else [f"T{k + 1}" for k in range(raw.sizes.get("sensor", 0))]
-    )
 
 
 def _extras(

@@ -59,9 +59,13 @@ class Settings(PluginSettings):
     min_valid: float = Field(
         default=0.5, ge=0, le=1, description="share of valid samples below which a mean is unknown"
     )
-    reference_time: Time = Field(
-        default=0.0, ge=0, description="beginning of the reference state, from the record's start"
+    reference_time: Time | None = Field(
+        default=None,
+        ge=0,
+        description="beginning of the reference state, from the record's start; default the first mean, after spin_up "
+        "where the record begins with the start of the spindle",
     )
+    spin_up: Time = Field(default=1.0, ge=0, description="time in which the spindle comes to its speed")
     reference_average: Time | None = Field(
         default=None, gt=0, description="length of the reference state; default one mean"
     )
@@ -86,6 +90,9 @@ class Settings(PluginSettings):
         default=True, description="correct the beams for the frame's expansion, where it is known"
     )
     frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
+    frame_smoothing: Time = Field(
+        default=60.0, ge=0, description="length of the moving mean of the frame's temperature, against its resolution"
+    )
     frame_expansion_uncertainty: float = Field(
         default=0.1, ge=0, description="relative standard uncertainty of the frame's expansion"
     )

@@ -81,7 +81,13 @@ def _cross(v: Array, m: Array) -> Array:
 
 
 def propagate(
-    now: State, then: State, frame: Frame, sigma: Array, sources: Sequence[Source], scaled: Sequence[tuple[str, Array]]
+    now: State,
+    then: State,
+    frame: Frame,
+    sigma: Array,
+    sources: Sequence[Source],
+    scaled: Sequence[Array],
+    own: Sequence[Array] = (),
 ) -> tuple[Array, Array]:
     """Return what the readings' own noise and the shared sources do to the errors.
 
@@ -95,13 +101,15 @@ def propagate(
         Standard uncertainty of the mean readings, m.
     sources : sequence of Source
         Shared by all instants.
-    scaled : sequence of (name, ndarray (5, instant))
-        Shared sources whose effect is a known change of the readings, m, in each instant.
+    scaled : sequence of ndarray (5, instant)
+        Effects of further shared sources as changes of the readings, m, in each instant.
+    own : sequence of ndarray (5, instant)
+        Effects of sources that are drawn anew in each instant and act on all readings together, m.
 
     Returns
     -------
     independent : ndarray (instant, 6, 6)
-        Covariance from the readings' own noise.
+        Covariance from the readings' own noise and from ``own``.
     influence : ndarray (source, instant, 6)
         Of ``sources``, then of ``scaled``.
     """
@@ -122,7 +130,10 @@ def propagate(
         dw = _cross(a0, da[:, :, :5])
         J = np.concatenate([dE[:, :, :5] + _cross(-arm, dw), dw], axis=1)
         independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J)
-        for k, (_, change) in enumerate(scaled):
+        for change in own:
+            effect = np.einsum("tip,pt->ti", J, change[:, part])
+            independent[part] += effect[:, :, None] * effect[:, None, :]
+        for k, change in enumerate(scaled):
             influence[len(sources) + k, part] = np.einsum("tip,pt->ti", J, change[:, part])
         # What is shared acts on the instant and on the reference state.
         da, dE = da @ changes_now, dE @ changes_now

@@ -1,0 +1,135 @@
+"""A drift record brought down to means, and what its means are worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.averaging import Averager, Averages, join, slices
+from errormotion.methods.spindle_drift.uncertainty import CHANNELS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.spindle_drift.settings import Settings
+
+    Array = NDArray[np.float64]
+
+# Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
+_CHANCE = 3.3
+_ENOUGH = 30
+
+
+@dataclass(frozen=True)
+class Record:
+    """Means on one clock; ``temperature`` (sensor, window) degC and ``spindle_speed`` (window,) 1/min where known."""
+
+    averages: Averages
+    temperature: Array | None
+    spindle_speed: Array | None
+
+
+def average_record(raw: xr.Dataset, settings: Settings) -> Record:
+    """Bring a record down to means in one pass and constant memory; ``raw`` has its channels in order."""
+    slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
+    averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
+    slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
+    parts: list[Averages] = []
+    slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
+    for time, part in slices(raw):
+        if not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
+            raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
+        parts.append(averager.update(time, part["distance"].transpose("channel", "time").values))
+        for name in slow:
+            values = part[name].transpose(..., "time").values.astype(np.float64)
+            slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
+    parts.append(averager.finish())
+    means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
+    speed = means.get("spindle_speed")
+    if speed is None and "spindle_speed" in raw:
+        speed = np.broadcast_to(np.float64(raw["spindle_speed"].values), (1, join(parts).time.size))
+    return Record(join(parts), means.get("temperature"), None if speed is None else speed[0])
+
+
+def count_unknown(averages: Averages, notes: list[str]) -> None:
+    """Note every channel that has unknown means; refuse one that has no other."""
+    for channel, row, counts in zip(CHANNELS, averages.mean, averages.count, strict=True):
+        unknown = np.isnan(row)
+        if unknown.all():
+            raise MethodError(
+                f"Channel {channel} has no valid reading in the whole record: check the sensor and its cable."
+            )
+        if unknown.any():
+            first, last = averages.time[unknown][[0, -1]]
+            notes.append(
+                f"{channel}: {unknown.sum()} of {row.size} means are unknown, between {first:.1f} s and {last:.1f} s "
+                f"({averages.expected.sum() - counts.sum()} samples lost in all); the errors there are NaN."
+            )
+
+
+def spin_up(record: Record, settings: Settings) -> float:
+    """Return how long after its start a record is still coming to speed, s: its run-out is not averaged away there."""
+    speed, time = record.spindle_speed, record.averages.time
+    starts_turning = speed is not None and bool(np.nan_to_num(speed[0]) > 0)
+    samples = record.averages.expected[0] > 1
+    return settings.spin_up if samples and starts_turning and np.ptp(time) > settings.spin_up else 0.0
+
+
+def reference_windows(averages: Averages, mean: Array, settings: Settings, spinning_up: float) -> NDArray[np.int64]:
+    """Return the windows of the reference state; MethodError where there is none with all five readings."""
+    wanted = spinning_up if settings.reference_time is None else settings.reference_time
+    begin = averages.time[0] + wanted
+    length = settings.reference_average or 0.0
+    inside = (averages.time >= begin - 1e-6) & (averages.time < begin + max(length - 0.5 * settings.average, 1e-6))
+    if not inside.any():
+        later = np.flatnonzero(averages.time >= begin - 1e-6)
+        if later.size == 0:
+            raise MethodError(
+                f"The record ends at {averages.time[-1]:.1f} s; the reference state was to begin at {wanted:g} s "
+                "(reference_time)."
+            )
+        inside[later[0]] = True
+    known = inside & np.isfinite(mean).all(axis=0)
+    if not known.any():
+        lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]
+        raise MethodError(
+            f"The reference state at {begin:.1f} s has no valid reading of {', '.join(lost) or 'all channels at once'}"
+            ". Choose another one with reference_time and reference_average."
+        )
+    return np.flatnonzero(known)
+
+
+def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[str]) -> Array:
+    """Return the standard uncertainty (5, instant) of the means, m: as stated, or as seen where that is more."""
+    stated = float(raw["distance_noise"])
+    sigma = stated / np.sqrt(np.maximum(averages.count, 1))
+    if settings.noise == "stated":
+        return np.asarray(sigma)
+    for i, channel in enumerate(CHANNELS):
+        # Second differences take out the drift itself; the median takes out steps.
+        second = np.diff(averages.mean[i] / sigma[i], 2) / np.sqrt(6.0)
+        second = second[np.isfinite(second)]
+        if second.size < _ENOUGH:
+            continue
+        seen = float(np.median(np.abs(second)) / 0.674490)
+        # Spread of a median-based deviation of overlapping second differences, from simulation: 1.7 / sqrt(2 n).
+        if seen > 1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size):
+            notes.append(
+                f"{channel}: the means scatter {seen:.2f} times as much as the stated noise of {stated * 1e6:.3g} um a "
+                "sample explains; the uncertainty is raised to what is seen."
+            )
+            sigma[i] *= seen
+    return np.asarray(sigma)
+
+
+def sensors(raw: xr.Dataset) -> list[str]:
+    """Return the names of the temperature sensors."""
+    return (
+        [str(name) for name in raw["sensor"].values]
+        if "sensor" in raw.coords
+        else [f"T{k + 1}" for k in range(raw.sizes.get("sensor", 0))]
+    )
