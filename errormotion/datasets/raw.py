@@ -61,8 +61,8 @@ def _row_violations(ds: xr.Dataset, row: Row) -> Iterator[str]:
         if row.name == "time" and row.dims == ("time",) and "sample_rate" in ds.attrs:
             yield from _rate_violations(ds)
         elif row.required:
-            unit = f", {row.unit}" if row.unit else ""
-            yield f"{row.name}({', '.join(row.dims)}): missing; expected {row.meaning}{unit}"
+            unit = f" in {row.unit}" if row.unit else ""
+            yield f"{row.name}({', '.join(row.dims)}): missing; expected{unit}: {row.meaning}"
         return
     variable = ds.variables[row.name]
     if set(variable.dims) != set(row.dims):

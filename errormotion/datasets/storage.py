@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 import shutil
@@ -130,10 +131,9 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
 
 def storable(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset as it goes to disk: texts of free length, no encoding of its former file, no derivable times."""
-    if "sample_rate" in ds.attrs and isinstance(ds.xindexes.get("time"), RangeIndex):
-        index = ds.xindexes["time"]
-        start = float(getattr(index, "start"))  # noqa: B009 - mypy does not follow the isinstance into .get()
-        ds = ds.drop_vars("time").assign_attrs(time_start=start)
+    index = ds.xindexes.get("time")
+    if isinstance(index, RangeIndex) and math.isclose(index.step * ds.attrs.get("sample_rate", 0.0), 1.0):
+        ds = ds.drop_vars("time").assign_attrs(time_start=float(index.start))
     ds = ds.drop_encoding()
     # Zarr v3 has no type for texts of fixed width; objects become its texts of free length.
     texts = {name: variable.astype(object) for name, variable in ds.variables.items() if variable.dtype.kind in "UT"}
@@ -298,7 +298,8 @@ def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
     rate = ds.attrs.get("sample_rate")
     if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:
         start, size = float(ds.attrs.get("time_start", 0.0)), ds.sizes["time"]
-        index = RangeIndex.linspace(start, start + size / rate, size, endpoint=False, dim="time")
+        # Half a step before the end: the number of times does not hang on rounding, and the step is 1 / rate exactly.
+        index = RangeIndex.arange(start, start + (size - 0.5) / rate, 1 / rate, dim="time")
         ds = ds.assign_coords(xr.Coordinates.from_xindex(index))
         ds["time"].attrs["units"] = "s"
     return ds

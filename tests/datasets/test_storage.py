@@ -1,0 +1,242 @@
+import errno
+import io
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from xarray.indexes import RangeIndex
+
+from errormotion import datasets
+from errormotion.datasets import load, save
+from errormotion.errors import DatasetError
+
+both = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@both
+def test_an_error_dataset_comes_back_identical(errors, tmp_path, suffix) -> None:
+    ds = errors(unseen=(5,))
+    back = load(save(ds, tmp_path / f"errors{suffix}"))
+    xr.testing.assert_identical(back, ds)
+    assert back["source"].dtype.kind == back["dof"].dtype.kind == "U"
+    assert datasets.violations(back) == []
+    assert names(tmp_path) == [f"errors{suffix}"]
+
+
+@both
+def test_a_raw_dataset_comes_back_equal_and_lazy(drift, tmp_path, suffix) -> None:
+    ds = drift()
+    with load(save(ds, tmp_path / f"raw{suffix}")) as back:
+        assert not back["distance"].variable._in_memory
+        assert float(back["distance"].sel(channel="Z", time=0.5)) == float(ds["distance"].sel(channel="Z", time=0.5))
+        xr.testing.assert_identical(back, ds)
+
+
+@both
+def test_what_was_loaded_can_be_saved_as_the_other_kind(drift, tmp_path, suffix) -> None:
+    other = {".nc": ".zarr", ".zarr": ".nc"}[suffix]
+    with load(save(drift(), tmp_path / f"a{suffix}")) as first, load(save(first, tmp_path / f"b{other}")) as second:
+        xr.testing.assert_identical(second, drift())
+
+
+@both
+def test_evenly_spaced_times_are_told_by_rate_and_start(drift, tmp_path, suffix) -> None:
+    ds = drift(n=40).drop_vars(["time", "temperature"]).assign_attrs(sample_rate=20e3, time_start=2.5)
+    with load(save(ds, tmp_path / f"raw{suffix}")) as back:
+        assert isinstance(back.xindexes["time"], RangeIndex)
+        np.testing.assert_allclose(back["time"], 2.5 + np.arange(40) / 20e3, rtol=1e-15)
+        assert back["time"].attrs == {"units": "s"}
+        assert datasets.violations(back) == []
+        later = back.isel(time=slice(10, 20))
+        with load(save(later, tmp_path / f"later{suffix}")) as part:
+            assert part.attrs["time_start"] == pytest.approx(2.5 + 10 / 20e3, rel=1e-15)
+            np.testing.assert_array_equal(part["time"], later["time"])
+        thinned = back.isel(time=slice(0, None, 2))  # no longer at the rate of the attribute
+        with load(save(thinned, tmp_path / f"thinned{suffix}")) as part:
+            np.testing.assert_array_equal(part["time"], thinned["time"])
+
+
+def test_the_times_of_a_huge_record_stay_a_rule(tmp_path) -> None:
+    n = 288_000_000
+    root = zarr.create_group(tmp_path / "raw.zarr", attributes={"sample_rate": 20e3})
+    root.create_array("distance", shape=(5, n), chunks=(5, 2**20), dtype="f4", dimension_names=("channel", "time"))
+    with load(tmp_path / "raw.zarr") as ds:
+        assert not ds["time"].variable._in_memory
+        assert float(ds["time"][-1]) == pytest.approx((n - 1) / 20e3, rel=1e-15)
+
+
+def test_long_stored_times_are_not_pulled_into_memory(drift, tmp_path) -> None:
+    n = 100_001
+    ds = drift(n=n).drop_vars(["temperature"])
+    with load(save(ds, tmp_path / "raw.nc")) as back:
+        assert "time" not in back.xindexes
+        assert not back["time"].variable._in_memory
+        assert datasets.violations(back) == []
+        assert not back["time"].variable._in_memory
+
+
+def test_metadata_in_the_root_counts_before_that_of_the_arrays(tmp_path) -> None:
+    root = zarr.create_group(tmp_path / "raw.zarr")
+    a = root.create_array("a", shape=(4,), chunks=(4,), dtype="f8", dimension_names=("time",))
+    with pytest.warns(zarr.errors.ZarrUserWarning, match="not part in the Zarr format 3"):
+        zarr.consolidate_metadata(tmp_path / "raw.zarr")
+    a.resize((9,))  # a writer that was cut off before it told the root
+    with load(tmp_path / "raw.zarr") as ds:
+        assert ds.sizes == {"time": 4}
+
+
+@both
+def test_nothing_is_overwritten_unless_asked(errors, tmp_path, suffix) -> None:
+    path = save(errors(seed=1), tmp_path / f"errors{suffix}")
+    with pytest.raises(DatasetError, match="is there already"):
+        save(errors(seed=2), path)
+    xr.testing.assert_identical(load(path), errors(seed=1))
+    save(errors(seed=2), path, overwrite=True)
+    xr.testing.assert_identical(load(path), errors(seed=2))
+    assert names(tmp_path) == [path.name]
+
+
+@both
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_leaves_nothing_behind_and_the_old_file_as_it_was(
+    errors, tmp_path, monkeypatch, suffix, code
+) -> None:
+    path = save(errors(seed=1), tmp_path / f"errors{suffix}")
+
+    def full(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", full)
+    for target in (path, tmp_path / f"new{suffix}"):
+        with pytest.raises(DatasetError, match=r"(full|quota).*Nothing was left behind"):
+            save(errors(seed=2), target, overwrite=True)
+    monkeypatch.undo()
+    assert names(tmp_path) == [path.name]
+    xr.testing.assert_identical(load(path), errors(seed=1))
+
+
+def test_a_limit_of_the_system_ends_in_a_message(errors, tmp_path) -> None:
+    resource = pytest.importorskip("resource", reason="limits of a process are a matter of Unix")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    big = errors(n=2000)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        for name in ("errors.nc", "errors.zarr"):
+            with pytest.raises(DatasetError, match=r"larger than allowed\. Nothing was left behind"):
+                save(big, tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert names(tmp_path) == []
+
+
+@both
+def test_an_interruption_leaves_nothing_behind(errors, tmp_path, monkeypatch, suffix) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        save(errors(), tmp_path / f"errors{suffix}")
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_cannot_be_put_in_place_leaves_the_old_one(errors, tmp_path, monkeypatch) -> None:
+    path = save(errors(seed=1), tmp_path / "errors.zarr")
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.suffix == ".part":
+            raise PermissionError(errno.EACCES, "no")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(DatasetError, match="permission denied"):
+        save(errors(seed=2), path, overwrite=True)
+    assert names(tmp_path) == [path.name]
+    xr.testing.assert_identical(load(path), errors(seed=1))
+
+
+def test_a_place_that_takes_no_file_is_told(errors, tmp_path) -> None:
+    with pytest.raises(DatasetError, match="there is no such folder"):
+        save(errors(), tmp_path / "none" / "errors.nc")
+    with pytest.raises(DatasetError, match=r"ends in \.nc .* or \.zarr"):
+        save(errors(), tmp_path / "errors.txt")
+
+
+def test_an_attribute_that_no_file_can_hold_is_named_before_writing(errors, tmp_path) -> None:
+    ds = errors().assign_attrs(operator=None)
+    ds["EX"].attrs["valid"] = True
+    with pytest.raises(DatasetError) as caught:
+        save(ds, tmp_path / "errors.nc")
+    assert "attribute 'operator'" in str(caught.value)
+    assert "EX: attribute 'valid'" in str(caught.value)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.0002, 0.5, 0.999])
+def test_a_truncated_file_is_told(drift, tmp_path, kept) -> None:
+    path = save(drift(), tmp_path / "raw.nc")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(kept * len(whole))])
+    with pytest.raises(DatasetError, match=r"(is empty|is truncated).* make it anew"):
+        load(path)
+
+
+def test_a_damaged_folder_is_told(errors, tmp_path) -> None:
+    path = save(errors(), tmp_path / "errors.zarr")
+    for broken in (path / "EX" / "zarr.json", path / "zarr.json"):
+        broken.write_text(broken.read_text()[:20])
+        with pytest.raises(DatasetError, match="is damaged"):
+            load(path)
+
+
+def test_a_cut_off_chunk_is_told(errors, tmp_path) -> None:
+    path = save(errors(), tmp_path / "errors.zarr")
+    (chunk,) = [file for file in (path / "covariance").rglob("*") if file.is_file() and file.name != "zarr.json"]
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(DatasetError, match="is damaged"):
+        load(path)
+
+
+def test_what_is_no_dataset_is_told(tmp_path) -> None:
+    (tmp_path / "log.csv").write_text("t;X1;X2\n")
+    with pytest.raises(DatasetError, match="errormotion import"):
+        load(tmp_path / "log.csv")
+    with pytest.raises(DatasetError, match="there is no such file"):
+        load(tmp_path / "none.nc")
+    with pytest.raises(DatasetError, match=r"folder without zarr\.json"):
+        load(tmp_path)
+    (tmp_path / "old.nc").write_bytes(b"CDF\x01" + bytes(100))
+    with pytest.raises(DatasetError, match="nccopy"):
+        load(tmp_path / "old.nc")
+
+
+def test_a_folder_around_a_dataset_points_to_it(drift, tmp_path) -> None:
+    save(drift(), tmp_path / "raw.zarr")
+    with pytest.raises(DatasetError, match=r"Did you mean .*raw\.zarr\?"):
+        load(tmp_path)
+
+
+def test_a_file_that_may_not_be_read_is_told(errors, tmp_path, monkeypatch) -> None:
+    path = save(errors(), tmp_path / "errors.nc")
+
+    def denied(*_: object, **__: object) -> io.BytesIO:
+        raise PermissionError(errno.EACCES, "no")
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(DatasetError, match="cannot be read: permission denied"):
+        load(path)
+
+
+def test_a_run_folder_may_move(errors, tmp_path) -> None:
+    path = save(errors(), tmp_path / "errors.zarr")
+    moved = shutil.move(path, tmp_path / "elsewhere.zarr")
+    xr.testing.assert_identical(load(moved), errors())
