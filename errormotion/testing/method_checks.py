@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Hashable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
@@ -115,8 +116,11 @@ def frame_invariance(subject: MethodSubject) -> str:
     rotation, shift = (np.array(part) for part in subject.motion)
     pose = RigidTransform.from_components(shift, Rotation.from_rotvec(rotation))
     raw, _ = subject.make(0)
-    here, there = subject.identify(raw), subject.identify(moved_raw(raw, subject.raw_vectors, pose))
-    back = pose.apply(functional_point(here)) - functional_point(there)
+    here, there = (
+        subject.identify(raw),
+        _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose)),
+    )
+    back = np.round(pose.apply(functional_point(here)) - functional_point(there), 12)  # else NaN times rounding is NaN
     turned = twists.adjoint(rotation=pose.rotation)
     expected, spread = twists.transform(values(here), turned), twists.transform_covariance(covariance(here), turned)
     carried = twists.adjoint(shift=back)
@@ -127,6 +131,14 @@ def frame_invariance(subject: MethodSubject) -> str:
         twists.transform_covariance(covariance(there), carried),
     )
     return f"{np.isfinite(expected).sum()} values alike"
+
+
+def _moved_subject(subject: MethodSubject, pose: RigidTransform) -> MethodSubject:
+    moved = dict(subject.settings)
+    for name, kind in subject.setting_vectors.items():
+        vector = np.asarray(moved[name], dtype=float)
+        moved[name] = tuple(pose.apply(vector) if kind == "point" else pose.rotation.apply(vector))
+    return replace(subject, settings=moved)
 
 
 def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset:
@@ -165,19 +177,28 @@ def number_format(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def layout(subject: MethodSubject) -> str:
-    """The order of dimensions, and of labels along them, does not matter."""
+    """The order of dimensions does not matter, nor that of labels along them, unless a typed error refuses it."""
     raw, _ = subject.make(0)
+    straight = subject.identify(raw)
     turned = raw.copy()
     for name in map(str, raw.data_vars):
         turned[name] = raw[name].transpose(*reversed(raw[name].dims))
-    labelled = [
-        str(dim) for dim in raw.dims if dim in raw.coords and raw[dim].dtype.kind in "UOT" and dim != "direction"
+    verdicts = [_same_or_refused(subject, straight, turned, "turned dimensions")]
+    verdicts += [
+        _same_or_refused(subject, straight, raw.isel({dim: slice(None, None, -1)}), f"reversed {dim}")
+        for dim in _labelled(raw, raw.dims)
     ]
-    turned = turned.isel({dim: slice(None, None, -1) for dim in labelled})
-    one, other = subject.identify(raw), subject.identify(turned)
+    return "; ".join(verdicts)
+
+
+def _same_or_refused(subject: MethodSubject, one: xr.Dataset, raw: xr.Dataset, what: str) -> str:
+    try:
+        other = subject.identify(raw)
+    except ErrormotionError:
+        return f"{what}: refused"
     other = other.sel({dim: one[dim] for dim in _labelled(one, one["EX"].dims)})
-    _require_close(values(one), covariance(one), values(other), covariance(other))
-    return f"dimensions turned; labels of {', '.join(labelled) or 'no dimension'} reversed"
+    _require_close(values(one), covariance(one), values(other), covariance(other), what=what)
+    return f"{what}: the same"
 
 
 @METHOD_CHECKS.add(limit=60.0)
@@ -302,9 +323,9 @@ def _require_close(
     require(bool(known.any()), "nothing to compare: no freedom is known")
     u = np.sqrt(np.einsum("pii->pi", spread))
     u_other = np.sqrt(np.einsum("pii->pi", other_spread))
-    scale = np.nanmax(u, axis=0, keepdims=True)
+    scale = np.max(np.nan_to_num(u), axis=0, keepdims=True)
     for what_differs, difference in {"value": np.abs(one - other), "standard uncertainty": np.abs(u - u_other)}.items():
-        ratio = np.where(known, difference / np.where(u > 0, u, scale), 0.0)
+        ratio = np.where(known, difference, 0.0) / np.where(u > 0, u, np.where(scale > 0, scale, 1.0))
         place, freedom = np.unravel_index(np.argmax(ratio), ratio.shape)
         require(
             ratio.max() <= fraction,

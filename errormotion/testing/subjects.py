@@ -150,6 +150,8 @@ class MethodSubject:
         raw data hold no vectors.
     settings : mapping
         What the method's ``Settings`` are made from.
+    setting_vectors : mapping of str to str
+        Which of these settings are points and directions in the frame of the raw data.
     name : str
         Tells several subjects of one plugin apart.
     optional : tuple of str
@@ -167,6 +169,7 @@ class MethodSubject:
     make: Callable[[int], tuple[xr.Dataset, xr.Dataset]]
     raw_vectors: Mapping[str, Vector]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    setting_vectors: Mapping[str, Literal["point", "direction"]] = field(default_factory=dict)
     name: str = ""
     optional: tuple[str, ...] = ()
     measured: tuple[str, ...] = ()

@@ -1,0 +1,25 @@
+"""Every instrument that the registry finds in this distribution passes the kit."""
+
+import pytest
+
+from errormotion import plugins
+from errormotion.testing.kit import run_check
+from errormotion.testing.run import checks_for, subjects_of
+
+OURS = [plugin.id for plugin in plugins.available("instruments") if plugin.distribution.startswith("errormotion ")]
+SUBJECTS = [subject for plugin_id in OURS for subject in subjects_of("instruments", plugin_id)]
+CASES = [
+    pytest.param(subject, check, id="-".join(filter(None, [subject.plugin.info.id, subject.name, check.name])))
+    for subject in SUBJECTS
+    for check in checks_for(subject)
+]
+
+
+def test_the_optoncdt_is_among_them():
+    assert "optoncdt" in OURS
+
+
+@pytest.mark.parametrize(("subject", "check"), CASES)
+def test_passes(subject, check):
+    result = run_check(check, subject)
+    assert result.ok, f"{check.claim}\n{result.message}\n{result.trace}"
