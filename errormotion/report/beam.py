@@ -284,8 +284,10 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
         rows,
     )
 
+    heights = [0.8] * len(names)
+
     def paint(figure: Canvas) -> None:
-        panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        panels = canvas.stack(figure, heights)
         for axes, name, rows_of in zip(panels, names, values, strict=True):
             for j, row in enumerate(rows_of):
                 axes.plot(
@@ -325,6 +327,6 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
     worst = ", ".join(
         f"{name} {fixed(math.sqrt(finite(np.mean, values[i] ** 2)), 3)} µm" for i, name in enumerate(names)
     )
-    svg = canvas.draw(paint, f"{key}-residual", 0.7 + 1.05 * len(names))
+    svg = canvas.draw(paint, f"{key}-residual", canvas.stack_height(heights))
     alt = f"Residuals over the steps of the sphere; rms: {worst}."
     return [table, Figure(svg, "Residuals by beam and profile.", alt)]

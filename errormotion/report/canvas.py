@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from xml.etree import ElementTree
@@ -29,6 +29,7 @@ BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 DASHES: tuple[tuple[float, ...] | None, ...] = (None, (5, 2), (1.5, 1.5), (6, 2, 1.5, 2))
 WIDTH = 6.9  # inch: the text width of an A4 page
+LEFT, RIGHT, TOP, BOTTOM, GAP = 0.52, 0.36, 0.24, 0.4, 0.26  # inch: room around and between panels
 _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "errormotion",
@@ -71,11 +72,33 @@ def style() -> Iterator[None]:
 def draw(paint: Callable[[Figure], None], key: str, height: float, width: float = WIDTH) -> Markup:
     """Return the SVG of a figure that ``paint`` fills; ``key`` keeps its identifiers apart from other figures'."""
     with style():
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height))
         paint(figure)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return inline(buffer.getvalue(), key)
+
+
+def stack(figure: Figure, heights: Sequence[float], right: float = RIGHT) -> list[Axes]:
+    """Return panels above one another with one time axis, at fixed places: figures on a page line up.
+
+    ``heights`` are those of the panels in inches; the figure is `stack_height` high.
+    """
+    wide, high = figure.get_size_inches()
+    made: list[Axes] = []
+    top = high - TOP
+    for height in heights:
+        place = (LEFT / wide, (top - height) / high, (wide - LEFT - right) / wide, height / high)
+        made.append(figure.add_axes(place, sharex=made[0] if made else None))
+        top -= height + GAP
+    for axes in made[:-1]:
+        axes.tick_params(labelbottom=False)
+    return made
+
+
+def stack_height(heights: Sequence[float]) -> float:
+    """Return the height of a figure with these panels, inches."""
+    return TOP + sum(heights) + GAP * (len(heights) - 1) + BOTTOM
 
 
 def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.ndarray, np.ndarray]:

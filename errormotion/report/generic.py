@@ -133,6 +133,7 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
 
     def paint(figure: Canvas) -> None:
         panels = figure.subplots(3, 2, sharex=True)
+        figure.subplots_adjust(left=0.075, right=0.985, top=0.95, bottom=0.09, wspace=0.19, hspace=0.3)
         for i, freedom in enumerate(budget.FREEDOMS):
             axes: Axes = panels[i % 3, i // 3]
             unit, size = unit_at(i)

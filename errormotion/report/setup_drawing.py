@@ -106,16 +106,21 @@ def figure(errors: xr.Dataset, key: str) -> Figure | None:
     views = [(side[0], setup.along), (side[1], setup.along), (side[0], side[1])]
     limits = np.array([_limits(setup, i) for i in range(3)])
     spans = np.ptp(limits, axis=1)
-    wide = [spans[a] for a, _ in views]
+    room = canvas.LEFT * 3 + 0.1
+    scale = min((canvas.WIDTH - room) / sum(spans[a] for a, _ in views), 5.5 / max(spans[b] for _, b in views))
+    high = canvas.stack_height([scale * max(spans[b] for _, b in views)])
 
     def paint(drawing: Canvas) -> None:
-        panels = drawing.subplots(1, 3, width_ratios=wide)
-        for axes, view in zip(panels, views, strict=True):
+        left = canvas.LEFT
+        for view in views:
+            size = scale * spans[list(view)] / (canvas.WIDTH, high)
+            axes = drawing.add_axes((left / canvas.WIDTH, canvas.BOTTOM / high, *size))
+            left += scale * spans[view[0]] + canvas.LEFT
             _view(axes, setup, view, moved, factor)
             axes.set_xlim(*(1e3 * limits[view[0]]))
             axes.set_ylim(*(1e3 * limits[view[1]]))
 
-    svg = canvas.draw(paint, key, min(0.6 + (canvas.WIDTH - 1.4) / sum(wide) * max(spans[b] for _, b in views), 6.5))
+    svg = canvas.draw(paint, key, high)
     drift = (
         f" Dashed: the bar at the end of running, its displacement drawn {integer(factor)} times larger."
         if factor

@@ -33,7 +33,7 @@ def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | No
     found = [line for line in found if np.isfinite(line.values).any()]
     if not found:
         return None
-    svg = _stack(errors, [found], ["µm"], done, key, titles=["Displacement"], height=1.9)
+    svg = _stack(errors, [found], ["µm"], done, key, titles=["Displacement"], height=1.6)
     caption = f"All displacements in one scale.{_events_in_words(done)}"
     return Figure(svg, caption, _in_words("All displacements over time", [found], minutes_of(errors)))
 
@@ -61,7 +61,7 @@ def tilts(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
     rows = [[found["A"], found["B"]]]
     if not any(np.isfinite(curve.values).any() for curve in rows[0]):
         return None
-    svg = _stack(errors, rows, ["arcsec"], done, key, height=2.0, titles=["Tilt about X (A) and about Y (B)"])
+    svg = _stack(errors, rows, ["arcsec"], done, key, height=1.5, titles=["Tilt about X (A) and about Y (B)"])
     caption = (
         "Tilt of the spindle axis about X (A, inclination in the YZ plane) and about Y (B, inclination in the XZ "
         "plane), right-handed. Bands: expanded uncertainty, k = 2."
@@ -80,9 +80,10 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
     if not known:
         return None
     time = minutes_of(errors)
+    right = min(0.5 + 0.065 * max(len(names[i]) for i in known), 0.4 * canvas.WIDTH)
 
     def paint(figure: Canvas) -> None:
-        axes = figure.subplots()
+        axes = canvas.stack(figure, [2.0], right)[0]
         for place, i in enumerate(known):
             colour = canvas.COLOURS[place % len(canvas.COLOURS)]
             dash = DASHES[place // len(canvas.COLOURS) % len(DASHES)]
@@ -101,7 +102,7 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
     missing = [names[i] for i in range(len(names)) if i not in known]
     note = f" No valid reading: {', '.join(missing)}." if missing else ""
     return Figure(
-        canvas.draw(paint, key, 2.5),
+        canvas.draw(paint, key, canvas.stack_height([2.0])),
         f"Temperatures during the test.{note}",
         f"Temperatures over time: {words}.",
     )
@@ -118,10 +119,10 @@ def channels(errors: xr.Dataset, name: str, title: str, caption: str, key: str) 
     names = [str(label) for label in errors["channel"].values]
     if not np.isfinite(values).any():
         return None
-    time = minutes_of(errors)
+    time, heights = minutes_of(errors), [0.42] * len(names)
 
     def paint(figure: Canvas) -> None:
-        panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        panels = canvas.stack(figure, heights)
         for axes, label, row in zip(panels, names, values, strict=True):
             canvas.curve(axes, time, row, colour=LOOK.get(label, (BLUE, None))[0], width=0.7)
             axes.set_ylabel("µm")
@@ -147,7 +148,7 @@ def channels(errors: xr.Dataset, name: str, title: str, caption: str, key: str) 
         for label, row in zip(names, values, strict=True)
         if np.isfinite(row).any()
     )
-    return Figure(canvas.draw(paint, key, 0.55 + 0.62 * len(names)), caption, f"{title} over time: {spans}.")
+    return Figure(canvas.draw(paint, key, canvas.stack_height(heights)), caption, f"{title} over time: {spans}.")
 
 
 def _stack(
@@ -158,15 +159,15 @@ def _stack(
     key: str,
     *,
     titles: list[str],
-    height: float = 1.75,
+    height: float = 1.4,
     speed: bool = False,
 ) -> Markup:
     time = minutes_of(errors)
     turning = running(errors) if speed else None
-    heights = [1.0] * len(rows) + ([0.22] if turning is not None else [])
+    heights = [height] * len(rows) + ([0.24] if turning is not None else [])
 
     def paint(figure: Canvas) -> None:
-        panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        panels = canvas.stack(figure, heights)
         ends: list[list[tuple[float, str, str]]] = []
         for axes, row, label, title in zip(panels, rows, labels, titles, strict=False):
             ends.append([])
@@ -185,11 +186,10 @@ def _stack(
         _time_axis(panels[-1], time)
         for i, axes in enumerate(panels[: len(rows)]):
             _mark_events(axes, done, named=i == 0)
-        figure.draw_without_rendering()
         for axes, row_ends in zip(panels, ends, strict=False):
             canvas.label_ends(axes, row_ends)
 
-    return canvas.draw(paint, key, height * len(rows) + 0.45 + (0.35 if turning is not None else 0))
+    return canvas.draw(paint, key, canvas.stack_height(heights))
 
 
 def _speed_strip(axes: Axes, time: np.ndarray, speed: np.ndarray) -> None:

@@ -53,7 +53,7 @@ def settings_of_a_warm_up():
 
 
 def drift_dataset(
-    n=2400, *, minutes=104.0, machine="C-frame 610", instruments=INSTRUMENTS, temperature=True, speed=True
+    n=1200, *, minutes=104.0, machine="C-frame 610", instruments=INSTRUMENTS, temperature=True, speed=True
 ):
     """A spindle's warm-up: (dataset), compensation off at 101 and 102 min, spindle off for the last minute."""
     rng = np.random.default_rng(1)
