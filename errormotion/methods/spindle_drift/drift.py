@@ -53,11 +53,11 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
-    raw = raw.sel(channel=list(CHANNELS))
+    record = average_record(raw, settings)
+    measured, raw = raw, raw.drop_vars("distance").sel(channel=list(CHANNELS))
     levels = np.asarray(raw["level"].values, np.float64)
     radius = float(raw["bar_radius"])
     origin, direction, beam_covariance, beam_group = _beams(raw, settings, notes)
-    record = average_record(raw, settings)
     averages = record.averages
     mean = averages.mean.copy()
     count_unknown(averages, notes)
@@ -153,7 +153,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         method=method,
         method_version=version,
         provenance=provenance.make(
-            settings, raw, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]
+            settings, measured, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]
         ),
         influence=influence,
         sources=names,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -34,8 +34,10 @@ class Record:
 
 
 def average_record(raw: xr.Dataset, settings: Settings) -> Record:
-    """Bring a record down to means in one pass and constant memory; ``raw`` has its channels in order."""
+    """Bring a record down to means in one pass and constant memory."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
+    # Put in order after reading: a lazy selection would read the store sample by sample.
+    order = [list(raw["channel"].values).index(name) for name in CHANNELS]
     averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
     slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
@@ -43,9 +45,10 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     for time, part in slices(raw):
         if not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
-        parts.append(averager.update(time, part["distance"].transpose("channel", "time").values))
+        readings = _with_time_last(part["distance"])
+        parts.append(averager.update(time, readings if order == [0, 1, 2, 3, 4] else readings[order]))
         for name in slow:
-            values = part[name].transpose(..., "time").values.astype(np.float64)
+            values = _with_time_last(part[name]).astype(np.float64)
             slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
     parts.append(averager.finish())
     means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
@@ -53,6 +56,11 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     if speed is None and "spindle_speed" in raw:
         speed = np.broadcast_to(np.float64(raw["spindle_speed"].values), (1, join(parts).time.size))
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0])
+
+
+def _with_time_last(variable: xr.DataArray) -> NDArray[np.floating[Any]]:
+    """Return the values with time as the last axis; read first, since a lazy transposition reads sample by sample."""
+    return np.moveaxis(np.asarray(variable.values), variable.get_axis_num("time"), -1)
 
 
 def count_unknown(averages: Averages, notes: list[str]) -> None:
