@@ -159,6 +159,7 @@ class Reader:
         """
         with self._change:
             self._text, self._reply, self._listening, self._final = b"", None, True, final
+            self._change.notify_all()
         self._transport.write(request)
         with self._change:
             self._change.wait_for(lambda: self._reply is not None or self._error is not None, timeout)
@@ -208,7 +209,7 @@ class Reader:
                 return
             if self._queued >= self._limit:
                 if self._transport.holds_back:
-                    self._change.wait_for(lambda: self._queued < self._limit or self._draining or self._ended)
+                    self._change.wait_for(self._may_go_on)
                     if self._draining:
                         return
                 else:
@@ -217,6 +218,10 @@ class Reader:
             self._queue.append(_Entry(chunk, size, now))
             self._queued += size
             self._change.notify_all()
+
+    def _may_go_on(self) -> bool:
+        """Whether the thread may take more: there is room, or an answer is awaited that comes behind the data."""
+        return self._queued < self._limit or self._listening or self._draining or self._ended
 
     def _accept_text(self, text: bytes) -> None:
         if not self._listening:

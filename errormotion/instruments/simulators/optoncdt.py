@@ -41,7 +41,9 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._sync = "NONE"
         self._stream: SensorStream | None = None
         self._starting = False
+        self._mute = False
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
+        self._mute = self.fault.from_the_start
         self._model = address.params.get("model", "ILD2300")
         own_range = self.world.machine.frame.range * 1e3 if self._model == "ILD2300" else 10.0
         self._range = address.number("range", own_range) * 1e-3
@@ -121,6 +123,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return ""
 
     def _stop(self) -> None:
+        self._silent()  # a sensor that fell silent does not speak again when it is told to stop
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.ended = True
@@ -134,8 +137,9 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._starting = False
 
     def _silent(self) -> bool:
-        begun = self._stream is not None and self._stream.sent >= self.fault.at
-        return self.fault.from_the_start or begun
+        stream = self._stream
+        self._mute = self._mute or (stream is not None and stream.sent >= self.fault.at)
+        return self._mute
 
 
 class SensorStream:

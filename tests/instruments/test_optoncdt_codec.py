@@ -1,0 +1,264 @@
+"""Bytes of an optoNCDT to values and back: published vectors, any split, any garbage."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.point_lds.optoncdt import codec, kernels
+from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
+
+ALL_CODES = sorted(codec.ERROR_CODES)
+compiled = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def wire(raws: list[int], first: int = 0, counter: bool = True) -> bytes:
+    """What the sensor sends, by the plain codec."""
+    data = b""
+    for number, raw in enumerate(raws, first):
+        data += codec.encode_value(raw)
+        if counter:
+            data += codec.encode_value(number & 0x3FFFF, first=False)
+    return data
+
+
+def decode(pieces: list[bytes], counter: bool = True, from_zero: bool = True) -> tuple[np.ndarray, np.ndarray, bytes]:
+    """Values (range 1, so that they are relative), reasons and text."""
+    decoder = StreamDecoder(1.0, counter=counter, from_zero=from_zero)
+    chunks = [decoder(piece) for piece in pieces]
+    return (
+        np.concatenate([chunk.values for chunk in chunks]),
+        np.concatenate([chunk.reasons for chunk in chunks]),
+        b"".join(chunk.text for chunk in chunks),
+    )
+
+
+def expected(raws: list[int]) -> list[float]:
+    return [codec.distance(raw, 1.0) if not codec.reason(raw) else np.nan for raw in raws]
+
+
+def test_published_vector() -> None:
+    assert codec.encode_value(32760) == bytes.fromhex("38 7F 87")
+    assert codec.decode_value(bytes.fromhex("38 7F 87")) == 32760
+
+
+@pytest.mark.parametrize(("raw", "millimetres"), [(0, -0.1), (32760, 5.0), (65520, 10.1)])
+def test_published_scale_at_10_mm(raw: int, millimetres: float) -> None:
+    assert codec.distance(raw, 10.0) == pytest.approx(millimetres, abs=1e-12)
+    assert codec.raw_value(millimetres, 10.0) == raw
+
+
+def test_measuring_range_ends_where_it_is_published() -> None:
+    assert [codec.reason(raw) for raw in (642, 643, 64876, 64877)] == ["below range", "", "", "above range"]
+    step = 1.02 / 65520  # the published ends are whole numbers within two steps of 0 and 1
+    assert codec.distance(643, 1.0) == pytest.approx(0, abs=2 * step)
+    assert codec.distance(64876, 1.0) == pytest.approx(1, abs=2 * step)
+
+
+@pytest.mark.parametrize("code", ALL_CODES)
+def test_each_error_code_has_a_reason_of_its_own(code: int) -> None:
+    values, reasons, _ = decode([wire([code])])
+    assert np.isnan(values).all()
+    assert codec.REASONS[reasons[0]] == codec.ERROR_CODES[code]
+    assert list(codec.ERROR_CODES.values()).count(codec.ERROR_CODES[code]) == 1
+
+
+def test_the_error_codes_are_the_published_ones() -> None:
+    assert list(range(262073, 262083)) == ALL_CODES
+
+
+@pytest.mark.parametrize(
+    ("raw", "reason"), [(0, "below range"), (65535, "above range"), (65536, "unknown code"), (262083, "unknown code")]
+)
+def test_what_is_no_distance_says_why(raw: int, reason: str) -> None:
+    assert codec.reason(raw) == reason
+    _, reasons, _ = decode([wire([raw])])
+    assert codec.REASONS[reasons[0]] == reason
+
+
+def test_a_value_has_18_bits_and_right_tags() -> None:
+    for raw in (-1, 1 << 18):
+        with pytest.raises(ProtocolError, match="18 bits"):
+            codec.encode_value(raw)
+    for triple in (b"\x40\x7f\x87", b"\x38\x3f\x87", b"\x38\x7f\x7f", b"\x38\x7f"):
+        with pytest.raises(ProtocolError, match="tagged"):
+            codec.decode_value(triple)
+
+
+@given(st.integers(0, (1 << 18) - 1), st.booleans())
+def test_every_value_comes_back(raw: int, first: bool) -> None:
+    triple = codec.encode_value(raw, first=first)
+    assert codec.decode_value(triple) == raw
+    assert (triple[2] >> 6) == (0b10 if first else 0b11)
+
+
+@given(st.lists(st.integers(0, (1 << 18) - 1)), st.integers(0, 1 << 20), st.booleans())
+@compiled
+def test_the_compiled_encoder_writes_the_same_bytes(raws: list[int], first: int, counter: bool) -> None:
+    data = np.empty(6 * len(raws), dtype=np.uint8)
+    used = kernels.encode(np.array(raws, dtype=np.int32), first, counter, data)
+    assert data[:used].tobytes() == wire(raws, first, counter)
+
+
+@given(st.lists(st.floats(-0.1, 1.1) | st.just(float("nan")), min_size=1))
+@compiled
+def test_quantising_is_off_by_half_a_step_at_most_and_codes_what_is_outside(distances: list[float]) -> None:
+    raws = np.empty(len(distances), dtype=np.int32)
+    kernels.quantise(np.array(distances), 1.0, raws)
+    for x, raw in zip(distances, raws, strict=True):
+        if codec.reason(int(raw)):
+            assert np.isnan(x) or not 1e-4 < x < 1 - 1e-4
+            assert int(raw) in (codec.NO_PEAK, codec.BEFORE_RANGE, codec.AFTER_RANGE)
+        else:
+            assert abs(codec.distance(int(raw), 1.0) - x) <= codec.SCALE / 2 + 1e-12
+
+
+@st.composite
+def splits(draw: st.DrawFn, data: bytes) -> list[bytes]:
+    cuts = sorted(draw(st.lists(st.integers(0, len(data)), max_size=12)))
+    return [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
+
+
+@given(st.data(), st.lists(st.integers(0, 65535) | st.sampled_from(ALL_CODES), max_size=40), st.booleans())
+@compiled
+def test_any_split_gives_the_same_samples(data: st.DataObject, raws: list[int], counter: bool) -> None:
+    values, reasons, text = decode(data.draw(splits(wire(raws, counter=counter))), counter)
+    np.testing.assert_allclose(values, expected(raws), rtol=1e-12, atol=1e-12)
+    assert [codec.REASONS[code] for code in reasons] == [codec.reason(raw) for raw in raws]
+    assert text == b""
+
+
+def test_one_byte_at_a_time_gives_the_same_samples() -> None:
+    raws = [1000, 64876, 262076, 0, 33333]
+    values, _, _ = decode([bytes([byte]) for byte in wire(raws)])
+    np.testing.assert_allclose(values, expected(raws), rtol=1e-12)
+
+
+TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=30).map(
+    lambda text: text.encode().replace(b"->", b"--") + b"\r\n->"
+)
+
+
+@given(st.data(), st.lists(st.integers(643, 64876), min_size=1, max_size=20), st.lists(TEXT, max_size=4))
+@compiled
+def test_answers_between_the_data_are_told_apart_and_harm_nothing(
+    data: st.DataObject, raws: list[int], answers: list[bytes]
+) -> None:
+    samples = [wire([raw], number) for number, raw in enumerate(raws)]
+    for answer in answers:
+        samples.insert(data.draw(st.integers(0, len(samples))), answer)
+    order = [part for part in samples if part.endswith(b"->")]
+    values, reasons, text = decode(data.draw(splits(b"".join(samples))))
+    np.testing.assert_allclose(values, expected(raws), rtol=1e-12)
+    assert not reasons.any()
+    assert text == b"".join(order)
+
+
+@given(
+    st.data(),
+    st.lists(st.integers(643, 64876), min_size=30, max_size=60),
+    st.lists(st.binary(min_size=1, max_size=5), min_size=1, max_size=4),
+)
+@compiled
+def test_garbage_makes_no_wrong_value_and_costs_few_samples(
+    data: st.DataObject, raws: list[int], garbage: list[bytes]
+) -> None:
+    """One stray burst spoils at most the sample it hits and two after it; what keeps a value has the right one."""
+    base = 123456  # no burst of 5 bytes is a sample with the right counter, which takes 6
+    stream = wire(raws, base)
+    places = sorted(data.draw(st.lists(st.integers(1, 29), min_size=len(garbage), max_size=len(garbage), unique=True)))
+    for place, burst in reversed(list(zip(places, garbage, strict=True))):
+        at = place * 6 + data.draw(st.integers(0, 5))
+        stream = stream[:at] + burst + stream[at:]
+    values, reasons, _ = decode(data.draw(splits(stream)), from_zero=False)
+    known = np.isfinite(values)
+    np.testing.assert_allclose(values[known], np.array(expected(raws))[: values.size][known], rtol=1e-12)
+    assert (~known).sum() <= 3 * len(garbage)
+    assert values.size >= len(raws) - 1
+    assert {codec.REASONS[code] for code in reasons} <= {"", "lost", "garbled"}
+
+
+@given(st.sets(st.integers(1, 98), max_size=97), st.integers(0, (1 << 18) - 1))
+@example({1, 2, 3, *range(5, 99, 2)}, (1 << 18) - 50)  # over the end of the counter's circle
+@compiled
+def test_missing_samples_are_lost_at_their_places(missing: set[int], base: int) -> None:
+    raws = [1000 + number for number in range(100)]
+    data = b"".join(wire([raw], base + number) for number, raw in enumerate(raws) if number not in missing)
+    values, reasons, _ = decode([data], from_zero=False)
+    truth = np.array(expected(raws))
+    truth[sorted(missing)] = np.nan
+    # A jump is believed when the sample behind it confirms it, so a jump at the very end stays open.
+    assert values.size == 100 or (values.size < 100 and 98 in missing)
+    np.testing.assert_allclose(values, truth[: values.size], rtol=1e-12)
+    assert set(np.flatnonzero(reasons)) == {number for number in missing if number < values.size}
+
+
+def test_a_counter_known_to_begin_at_zero_shows_what_was_lost_before() -> None:
+    values, reasons, _ = decode([wire([2000, 2001, 2002], first=4)], from_zero=True)
+    assert np.isnan(values[:4]).all()
+    np.testing.assert_allclose(values[4:], expected([2000, 2001, 2002]), rtol=1e-12)
+    assert [codec.REASONS[code] for code in reasons[:4]] == ["lost"] * 4
+
+
+def test_a_counter_goes_on_over_its_18_bits() -> None:
+    raws = np.full(300_000, 5000, dtype=np.int32)
+    data = np.empty(6 * raws.size, dtype=np.uint8)
+    kernels.encode(raws, 0, True, data)
+    values, reasons, _ = decode([data.tobytes()])
+    assert values.size == 300_000
+    assert not reasons.any()
+
+
+def test_a_counter_that_starts_again_is_a_protocol_error() -> None:
+    decoder = StreamDecoder(1.0, counter=True, from_zero=True)
+    decoder(wire([1000] * 100))
+    with pytest.raises(ProtocolError, match="restarted"):
+        decoder(wire([1000] * 100))
+
+
+def reference_split(data: bytes) -> tuple[list[int], bytes]:
+    """The plain way to tell values from the rest, of a complete stretch of bytes."""
+    triple = re.compile(rb"[\x00-\x3f][\x40-\x7f][\x80-\xff]")
+    values = [codec.decode_value(match[0]) for match in triple.finditer(data)]
+    return values, triple.sub(b"", data)
+
+
+@given(st.lists(st.binary(max_size=12) | st.integers(0, (1 << 18) - 1).map(codec.encode_value), max_size=30))
+@compiled
+def test_the_compiled_splitter_agrees_with_the_plain_one(parts: list[bytes]) -> None:
+    data = b"".join(parts) + b"\xff\xff"  # closes whatever was begun
+    values = np.empty(len(data), dtype=np.uint32)
+    text = np.empty(len(data), dtype=np.uint8)
+    used, n_values, n_text, _ = kernels.split(np.frombuffer(data, dtype=np.uint8), values, text, False)
+    plain_values, plain_text = reference_split(data)
+    assert used == len(data)
+    assert [int(value) & 0x3FFFF for value in values[:n_values]] == plain_values
+    assert text[:n_text].tobytes() == plain_text
+
+
+def test_an_answer_is_read_without_echo_and_prompt() -> None:
+    assert codec.parse_reply("GETINFO", b"GETINFO\r\nName: ILD2300-2\r\nSerial: 1\r\n->") == [
+        "Name: ILD2300-2",
+        "Serial: 1",
+    ]
+    assert codec.parse_reply("OUTPUT NONE", b"->") == []
+
+
+def test_a_refusal_is_an_instrument_error_with_the_sensors_words() -> None:
+    with pytest.raises(InstrumentError, match="refuses 'LASERPOW FULL': E104 Timeout"):
+        codec.parse_reply("LASERPOW FULL", b"E104 Timeout\r\n->")
+
+
+def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
+    with pytest.raises(InstrumentError, match=r"20000 samples/s x 2 values .* x 3 bytes x 10 bits .* = 1200000 bit/s"):
+        codec.check_line(20e3, 921600, counter=True)
+    codec.check_line(20e3, 921600, counter=False)
+    codec.check_line(49.14e3, 4000000, counter=True)
+
+
+@pytest.mark.parametrize(("rate", "text"), [(49140.0, "49.14"), (1500.0, "1.5"), (250.0, "0.25"), (20000.0, "20")])
+def test_a_rate_is_sent_in_kilohertz(rate: float, text: str) -> None:
+    assert codec.rate_text(rate) == text

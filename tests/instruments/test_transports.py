@@ -1,0 +1,148 @@
+"""Addresses, and the wires beneath them."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.transports import Transport, open_transport, parse_address
+from errormotion.instruments.transports.serving import Server, make_server
+
+
+class Echo:
+    """A device that sends back what it gets, in capitals."""
+
+    def __init__(self, wire: str) -> None:
+        self.server: Server = make_server(wire, "echo", self._answer)
+        self.server.start()
+
+    def _answer(self, data: bytes) -> None:
+        self.server.send(data.upper())
+
+
+@pytest.fixture(params=["tcp", "pty"])
+def echo(request: pytest.FixtureRequest) -> object:
+    device = Echo(request.param)
+    yield device
+    device.server.close()
+
+
+@pytest.fixture
+def line(echo: Echo) -> object:
+    transport = open_transport(echo.server.url, timeout=1.0)
+    yield transport
+    transport.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "scheme", "host", "port", "path"),
+    [
+        ("serial:///dev/ttyUSB0?baudrate=921600", "serial", "", None, "/dev/ttyUSB0"),
+        ("tcp://192.168.0.2:23", "tcp", "192.168.0.2", 23, ""),
+        ("sim://cframe/X1?seed=3", "sim", "cframe", None, "X1"),
+        ("sim://", "sim", "", None, ""),
+        ("replay://runs/a b?.rec", "replay", "", None, "runs/a b?.rec"),
+        ("replay:///tmp/x.rec", "replay", "", None, "/tmp/x.rec"),
+    ],
+)
+def test_an_address_is_taken_apart(url: str, scheme: str, host: str, port: int | None, path: str) -> None:
+    address = parse_address(url)
+    assert (address.scheme, address.host, address.port, address.path) == (scheme, host, port, path)
+
+
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("/dev/ttyUSB0", "such as serial:///dev/ttyUSB0"),
+        ("http://x:1", "such as"),
+        ("tcp://host", "tcp://HOST:PORT"),
+        ("tcp://host:abc", "cannot be read"),
+        ("serial://", "serial:///dev/NAME"),
+        ("replay://", "names no recording"),
+        ("sim://cframe/X1?seed", "cannot be read"),
+    ],
+)
+def test_a_wrong_address_is_refused_with_an_example(url: str, message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        parse_address(url)
+
+
+def test_a_parameter_that_is_no_number_is_named() -> None:
+    with pytest.raises(InstrumentError, match="'seed'.*expected a number; found 'three'"):
+        parse_address("sim://cframe/X1?seed=three").number("seed", 0)
+
+
+def test_bytes_go_out_and_come_back(line: Transport) -> None:
+    line.write(b"hello")
+    assert line.read_until(b"O") == b"HELLO"
+
+
+def test_what_follows_a_terminator_stays_for_the_next_read(line: Transport) -> None:
+    line.write(b"one;two;three")
+    assert line.read_until(b";") == b"ONE;"
+    assert line.read(1) == b"T"
+    assert line.read_until(b";") == b"WO;"
+    assert line.read_until(b"E", limit=100) == b"THRE"
+
+
+def test_silence_becomes_a_timeout_error_that_shows_what_came(line: Transport) -> None:
+    line.write(b"half")
+    with pytest.raises(InstrumentTimeoutError, match=r"only b'HALF' came"):
+        line.read_until(b";", timeout=0.2)
+    with pytest.raises(InstrumentTimeoutError, match="silent"):
+        line.read(timeout=0.05)
+
+
+def test_an_endless_line_becomes_a_protocol_error(line: Transport) -> None:
+    line.write(b"x" * 100)
+    with pytest.raises(ProtocolError, match="bytes without b';'"):
+        line.read_until(b";", limit=10)
+
+
+def test_a_closed_transport_says_so(line: Transport) -> None:
+    line.close()
+    line.close()
+    with pytest.raises(InstrumentError, match="closed"):
+        line.write(b"x")
+    with pytest.raises(InstrumentError, match="closed"):
+        line.read()
+
+
+def test_a_broken_tcp_connection_is_an_instrument_error_and_can_be_opened_again() -> None:
+    echo = Echo("tcp")
+    first = open_transport(echo.server.url)
+    first.write(b"a")
+    assert first.read() == b"A"
+    echo.server.hang_up()
+    with pytest.raises(InstrumentError, match="lost"):
+        first.read()
+    first.close()
+    second = open_transport(echo.server.url)
+    second.write(b"b")
+    assert second.read() == b"B"
+    second.close()
+    echo.server.close()
+
+
+def test_nobody_at_an_address_is_an_instrument_error(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(InstrumentError, match=f"No connection to tcp://127.0.0.1:{port}"):
+        open_transport(f"tcp://127.0.0.1:{port}")
+    with pytest.raises(InstrumentError, match="cannot be opened"):
+        open_transport(f"serial://{tmp_path}/none?baudrate=9600")
+
+
+@pytest.mark.parametrize(
+    ("simulator", "message"),
+    [(None, "has no simulator"), ("errormotion.nowhere:X", "does not load"), ("errormotion.errors:X", "does not load")],
+)
+def test_a_simulator_that_is_not_there_is_named(simulator: str | None, message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        open_transport("sim://cframe/X1", simulator=simulator)
+
+
+def test_an_unknown_wire_is_refused() -> None:
+    with pytest.raises(InstrumentError, match="wire=tcp"):
+        make_server("smoke", "x", lambda data: None)
