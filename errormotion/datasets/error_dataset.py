@@ -247,6 +247,8 @@ def _coordinate_violations(ds: xr.Dataset) -> list[str]:
             found += time_violations("time", ds.variables["time"])
     for name in ("x", "y", "z"):
         if name in ds.variables:
+            if not set(ds.variables[name].dims) <= {"position", "target"}:
+                found.append(f"{name}: expected dims position or target; found {dims_text(ds.variables[name])}")
             found += magnitude_violations(name, ds.variables[name], _ROWS[name])
     if "temperature" in ds.coords and "sensor" in ds["temperature"].dims:
         row = Row("temperature", ("...", "sensor"), "degC", -60.0, 200.0, "")

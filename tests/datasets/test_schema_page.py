@@ -1,0 +1,49 @@
+"""The reference page of the schemas says what the validator checks."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from errormotion.datasets.import_map import Channel, Format, ImportMap, SpeedColumn, TemperatureColumn, TimeColumn
+from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RAW_SCHEMAS, Row
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "reference" / "schemas.md").read_text()
+
+
+def line(row: Row) -> str:
+    dims = ", ".join(row.dims).replace("|", " or ")
+    limits = "" if math.isinf(row.low) else f"{row.low:.6g} to {row.high:.6g}"
+    return f"| `{row.name}` | {dims} | {row.unit} | {'yes' if row.required else 'no'} | {limits} | {row.meaning} |"
+
+
+def rows_of(text: str) -> list[str]:
+    return [found for found in text.splitlines() if found.startswith("| `") and found.count("|") == 7]
+
+
+def test_the_table_of_errors_is_the_schema() -> None:
+    section = PAGE.partition("\n## Error dataset")[2].partition("\n## Raw datasets")[0]
+    assert rows_of(section) == [line(row) for row in ERROR_ROWS]
+
+
+@pytest.mark.parametrize("number", range(len(RAW_SCHEMAS)), ids=[raw.title for raw in RAW_SCHEMAS])
+def test_the_table_of_each_raw_dataset_is_the_schema(number: int) -> None:
+    sections = PAGE.partition("\n## Raw datasets")[2].partition("\n## Files")[0].split("\n### ")[1:]
+    assert len(sections) == len(RAW_SCHEMAS)
+    assert f"`{RAW_SCHEMAS[number].id}`" in sections[number]
+    assert rows_of(sections[number]) == [line(row) for row in RAW_SCHEMAS[number].rows]
+
+
+def test_the_how_to_names_every_key_of_a_map() -> None:
+    page = (DOCS / "how-to" / "import-logs.md").read_text()
+    told = set(re.findall(r"[`.]([a-z_]+)`", page.partition("## All keys")[2]))
+    for table in (ImportMap, Format, TimeColumn, Channel, TemperatureColumn, SpeedColumn):
+        keys = {field.alias or name for name, field in table.model_fields.items()}
+        assert keys - {"format", "time", "channels", "temperatures", "spindle_speed"} <= told
+
+
+def test_the_table_of_attributes_is_the_schema() -> None:
+    for name, meaning in ERROR_ATTRIBUTES.items():
+        assert f"| `{name}` | {meaning} |" in PAGE
