@@ -161,6 +161,17 @@ RAW_SCHEMAS = (
                 "temperature", ("time", "sensor"), "degC", -60.0, 200.0, "of each sensor; NaN = unknown", required=False
             ),
             Row("spindle_speed", ("time",), "1/min", -5e5, 5e5, "turns per minute; NaN = unknown", required=False),
+            Row(
+                "frame_expansion",
+                ("channel", "direction"),
+                "m/K",
+                -1e-4,
+                1e-4,
+                "how each beam's origin moves as the measuring frame warms",
+                required=False,
+            ),
+            Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "from the drawing", required=False),
+            Row("nominal_direction", ("channel", "direction"), "1", *_UNIT_VECTOR, "from the drawing", required=False),
         ),
         sizes={**_DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
         labels={**_XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
