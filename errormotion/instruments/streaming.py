@@ -196,7 +196,7 @@ class Reader:
                 self._accept(self._decode(data), now)
         except InstrumentError as error:
             with self._change:
-                self._error = error
+                self._error = type(error)(f"{self._name}: {error}")
                 self._change.notify_all()
 
     def _accept(self, chunk: Chunk, now: float) -> None:

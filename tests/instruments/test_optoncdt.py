@@ -132,9 +132,9 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_it_is_opened(addr
 
 
 def test_another_sensor_than_the_settings_say_is_refused() -> None:
-    with pytest.raises(InstrumentError, match="model ILD1420; .* answers a 'ILD2300-2'"):
+    with pytest.raises(InstrumentError, match=r"model ILD1420; .* answers a 'ILD2300-2'"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(model="ILD1420", range=0.01, rate=4e3)).open()
-    with pytest.raises(InstrumentError, match="range of 10 mm; .* has 2.00 mm"):
+    with pytest.raises(InstrumentError, match=r"range of 10 mm; .* has 2.00 mm"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(range=0.01)).open()
 
 
@@ -163,14 +163,13 @@ def test_silence_from_the_start_is_a_timeout_error() -> None:
 
 def test_silence_in_a_stream_is_a_timeout_error_after_the_samples_before_it() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
-    got = 0
+    got: list[Samples] = []
     with (
         OptoNCDT("sim://cframe/X1?seed=3&fault=silence&fault_at=5000", settings) as sensor,
         pytest.raises(InstrumentTimeoutError, match=r"no data for 0\.2 s"),
     ):
-        for block in sensor.stream(block=1000):
-            got += block.values.shape[1]
-    assert got == 5000
+        got.extend(sensor.stream(block=1000))
+    assert len(got) == 5
 
 
 def test_a_sensor_that_fell_silent_has_to_be_opened_again() -> None:
@@ -285,7 +284,7 @@ def test_a_driver_that_writes_something_else_fails_in_replay(tmp_path: Path) -> 
     path = tmp_path / "session.rec"
     with OptoNCDT("sim://cframe/X1?seed=3", SLOW, record=path):
         pass
-    with pytest.raises(ReplayError, match="MEASRATE 1.5"):
+    with pytest.raises(ReplayError, match=r"MEASRATE 1.5"):
         OptoNCDT(f"replay://{path}", OptoSettings(rate=2500.0)).open()
 
 

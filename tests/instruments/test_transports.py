@@ -69,7 +69,7 @@ def test_a_wrong_address_is_refused_with_an_example(url: str, message: str) -> N
 
 
 def test_a_parameter_that_is_no_number_is_named() -> None:
-    with pytest.raises(InstrumentError, match="'seed'.*expected a number; found 'three'"):
+    with pytest.raises(InstrumentError, match=r"'seed'.*expected a number; found 'three'"):
         parse_address("sim://cframe/X1?seed=three").number("seed", 0)
 
 

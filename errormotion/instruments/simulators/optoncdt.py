@@ -89,9 +89,10 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return ""
 
     def _description(self) -> str:
+        number = 1000 * abs(self.world.seed) + sum(i * byte for i, byte in enumerate(self.name.encode(), 1))
         lines = (
             f"Name: {self._model}-{self._range * 1e3:g}",
-            f"Serial: {1000 * abs(self.world.seed) + sum(i * byte for i, byte in enumerate(self.name.encode(), 1)):08d}",
+            f"Serial: {number:08d}",
             f"Range: {self._range * 1e3:.2f} mm",
             "Version: 001.000",
             f"Operating time: {self.world.sensors_on_for:.0f} s",

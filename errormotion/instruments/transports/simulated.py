@@ -35,6 +35,7 @@ class SimulatedTransport(Transport):
         except BaseException:
             self._device.close()
             raise
+        self._inner.url = self.url  # messages name the address that a person knows
 
     def _send(self, data: bytes) -> None:
         self._inner.write(data)

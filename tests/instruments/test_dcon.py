@@ -1,0 +1,159 @@
+"""DCON thermometers: codec, driver, wire."""
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.simulators import world
+from errormotion.instruments.thermometer.dcon import (
+    DconSettings,
+    DconTemperature,
+    checksum,
+    decode,
+    encode,
+    format_temperatures,
+    parse_temperatures,
+)
+
+ADDRESS = "sim://cframe/thermometer?seed=3"
+QUICK = DconSettings(timeout=0.3)
+
+
+def read_often(thermometer: DconTemperature, times: int) -> None:
+    for _ in range(times):
+        thermometer.read()
+
+
+def test_vectors() -> None:
+    assert encode("#01") == b"#01\r"
+    assert parse_temperatures(decode(b">+025.12+026.00\r")) == [25.12, 26.0]
+    assert format_temperatures([25.12, 26.0]) == ">+025.12+026.00"
+
+
+def test_checksum_is_the_sum_of_the_characters() -> None:
+    assert checksum("$012") == "B7"  # 24 + 30 + 31 + 32, hexadecimal
+    assert encode("$012", with_checksum=True) == b"$012B7\r"
+    assert decode(b"$012B7\r", with_checksum=True) == "$012"
+    with pytest.raises(ProtocolError, match="checksum 'B8'; expected 'B7'"):
+        decode(b"$012B8\r", with_checksum=True)
+
+
+@given(st.lists(st.floats(-200, 1370).map(lambda t: round(t, 2)), min_size=1, max_size=10))
+def test_temperatures_come_back(temperatures: list[float]) -> None:
+    assert parse_temperatures(format_temperatures(temperatures)) == pytest.approx(temperatures, abs=1e-9)
+
+
+@pytest.mark.parametrize("value", ["+9999.9", "-9999.9", "+9999", "-0000", "+888888"])
+def test_an_open_sensor_is_nan(value: str) -> None:
+    readings = parse_temperatures(f">+025.12{value}+026.00")
+    assert math.isnan(readings[1])
+    assert readings[::2] == [25.12, 26.0]
+
+
+def test_zero_degrees_is_no_open_sensor() -> None:
+    assert parse_temperatures(">+000.00-000.00") == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("text", ["", ">", "+025.12", ">025.12", ">+025.12x", ">+025.12 +026.00", "!01"])
+def test_anything_else_is_a_protocol_error(text: str) -> None:
+    with pytest.raises(ProtocolError, match="such as '>"):
+        parse_temperatures(text)
+    with pytest.raises(ProtocolError, match="ASCII"):
+        decode(b"\xff>+025.12\r")
+
+
+@pytest.mark.parametrize("wire", ["tcp", "pty"])
+@pytest.mark.parametrize("check", [False, True])
+def test_temperatures_are_the_twins(wire: str, check: bool) -> None:
+    address = f"{ADDRESS}&wire={wire}&checksum={int(check)}"
+    with DconTemperature(address, DconSettings(checksum=check)) as thermometer:
+        reading = thermometer.read()
+        assert thermometer.open_sensors == ()
+        assert thermometer.identify().model == "4018"
+        assert thermometer.identify().simulated
+        twin = world("cframe", 3).machine
+        truth = dict(zip(twin.temperature_sensors, twin.temperatures([0.0])[0], strict=True))
+    assert list(reading) == ["frame", "ambient", "spindle_front", "spindle_rear", "column"]
+    for name, value in reading.items():
+        assert value == pytest.approx(truth[name], abs=0.11)  # five sigma of 0.02 K, and the last digit
+
+
+def test_an_open_sensor_is_nan_and_named() -> None:
+    with DconTemperature(f"{ADDRESS}&open=1") as thermometer:
+        reading = thermometer.read()
+        assert thermometer.open_sensors == ("ambient",)
+    assert math.isnan(reading.pop("ambient"))
+    assert all(math.isfinite(value) for value in reading.values())
+
+
+def test_names_and_inputs_are_settings() -> None:
+    settings = DconSettings(channels=("air", "bed"), unit=0x1F)
+    with DconTemperature(f"{ADDRESS}&sensors=ambient,bed&unit=31", settings) as thermometer:
+        assert list(thermometer.read()) == ["air", "bed"]
+
+
+def test_fewer_inputs_than_names_is_an_error() -> None:
+    with (
+        DconTemperature(f"{ADDRESS}&sensors=frame,bed") as thermometer,
+        pytest.raises(ProtocolError, match=r"at least 5 temperatures .* found 2"),
+    ):
+        thermometer.read()
+
+
+def test_a_refused_request_and_a_foreign_module_are_errors() -> None:
+    with DconTemperature(ADDRESS) as thermometer, pytest.raises(InstrumentError, match=r"refuses '\$01X': '\?01'"):
+        thermometer._ask("$01X", "!01")
+    with pytest.raises(InstrumentError, match="refuses"):
+        DconTemperature(ADDRESS, DconSettings(unit=2)).open()
+
+
+def test_a_sensor_that_the_machine_does_not_have_is_refused() -> None:
+    with pytest.raises(InstrumentError, match=r"has the sensors .* found coffee"):
+        DconTemperature(f"{ADDRESS}&sensors=coffee").open()
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("silence", InstrumentTimeoutError),
+        ("drop", InstrumentTimeoutError),
+        ("garbage", ProtocolError),
+        ("disconnect", InstrumentError),
+    ],
+)
+@pytest.mark.parametrize("at", [0, 4])
+def test_each_fault_becomes_a_typed_error(fault: str, error: type[InstrumentError], at: int) -> None:
+    thermometer = DconTemperature(f"{ADDRESS}&fault={fault}&fault_at={at}", QUICK)
+    with pytest.raises(error), thermometer:
+        read_often(thermometer, 4)
+
+
+def test_a_bad_checksum_is_a_protocol_error_and_splitting_none() -> None:
+    settings = DconSettings(checksum=True, timeout=0.3)
+    with (
+        DconTemperature(f"{ADDRESS}&checksum=1&fault=checksum&fault_at=3", settings) as thermometer,
+        pytest.raises(ProtocolError, match="checksum"),
+    ):
+        read_often(thermometer, 3)
+    with DconTemperature(f"{ADDRESS}&checksum=1&fault=split", settings) as thermometer:
+        assert all(math.isfinite(value) for value in thermometer.read().values())
+    with pytest.raises(InstrumentError, match="no such thing"):
+        DconTemperature(f"{ADDRESS}&fault=checksum").open()
+
+
+def test_out_of_range_is_nan_everywhere() -> None:
+    with DconTemperature(f"{ADDRESS}&fault=out_of_range") as thermometer:
+        assert all(math.isnan(value) for value in thermometer.read().values())
+        assert len(thermometer.open_sensors) == 5
+
+
+def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
+    path = tmp_path / "thermometer.rec"
+    with DconTemperature(ADDRESS, record=path) as thermometer:
+        readings = [thermometer.read() for _ in range(3)]
+    with DconTemperature(f"replay://{path}") as thermometer:
+        assert [thermometer.read() for _ in range(3)] == readings

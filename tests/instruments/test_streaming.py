@@ -1,0 +1,146 @@
+"""The reader thread and its bounded queue."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.streaming import Chunk, Reader
+from errormotion.instruments.transports import Transport
+
+OVERRUN = 9
+
+
+class Tap(Transport):
+    """Gives the bytes that a test puts in; each byte is a sample of that value, capitals are text."""
+
+    def __init__(self, holds_back: bool) -> None:
+        super().__init__("tap://", timeout=1.0)
+        self.holds_back = holds_back
+        self.waiting: list[bytes] = []
+        self.change = threading.Condition()
+        self.told: list[int] = []
+
+    def put(self, data: bytes) -> None:
+        with self.change:
+            self.waiting.append(data)
+            self.change.notify_all()
+
+    def taken(self) -> None:
+        """Wait until the thread has come back for more."""
+        with self.change:
+            assert self.change.wait_for(lambda: not self.waiting, 5.0)
+
+    def handed_over(self, samples: int) -> None:
+        self.told.append(samples)
+
+    def _send(self, data: bytes) -> None:
+        self.put(b"OK>")
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        with self.change:
+            if not self.change.wait_for(lambda: bool(self.waiting), timeout):
+                raise InstrumentTimeoutError("silent")
+            data = self.waiting.pop(0)
+            self.change.notify_all()
+        if data == b"!":
+            raise InstrumentError("the cable is cut")
+        return data
+
+    def close(self) -> None:
+        pass
+
+
+def decode(data: bytes) -> Chunk:
+    if data == b"?":
+        raise ProtocolError("these are no samples")
+    numbers = np.frombuffer(bytes(byte for byte in data if byte < 32), dtype=np.uint8)
+    return Chunk(numbers.astype(float), np.zeros(numbers.size, dtype=np.uint8), bytes(b for b in data if b >= 32))
+
+
+@pytest.fixture
+def tap(request: pytest.FixtureRequest) -> Tap:
+    return Tap(getattr(request, "param", True))
+
+
+@pytest.fixture
+def reader(tap: Tap) -> object:
+    thread = Reader(tap, decode, name="tap", limit=4, overrun=OVERRUN, prompt=b">")
+    yield thread
+    thread.abandon()
+
+
+def fill(reader: Reader, size: int, timeout: float = 1.0) -> tuple[list[float], list[int]]:
+    values, reasons = np.empty(size), np.empty(size, dtype=np.uint8)
+    reader.fill(values, reasons, timeout)
+    return values.tolist(), reasons.tolist()
+
+
+def test_samples_come_in_order_whatever_the_pieces(tap: Tap, reader: Reader) -> None:
+    for piece in (b"\1\2\3", b"\4", b"\5\6"):
+        tap.put(piece)
+    assert fill(reader, 2)[0] == [1, 2]
+    assert fill(reader, 4)[0] == [3, 4, 5, 6]
+    assert tap.told == [2, 6]
+
+
+def test_a_full_queue_holds_the_device_back(tap: Tap, reader: Reader) -> None:
+    tap.put(b"\1\2\3\4")
+    tap.put(b"\5")
+    tap.taken()
+    tap.put(b"\6")  # stays with the device: the thread waits with \5 in its hand
+    assert fill(reader, 6)[0] == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("tap", [False], indirect=True)
+def test_what_nothing_holds_back_is_thrown_away_and_counted_at_its_place(tap: Tap, reader: Reader) -> None:
+    for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
+        tap.put(piece)
+    tap.put(b"\7")
+    tap.taken()
+    values, reasons = fill(reader, 7)
+    assert values[:4] == [1, 2, 3, 4]
+    assert np.isnan(values[4:]).all()
+    assert reasons == [0] * 4 + [OVERRUN] * 3
+
+
+def test_an_answer_gets_through_a_full_queue(tap: Tap, reader: Reader) -> None:
+    for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
+        tap.put(piece)
+    assert reader.ask(b"hello", 2.0) == b"OK>"
+    assert fill(reader, 7)[0] == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_bytes_that_nobody_asked_for_are_counted(tap: Tap, reader: Reader) -> None:
+    tap.put(b"AB\1C")
+    assert fill(reader, 1)[0] == [1]
+    assert reader.stray_bytes == 3
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "message"),
+    [(b"!", InstrumentError, "tap: the cable is cut"), (b"?", ProtocolError, "tap: these are no samples")],
+)
+def test_an_error_in_the_thread_comes_out_behind_the_samples_before_it(
+    tap: Tap, reader: Reader, data: bytes, error: type[InstrumentError], message: str
+) -> None:
+    tap.put(b"\1\2")
+    tap.put(data)
+    assert fill(reader, 2)[0] == [1, 2]
+    with pytest.raises(error, match=message):
+        fill(reader, 1)
+    with pytest.raises(error, match=message):
+        reader.ask(b"hello", 1.0)
+
+
+def test_silence_is_a_timeout_error(reader: Reader) -> None:
+    with pytest.raises(InstrumentTimeoutError, match=r"tap: no data for 0\.05 s"):
+        fill(reader, 1, timeout=0.05)
+
+
+def test_stopping_ends_the_thread_even_when_nobody_takes_the_samples(tap: Tap, reader: Reader) -> None:
+    for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
+        tap.put(piece)
+    assert reader.stop(b"stop", 2.0) == b"OK>"
+    assert not any(thread.name == "reader-tap" for thread in threading.enumerate())
