@@ -23,7 +23,7 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.spindle_figures import LOOK
-from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, significant
+from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
 
 _UNKNOWN = "the beam was not determined"
 
@@ -40,7 +40,7 @@ def part(source: Source, key: str) -> Part:
             Section("nominal", "Difference to nominal", _nominal(errors)),
             Section("constructions", "Circles and line beside the likelihood fit", _constructions(errors)),
             Section("quality", "Residuals and data quality", [*quality.notes(errors), *_residuals(errors, key)]),
-            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance)),
+            Section("provenance", "Provenance", provenance.blocks(source)),
         ],
     )
 
@@ -135,9 +135,10 @@ def _summary(errors: xr.Dataset) -> list[str]:
     known = [(name, row) for name, row in zip(names, found, strict=False) if math.isfinite(row[0])]
     if known:
         far, off = max(known, key=lambda entry: entry[1][0]), max(known, key=lambda entry: entry[1][1])
+        angle, expanded = rounded(off[1][1] / ARCSEC, 2 * off[1][2] / ARCSEC, signed=False)
         words.append(
             f"Against nominal, origins differ by up to {fixed(1e6 * far[1][0], 0)} µm ({far[0]}) and directions by "
-            f"up to {fixed(off[1][1] / ARCSEC, 0)} arcsec ({off[0]}); an evaluation with nominal beams would carry "
+            f"up to {angle} ± {expanded} arcsec ({off[0]}); an evaluation with nominal beams would carry "
             "these differences."
         )
     both = _construction_differences(errors)

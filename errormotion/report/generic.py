@@ -45,7 +45,7 @@ def part(source: Source, key: str) -> Part:
                 "Data quality",
                 [*quality.notes(errors), *quality.sentences(errors, source.raw), _further(errors)],
             ),
-            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance)),
+            Section("provenance", "Provenance", provenance.blocks(source)),
         ],
     )
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import xarray as xr
 
-from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.document import Block, Cell, Source, Table, Text
 from errormotion.report.text import DASH
 
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
+_RUN = ("campaign", "bench", "inputs", "samples")
 _INSTRUMENT = ("name", "manufacturer", "model", "serial_number", "firmware", "address", "calibration")
 
 
@@ -31,8 +33,9 @@ def simulated(*sources: Any) -> str:
     """Return why the data count as simulated, from anything nested; empty where nothing says so."""
     for source in sources:
         for path, value in walk(source):
-            if isinstance(value, str) and value.strip().lower().startswith(("sim://", "twin://")):
-                return f"instrument address {value.strip()}"
+            address = _address(value, "sim://", "twin://")
+            if address:
+                return f"instrument address {address}"
             if path and path[-1] == "simulated" and (value is True or value == 1 or str(value).lower() == "true"):
                 return "the provenance marks them as simulated"
     return ""
@@ -40,19 +43,25 @@ def simulated(*sources: Any) -> str:
 
 def replayed(*sources: Any) -> str:
     """Return the address of a recording that was played back; empty where there is none."""
-    for source in sources:
-        for _, value in walk(source):
-            if isinstance(value, str) and value.strip().lower().startswith("replay://"):
-                return value.strip()
-    return ""
+    return next(
+        (found for source in sources for _, value in walk(source) if (found := _address(value, "replay://"))), ""
+    )
+
+
+def _address(leaf: Any, *schemes: str) -> str:
+    """Return the first address with one of these schemes in a leaf, JSON text included; empty where there is none."""
+    entries = leaf if isinstance(leaf, (list, tuple)) else [leaf]
+    pattern = rf'(?:^\s*|")((?:{"|".join(schemes)})[^"]*)'
+    found = (re.search(pattern, entry, re.IGNORECASE) for entry in entries if isinstance(entry, str))
+    return next((match[1].strip() for match in found if match), "")
 
 
 def walk(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield every leaf of nested mappings and sequences with its path; long lists of numbers are one leaf."""
+    """Yield every leaf of nested mappings and sequences with its path; a list of plain values is one leaf."""
     if isinstance(value, Mapping) and value:
         for key, entry in value.items():
             yield from walk(entry, (*path, str(key)))
-    elif isinstance(value, (list, tuple)) and any(isinstance(entry, (Mapping, list, tuple, str)) for entry in value):
+    elif isinstance(value, (list, tuple)) and any(isinstance(entry, (Mapping, list, tuple)) for entry in value):
         for i, entry in enumerate(value):
             yield from walk(entry, (*path, str(i + 1)))
     else:
@@ -90,8 +99,10 @@ def instrument_table(provenance: Mapping[str, Any]) -> Table | None:
     )
 
 
-def blocks(errors: xr.Dataset, provenance: Mapping[str, Any]) -> list[Block]:
+def blocks(source: Source) -> list[Block]:
     """Return the provenance as tables: instruments, settings, and the rest."""
+    errors, provenance = source.errors, source.provenance
+    run = {name: _brief(source.run[name]) for name in _RUN if source.run.get(name)}
     found: list[Block] = []
     table = instrument_table(provenance)
     found.append(table if table is not None else Text("The provenance names no instrument.", "note"))
@@ -108,9 +119,19 @@ def blocks(errors: xr.Dataset, provenance: Mapping[str, Any]) -> list[Block]:
     attributes = [[name.replace("_", " "), text(errors.attrs[name])] for name in _ATTRIBUTES if name in errors.attrs]
     rest = {name: value for name, value in provenance.items() if name not in ("settings", "instruments")}
     found.append(
-        Table("Result, software and data.", ["item", "value"], [*attributes, *map(list, _flat(rest))], numeric=False)
+        Table(
+            "Result, software and data.",
+            ["item", "value"],
+            [*attributes, *map(list, _flat({**run, **rest}))],
+            numeric=False,
+        )
     )
     return found
+
+
+def _brief(value: Any) -> Any:
+    """Return an entry of ``run.json`` without the full text of a file, whose hash stands beside it."""
+    return {name: entry for name, entry in value.items() if name != "text"} if isinstance(value, Mapping) else value
 
 
 def _flat(value: Any) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from errormotion.report.document import Block, Cell, Table, Text
 from errormotion.report.series import minutes_of
-from errormotion.report.text import DASH, finite, fixed, integer, minutes, percent
+from errormotion.report.text import DASH, finite, fixed, integer, listed, minutes, percent
 
 
 def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
@@ -93,10 +93,13 @@ def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
             words += f"; the time axis has {len(holes)} gap(s), the longest {minutes(float(step[holes].max()))}"
         blocks.append(Text(f"{words}."))
     seen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if np.isfinite(errors[name].values).any()]
+    shares: dict[float, list[str]] = {}
     for name in seen:
-        known = float(np.isfinite(errors[name].values).mean())
-        if known < 1:
-            blocks.append(Text(f"{name} is determined at {percent(known)} of the instants.", "warning"))
+        shares.setdefault(float(np.isfinite(errors[name].values).mean()), []).append(name)
+    for share, names in shares.items():
+        if share < 1:
+            kind = "plain" if share > 0.999 else "warning"
+            blocks.append(Text(f"{listed(names)}: determined at {percent(share)} of the instants.", kind))
     counted = counts(errors, raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())

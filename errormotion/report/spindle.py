@@ -23,7 +23,9 @@ from errormotion.report.series import (
     minutes_of,
     unit_of,
 )
-from errormotion.report.text import finite, fixed, integer, listed, minutes
+from errormotion.report.text import UM, finite, fixed, integer, listed, minutes
+
+_AT_ONCE, _AROUND = 1 / 60, 10 / 60  # min: what is left out about a switched compensation, and what is averaged
 
 
 def part(source: Source, key: str) -> Part:
@@ -40,7 +42,7 @@ def part(source: Source, key: str) -> Part:
             Section("setup", "Set-up", _setup(errors, key)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors)),
             Section("quality", "Residuals and data quality", _quality(source, key)),
-            Section("provenance", "Provenance", provenance.blocks(errors, source.provenance)),
+            Section("provenance", "Provenance", provenance.blocks(source)),
         ],
         spindle_figures.overview(errors, events(source), f"{key}-overview"),
     )
@@ -132,35 +134,36 @@ def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
 
 
 def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
-    """Say what a switched compensation did: the change from just before it to a minute later, or the next event."""
+    """Say what a switched compensation did: the mean of ten seconds after it, less that of ten seconds before it."""
     time, words = minutes_of(errors), []
-    for i, event in enumerate(done):
-        until = min([event.minute + 1.0, time[-1], *(later.minute for later in done[i + 1 : i + 2])])
-        before, after = np.flatnonzero(time < event.minute), np.flatnonzero(time <= until)
+    for event in done:
         for axis in event.axes:
             freedom = f"E{axis}"
             known = np.isfinite(errors[freedom].values)
-            first, last = last_known(errors[freedom].values, before[-1] if before.size else -1), after[known[after]]
-            if first is None or not last.size or time[last[-1]] <= event.minute:
+            before = np.flatnonzero(known & (time < event.minute - _AT_ONCE))
+            after = np.flatnonzero(known & (time > event.minute + _AT_ONCE))
+            if not (before.size and after.size):
                 continue
-            pair = errors.isel(time=[first, int(last[-1])])
-            change = pair.em.combine([-1.0, 1.0], "time")
-            size = unit_of(axis)[1]
-            values = [
-                estimate(value / size, 2 * math.sqrt(max(variance, 0.0)) / size)
-                for value, variance in (
-                    (float(pair[freedom][0]), float(pair["covariance"].sel(dof=freedom, dof_=freedom)[0])),
-                    (float(pair[freedom][1]), float(pair["covariance"].sel(dof=freedom, dof_=freedom)[1])),
-                    (float(change.value.sel(dof=freedom)), float(change.covariance.sel(dof=freedom, dof_=freedom))),
-                )
-            ]
-            told = [f"{_with_uncertainty(value)} µm" for value in values]
+            before = before[(time[before] >= event.minute - _AROUND) | (before == before[-1])]
+            after = after[(time[after] <= event.minute + _AROUND) | (after == after[0])]
+            near = errors.isel(time=np.concatenate([before, after]))
+            weights = np.repeat([0.0, 1.0], [before.size, after.size]) / after.size
+            mean_before = np.repeat([1.0, 0.0], [before.size, after.size]) / before.size
+            start, change = (_combined(near, each, freedom) for each in (mean_before, weights - mean_before))
             words.append(
                 f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min: {axis} at the "
-                f"functional point went from {told[0]} to {told[1]} by {fixed(time[last[-1]], 1)} min, "
-                f"a change of {told[2]}."
+                f"functional point stepped by {change} µm, from {start} µm."
             )
     return words
+
+
+def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> str:
+    """Return a linear combination of one displacement over time with its expanded uncertainty, in micrometres."""
+    combined = errors.em.combine(weights, "time")
+    variance = float(combined.covariance.sel(dof=freedom, dof_=freedom))
+    return _with_uncertainty(
+        estimate(float(combined.value.sel(dof=freedom)) / UM[1], 2 * math.sqrt(max(variance, 0.0)) / UM[1])
+    )
 
 
 def _first_hour(errors: xr.Dataset) -> list[str]:

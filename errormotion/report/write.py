@@ -77,8 +77,11 @@ def write_report(
     page = _page(sources, parts, title)
     out = Path(out)
     beside = out.with_name(out.name + ".part")
-    beside.write_text(page, encoding="utf-8")
-    os.replace(beside, out)
+    try:
+        beside.write_text(page, encoding="utf-8")
+        os.replace(beside, out)
+    finally:
+        beside.unlink(missing_ok=True)
     return out
 
 
@@ -163,9 +166,6 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
 
     attributes, test = errors.attrs, known("test", "name")
     instruments = provenance.instruments(source.provenance)
-    serials = ", ".join(
-        f"{row['model'] or row['name']} no. {row['serial_number']}" for row in instruments if row["serial_number"]
-    )
     return [
         ("Machine", machine),
         ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
@@ -173,9 +173,14 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
         ("Operator", known("operator")),
         ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
         ("Reference state", str(attributes.get("reference", DASH))),
-        ("Instruments", serials or ", ".join(row["model"] or row["name"] for row in instruments) or DASH),
         ("Run", known("id", "run")),
+        ("Instruments", "; ".join(_instrument(row) for row in instruments) or DASH),
     ]
+
+
+def _instrument(row: Mapping[str, str]) -> str:
+    made = f"{row['manufacturer']} {row['model'] or row['name']}".strip()
+    return f"{made}, serial number {row['serial_number']}" if row["serial_number"] else made
 
 
 def _moment(text: str) -> str:

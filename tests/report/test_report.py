@@ -104,7 +104,13 @@ def test_every_figure_is_described_in_words(page):
 
 
 def test_the_head_says_who_measured_what_and_when(page):
-    for words in ("C-frame 610", "Warm-up", "J. Doe", "2026-03-02 08:15 UTC", "ILD2300-2 no. 10123"):
+    for words in (
+        "C-frame 610",
+        "Warm-up",
+        "J. Doe",
+        "2026-03-02 08:15 UTC",
+        "Micro-Epsilon ILD2300-2, serial number 10123",
+    ):
         assert words in page.text
 
 
@@ -129,8 +135,8 @@ def test_a_value_that_holds_a_compensation_step_says_so(page):
 
 
 def test_a_switched_compensation_is_told_with_its_change(page):
-    found = re.search(r"Z compensation off at 101.0 min: .*? a change of \+(\d+\.\d+) ±", page.text)
-    # 29.3 um were put in; the warm-up adds about 0.02 um in that minute.
+    found = re.search(r"Z compensation off at 101.0 min: .*? stepped by \+(\d+\.\d+) ±", page.text)
+    # 29.3 um were put in; the warm-up adds less than 0.02 um between the two means.
     assert float(found[1]) == pytest.approx(29.3, abs=0.1)
 
 
@@ -176,9 +182,11 @@ def test_simulated_data_cannot_pass_for_real(read, make_drift, simulated_instrum
     "instrument",
     [
         {"settings": {"channels": [{"address": " SIM://cframe/x1"}]}},
+        {"addresses": ["tcp://10.0.0.7", "sim://cframe/x1"]},
         {"identity": {"simulated": True}},
         {"identity": {"simulated": "true"}},
         {"address": "twin://cframe"},
+        {"attributes": '[{"name": "frame", "address": "sim://cframe"}]'},
     ],
 )
 def test_simulation_is_found_wherever_it_is_told(instrument):
