@@ -106,7 +106,7 @@ class Event:
 
 
 def events(source: Source) -> list[Event]:
-    """Return what the schedule in the settings says was done after the start, in order of time."""
+    """Return what the schedule in the settings says was done within the record, in order of time."""
     schedule = source.settings.get("schedule")
     zero = float(source.errors.attrs.get("reference_time", 0.0))
     if not isinstance(schedule, (list, tuple)):
@@ -119,7 +119,9 @@ def events(source: Source) -> list[Event]:
             if math.isfinite(at) and what:
                 axes = entry.get("compensation")
                 found.append(Event((at - zero) / 60, what, tuple(axes) if isinstance(axes, Mapping) else ()))
-    return sorted(found, key=lambda event: event.minute)
+    time = minutes_of(source.errors)
+    end = time[-1] if time.size else -math.inf
+    return sorted((event for event in found if event.minute <= end), key=lambda event: event.minute)
 
 
 def _seconds(value: Any) -> float:

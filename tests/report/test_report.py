@@ -153,6 +153,8 @@ def test_an_iso_value_that_could_not_be_found_says_why(read, make_drift):
     assert "No temperatures were recorded" in text
     assert "no temperature was recorded" in text
     assert "the spindle speed was not recorded" in text
+    # What was planned for later than the record's end did not happen in it.
+    assert "compensation off" not in text
 
 
 def test_the_budget_names_its_groups_and_adds_up(page, drift):
