@@ -12,7 +12,7 @@ help:  ## list the targets
 setup: .venv/.dev  ## install everything into .venv (uv where it is, else pip)
 
 demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, report
-	$(BIN)/errormotion demo $(ARGS)
+	@$(BIN)/errormotion demo $(ARGS)
 
 test: .venv/.dev  ## run the tests (ARGS="tests/kinematics -k fit" runs some)
 	$(BIN)/python -m pytest $(ARGS)
