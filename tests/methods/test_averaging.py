@@ -1,5 +1,7 @@
 """Means of a record: right for every layout, whatever the pieces it comes in."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -20,7 +22,7 @@ def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost):
         values = np.ascontiguousarray(values.T).T
     edges = np.array([0, 1, 1, 700, 1403, 3001])
     sums, counts = window_sums(values, edges)
-    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (a, b) in enumerate(pairwise(edges)):
         part = values[:, a:b].astype(np.float64)
         np.testing.assert_allclose(sums[:, k], np.nansum(part, axis=1), rtol=1e-13)
         np.testing.assert_array_equal(counts[:, k], np.isfinite(part).sum(axis=1))
@@ -38,13 +40,12 @@ def test_means_do_not_depend_on_the_pieces(pieces, length):
     expected = join([whole.update(time, values), whole.finish()])
     parts = Averager(2, length)
     edges = np.cumsum([0, *pieces])
-    found = join(
-        [parts.update(time[a:b], values[:, a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)] + [parts.finish()]
-    )
+    found = join([parts.update(time[a:b], values[:, a:b]) for a, b in pairwise(edges)] + [parts.finish()])
     np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(found.time, expected.time, rtol=1e-12)
     np.testing.assert_array_equal(found.count, expected.count)
-    assert expected.expected.sum() == total
+    # All samples are in a window, but for a last one that is not half full.
+    assert total - 500 * length < expected.expected.sum() <= total
 
 
 def test_windows_follow_the_clock_and_not_the_samples():

@@ -93,7 +93,7 @@ def test_missed_steps_are_unknown_and_do_no_harm():
 
 def test_a_beam_far_from_nominal_is_found():
     rng = np.random.default_rng(5)
-    P, u = P0 + [3e-4, 4e-4, -4e-4], U0 + [0, 0.04, -0.03]
+    P, u = P0 + np.array([3e-4, 4e-4, -4e-4]), U0 + np.array([0, 0.04, -0.03])
     u = u / np.linalg.norm(u)
     readings = sphere_reading(P, u, CENTRE, R)[0] + rng.normal(0, NOISE, CENTRE.shape[:2])
     beam = likelihood_fit(readings, CENTRE, R, P0, U0)

@@ -64,7 +64,7 @@ def test_a_record_without_a_scan_is_refused():
 
 def test_a_cut_off_record_is_refused():
     distance, *_ = record(3)
-    with pytest.raises(MethodError, match="holds 5.* s; a scan of 101 steps needs more than 101 s"):
+    with pytest.raises(MethodError, match=r"holds 5.* s; a scan of 101 steps needs more than 101 s"):
         segment_steps(distance[: distance.size // 2], RATE, STEPS, 1.0)
 
 
@@ -75,5 +75,5 @@ def test_another_number_of_steps_is_noticed():
 
 
 def test_a_mean_longer_than_half_a_rest_is_refused():
-    with pytest.raises(MethodError, match="at most 0.5 s"):
+    with pytest.raises(MethodError, match=r"at most 0\.5 s"):
         segment_steps(np.zeros(1000), RATE, STEPS, 1.0, 0.6)

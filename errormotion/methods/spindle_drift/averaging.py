@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 # Reassociation lets the compiler add in vectors; NaN keeps its meaning, since the kernels test for it.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 _SLICE_BYTES = 32 << 20
+# A last window that is shorter is left out: run-out does not average away in a part of it.
+_LEAST_WINDOW = 0.5
 
 
 @numba.njit(cache=True, nogil=True, fastmath=_FAST)
@@ -120,7 +122,7 @@ class Averages:
     time : ndarray, (window,)
         Mean time of the samples of each window, s, on the record's own clock.
     mean : ndarray, (channel, window)
-        Mean of the valid samples, m; NaN where fewer than ``minimum`` of them are valid.
+        Mean of the valid samples, m; NaN where fewer than ``minimum`` of a full window's are valid.
     count : ndarray, int64, (channel, window)
         Number of valid samples.
     expected : ndarray, int64, (window,)
@@ -145,6 +147,7 @@ class Averager:
         self._start = np.nan
         self._own: bool | None = None
         self._lone: tuple[NDArray[np.float64], NDArray[np.floating[Any]]] | None = None
+        self._slack = self._full = 0.0
         self._index = -1
         self._sum = np.zeros(channels)
         self._count = np.zeros(channels, np.int64)
@@ -163,13 +166,16 @@ class Averager:
                 self._lone = time.copy(), values.copy()
                 return self._averages([], [], [], [])
             self._start = float(time[0])
-            self._own = float(np.median(np.diff(time[:1000]))) > 0.5 * self._length
+            interval = float(np.median(np.diff(time[:1000])))
+            self._own = interval > 0.5 * self._length
+            self._slack = 0.5 * interval / self._length
+            self._full = self._length / interval
         if self._own:
             return _each(time, values)
-        # A thousandth of a window forgives the rounding of times that were written as decimals.
-        first = int(np.floor((time[0] - self._start) / self._length + 1e-3))
-        last = int(np.floor((time[-1] - self._start) / self._length + 1e-3))
-        bounds = self._start + (np.arange(first + 1, last + 1) - 1e-3) * self._length
+        # Half a sample of slack forgives the rounding of times that were written as decimals.
+        first = int(np.floor((time[0] - self._start) / self._length + self._slack))
+        last = int(np.floor((time[-1] - self._start) / self._length + self._slack))
+        bounds = self._start + (np.arange(first + 1, last + 1) - self._slack) * self._length
         edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
         sums, counts = window_sums(values, edges)
         samples = np.diff(edges)
@@ -195,10 +201,10 @@ class Averager:
         return self._averages(done_sum, done_count, done_time, done_samples)
 
     def finish(self) -> Averages:
-        """Return the last, possibly shorter window."""
+        """Return the last window, if enough of it was there to average the run-out away."""
         if self._lone is not None:
             return _each(*self._lone)
-        if not self._samples:
+        if not self._samples or self._samples < _LEAST_WINDOW * self._full:
             return self._averages([], [], [], [])
         last = self._averages([self._sum], [self._count], [self._time], [self._samples])
         self._samples = 0
@@ -209,7 +215,7 @@ class Averager:
         count = np.array(counts, np.int64).reshape(-1, channels).T
         total = np.array(sums, np.float64).reshape(-1, channels).T
         expected = np.array(samples, np.int64)
-        enough = count >= np.maximum(1, self._minimum * expected)
+        enough = count >= np.maximum(1, self._minimum * np.maximum(expected, 0.99 * self._full))
         mean = np.where(enough, total / np.maximum(count, 1), np.nan)
         return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
 

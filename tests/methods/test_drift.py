@@ -1,0 +1,242 @@
+"""Spindle drift from raw dataset to error dataset, against the virtual machine's truth."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import DatasetError, MethodError
+from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.twin import Event, VirtualMachine
+
+SEEN = slice(0, 5)  # EC is not seen
+TIMES = np.array([0.0, 600.0, 1800.0, 3600.0, 6000.0])
+
+
+@pytest.fixture(scope="module")
+def machine():
+    machine = VirtualMachine("cframe", seed=3)
+    machine.start([Event(0.0, 15000.0)])
+    return machine
+
+
+@pytest.fixture(scope="module")
+def method():
+    return SpindleDrift()
+
+
+def detected(machine, method, seed):
+    """Return beams as a detection finds them: origin, direction, covariance."""
+    beams = method.identify(machine.raw_beam_detection(seed=seed))
+    return beams["beam_origin"].values, beams["beam_direction"].values, beams["beam_covariance"].values
+
+
+def truth_of(machine, errors):
+    twist = np.asarray(
+        machine.truth_spindle(TIMES[: errors.sizes["time"]], errors.attrs["functional_point"]).em.twist()
+    )
+    return (twist - twist[0])[:, SEEN]
+
+
+def test_stated_intervals_hold_the_truth_and_the_joint_covariance_is_right(machine, method):
+    seeds, inside, joint, slopes = 60, [], [], []
+    for seed in range(seeds):
+        raw = machine.raw_spindle_drift(TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
+        errors = method.identify(raw, Settings(compensate_frame=False))
+        miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
+        covariance = errors["covariance"].values[:, SEEN, SEEN]
+        inside.append(np.abs(miss[1:]) <= 1.96 * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))[1:])
+        joint += [miss[t] @ np.linalg.solve(covariance[t], miss[t]) for t in range(1, 5)]
+        # The change between two late instants: the reference state drops out, which only the influences know.
+        change = errors.em.combine([0.0, 0.0, 0.0, -1.0, 1.0], dim="time")
+        value, spread = np.asarray(change[0])[SEEN], np.asarray(change[1])[SEEN, SEEN]
+        off = value - (truth_of(machine, errors)[4] - truth_of(machine, errors)[3])
+        slopes.append(off @ np.linalg.solve(spread, off))
+    # 60 seeds of 4 instants that share their reference: the share of 60 draws, within 99.9 %.
+    fraction = np.mean(inside, axis=(0, 1))
+    assert (fraction > 0.95 - 3.3 * np.sqrt(0.05 * 0.95 / seeds)).all(), fraction
+    # Chi-square of 5 freedoms: mean 5, spread sqrt(10 / 60) of the mean over seeds.
+    assert abs(np.mean(joint) - 5) < 3.3 * np.sqrt(10 / seeds)
+    assert abs(np.mean(slopes) - 5) < 3.3 * np.sqrt(10 / seeds)
+
+
+def test_noise_free_readings_give_the_truth_to_a_tenth_of_a_nanometre(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0, radius_error=False)
+    raw["distance"] = (("channel", "time"), machine.still_readings(TIMES, expansion=False))
+    errors = method.identify(raw, Settings(compensate_frame=False))
+    miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
+    assert np.abs(miss[:, :3]).max() < 1e-10  # the unseen EC acts over the 12 um to the functional point
+    assert np.abs(miss[:, 3:]).max() < 1e-9
+
+
+def test_nominal_beams_are_worse_and_say_so(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=1, beams=detected(machine, method, 1))
+    frame = machine.frame
+    raw["nominal_origin"] = (("channel", "direction"), frame.nominal_origin)
+    raw["nominal_direction"] = (("channel", "direction"), frame.nominal_direction)
+    found = {beams: method.identify(raw, Settings(beams=beams, compensate_frame=False)) for beams in ("raw", "nominal")}
+    miss = {b: np.abs(np.asarray(e.em.twist())[:, SEEN] - truth_of(machine, e)) for b, e in found.items()}
+    sigma = {b: np.sqrt(np.diagonal(e["covariance"].values, axis1=1, axis2=2))[:, SEEN] for b, e in found.items()}
+    assert miss["nominal"][-1, :2].max() > 3 * miss["raw"][-1, :2].max()
+    assert sigma["nominal"][-1, :2].min() > 3 * sigma["raw"][-1, :2].max()
+    assert (miss["nominal"][1:] < 4 * sigma["nominal"][1:]).all()
+
+
+def test_ec_is_not_seen_and_never_zero(machine, method):
+    errors = method.identify(machine.raw_spindle_drift(TIMES, seed=0))
+    assert np.isnan(errors["EC"]).all()
+    assert np.isnan(errors["covariance"].sel(dof="EC")).all()
+    validate(errors)
+
+
+def test_the_functional_point_may_be_chosen_and_only_moves_the_errors(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    at_end = method.identify(raw)
+    higher = method.identify(raw, Settings(functional_point=(0.0, 0.0, 0.08)))
+    moved = at_end.em.at([0.0, 0.0, 0.08])
+    for name in ("EX", "EY", "EZ", "EA", "EB"):
+        np.testing.assert_allclose(higher[name], moved[name], rtol=0, atol=1e-10)
+
+
+def test_the_record_stays_as_it_was(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    copy = raw.copy(deep=True)
+    method.identify(raw)
+    xr.testing.assert_identical(raw, copy)
+
+
+def test_order_of_channels_and_dims_and_float32_do_not_matter(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    other = raw.isel(channel=[4, 2, 0, 3, 1]).transpose("time", ...)
+    a, b = method.identify(raw), method.identify(other)
+    np.testing.assert_allclose(a["EZ"], b["EZ"], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(a["EA"], b["EA"], rtol=0, atol=1e-13)
+    c = method.identify(raw.assign(distance=raw["distance"].astype(np.float32)))
+    # float32 resolves a millimetre to 0.12 nm.
+    np.testing.assert_allclose(a["EX"], c["EX"], rtol=0, atol=1e-9)
+
+
+def test_means_of_a_fast_record_are_those_of_the_slow_one(machine, method):
+    """2 s at 2 kHz, averaged here, against the same readings averaged beforehand."""
+    raw = machine.raw_spindle_drift(np.arange(0, 2, 1 / 2000), seed=5, averaged=1)
+    raw = raw.drop_vars(["temperature", "spindle_speed", "sensor"])
+    slow = raw.isel(time=slice(0, None, 1000)).copy(deep=True)
+    slow["distance"] = (("channel", "time"), raw["distance"].values.reshape(5, 4, 1000).mean(axis=2))
+    slow["distance_noise"] = raw["distance_noise"] / np.sqrt(1000)
+    a, b = method.identify(raw), method.identify(slow)
+    np.testing.assert_allclose(a["EZ"], b["EZ"], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(a["covariance"], b["covariance"], rtol=1e-6, atol=1e-22)
+
+
+def test_more_noise_than_stated_is_noticed_and_raises_the_uncertainty(machine, method):
+    t = np.arange(0, 200, 0.5)
+    raw = machine.raw_spindle_drift(t, seed=6)
+    noisy = raw.copy(deep=True)
+    noisy["distance_noise"] = raw["distance_noise"] / 3
+    auto, stated = method.identify(noisy), method.identify(noisy, Settings(noise="stated"))
+    honest = method.identify(raw)
+    sigma = [np.sqrt(e["covariance"].sel(dof="EX", dof_="EX").values[-1]) for e in (auto, stated, honest)]
+    assert sigma[0] == pytest.approx(sigma[2], rel=0.15)  # 400 differences: 6 %, and two channels
+    assert sigma[1] == pytest.approx(sigma[2] / 3, rel=0.01)
+    assert any("times as much as the stated noise" in note for note in auto.attrs["notes"])
+    assert not any("stated noise" in note for note in honest.attrs["notes"])
+
+
+def test_a_sensor_out_of_range_for_ten_minutes_loses_only_these(machine, method):
+    t = np.arange(0, 3600.0, 10.0)
+    raw = machine.raw_spindle_drift(t, seed=7)
+    gap = (t >= 1200) & (t < 1800)
+    cut = raw.copy(deep=True)
+    cut["distance"][1, gap] = np.nan
+    whole, errors = method.identify(raw), method.identify(cut)
+    assert np.isnan(errors["EX"].values[gap]).all()
+    np.testing.assert_allclose(errors["EX"].values[~gap], whole["EX"].values[~gap], rtol=0, atol=1e-15)
+    assert any(note.startswith("X2: 60 of 360 means are unknown") for note in errors.attrs["notes"])
+    assert float(errors["valid_fraction"].sel(channel="X2").mean()) == pytest.approx(5 / 6)
+
+
+def test_the_frames_expansion_is_taken_out_by_its_temperature(machine, method):
+    t = np.arange(0, 6000.0, 10.0)
+    raw = machine.raw_spindle_drift(t, seed=8, expansion=True)
+    raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
+    truth = np.asarray(machine.truth_spindle(t, [0, 0, 0]).em.twist())
+    truth = truth - truth[0]
+    with_it, without = method.identify(raw), method.identify(raw, Settings(compensate_frame=False))
+    miss = [np.abs(np.asarray(e.em.twist()) - truth)[-1, :3] for e in (with_it, without)]
+    assert (miss[1] > 0.5e-6).all()  # 1.3 to 2.4 um/K over about a kelvin
+    assert (miss[0] < 0.05e-6).all()
+    sigma = np.sqrt(np.diagonal(with_it["covariance"].values[-1]))[:3]
+    assert (sigma > 0.05 * miss[1]).all()  # a tenth of what was taken out is in the budget
+
+
+def test_a_record_that_begins_with_the_spindles_start_has_its_reference_after_it(machine, method):
+    machine = VirtualMachine("cframe", seed=4)
+    machine.start([Event(0.0, 15000.0)])
+    rate = 2500.0
+    raw = machine.raw_spindle_drift(np.arange(0, 4, 1 / rate), seed=0, averaged=1)
+    raw["distance"] = (("channel", "time"), machine.distances(0, raw.sizes["time"], rate))
+    raw["spindle_speed"] = ("time", np.full(raw.sizes["time"], 15000.0))
+    errors = method.identify(raw)
+    assert np.isnan(errors["EX"].values[:2]).all()
+    assert errors["time"].values[2] == pytest.approx(0.0)
+    assert errors["EX"].values[2] == 0.0
+    run_out = method.identify(raw, Settings(reference_time=0.0))
+    # With the first half second as reference, its run-out is in every later value.
+    assert np.abs(run_out["EX"].values[3:]).min() > 5 * np.abs(errors["EX"].values[3:]).max()
+
+
+# ------------------------------------------------------------------ wrong inputs
+
+
+def spoilt(machine, name):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    if name == "missing channel":
+        return raw.isel(channel=[0, 1, 2, 4])
+    if name == "bar radius in mm":
+        return raw.assign(bar_radius=5.0)
+    if name == "parallel beams":
+        raw["beam_direction"][2:4] = raw["beam_direction"][:2].values
+    if name == "unknown beam":
+        raw["beam_origin"][3] = np.nan
+    if name == "dead sensor":
+        raw["distance"][4] = np.nan
+    if name == "no reference":
+        raw["distance"][1, 0] = np.nan
+    if name == "wrong bar":
+        raw = raw.assign(bar_radius=raw["bar_radius"] * 4)
+        raw["beam_origin"] = raw["beam_origin"] + 0.05
+    if name == "foreign schema":
+        raw.attrs["schema"] = "errormotion.raw.crossbeam_scan/1"
+    return raw
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("missing channel", DatasetError, "Y2"),
+        ("bar radius in mm", DatasetError, "bar_radius.*mm"),
+        ("parallel beams", MethodError, "X1 and Y1 are parallel"),
+        ("unknown beam", (MethodError, DatasetError), "Y2|beam_origin"),
+        ("dead sensor", MethodError, "Channel Z has no valid reading"),
+        ("no reference", MethodError, "no valid reading of X2"),
+        ("foreign schema", (MethodError, DatasetError), "crossbeam_scan|height"),
+    ],
+)
+def test_wrong_inputs_are_refused_in_words_that_help(machine, method, name, error, message):
+    with pytest.raises(error, match=f"(?s){message}"):
+        method.identify(spoilt(machine, name))
+
+
+def test_nominal_beams_that_are_not_there_are_missed(machine, method):
+    with pytest.raises(MethodError, match="nominal_origin"):
+        method.identify(spoilt(machine, ""), Settings(beams="nominal"))
+
+
+def test_plan_predicts_what_the_twin_shows(machine, method):
+    plan = method.plan()
+    validate(plan)
+    predicted = np.sqrt(np.diagonal(plan["covariance"].values[-1]))[SEEN]
+    raw = machine.raw_spindle_drift(TIMES, seed=0, beams=detected(machine, method, 0))
+    stated = np.sqrt(np.diagonal(method.identify(raw)["covariance"].values[-1]))[SEEN]
+    # The twin's frame is misaligned and its drift another one than the plan's: the same within a tenth.
+    np.testing.assert_allclose(predicted, stated, rtol=0.1)

@@ -1,0 +1,124 @@
+"""ISO 230-3 values: ranges, differences, time constant, slope, and what is known of them."""
+
+import numpy as np
+import pytest
+
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
+
+U = 1e-8
+
+
+def drift(t, tau=1500.0):
+    """Return error twists: Z rises by 20 um and settles, the bar tilts, and X turns back halfway."""
+    errors = np.full((t.size, 6), np.nan)
+    errors[:, 0] = 3e-6 * np.sin(np.pi * t / t[-1])
+    errors[:, 1] = -2e-6 * t / t[-1]
+    errors[:, 2] = 20e-6 * -np.expm1(-t / tau)
+    errors[:, 3] = 100e-6 * -np.expm1(-t / tau)
+    errors[:, 4] = -50e-6 * -np.expm1(-t / tau)
+    return errors
+
+
+def results(t, errors=None, **options):
+    errors = drift(t) if errors is None else errors
+    independent = np.tile(np.diag([U**2] * 6), (t.size, 1, 1))
+    influence = np.zeros((1, t.size, 6))
+    influence[0, 1:] = 3 * U  # the reference: one draw in all values but the first
+    series = quantities(errors, independent, influence, np.array([0.01, 0.05]))
+    settings = {"temperature": None, "sensors": (), "spindle_speed": None, "running_end": None, "sensor": None}
+    return evaluate(series, t, **(settings | options))
+
+
+def value(found, quantity, measure, table="value"):
+    return getattr(found, table)[QUANTITIES.index(quantity), MEASURES.index(measure)]
+
+
+def test_ranges_and_differences_are_told_apart():
+    t = np.arange(0, 7200.5, 0.5)
+    found = results(t)
+    assert value(found, "X1", "range_total") == pytest.approx(
+        3e-6 + abs(value(found, "B", "difference_total")) * 0.0, abs=1e-6
+    )
+    assert value(found, "Z", "range_60min") == pytest.approx(20e-6 * -np.expm1(-3600 / 1500), rel=1e-9)
+    assert value(found, "Z", "difference_total") == pytest.approx(20e-6 * -np.expm1(-7200 / 1500), rel=1e-9)
+    turned = drift(t)[:, 0] + drift(t)[:, 4] * 0.01
+    assert value(found, "X1", "range_total") == pytest.approx(np.ptp(turned), rel=1e-12)
+    assert value(found, "X1", "difference_total") == pytest.approx(turned[-1] - turned[0], rel=1e-12)
+    assert abs(value(found, "X1", "difference_total")) < 0.3 * value(found, "X1", "range_total")
+
+
+def test_levels_follow_from_displacement_and_tilt():
+    t = np.arange(0, 4000.0, 10.0)
+    found = results(t)
+    errors = drift(t)
+    np.testing.assert_allclose(found.series.value[1], errors[:, 0] + 0.05 * errors[:, 4], atol=1e-18)
+    np.testing.assert_allclose(found.series.value[2], errors[:, 1] - 0.01 * errors[:, 3], atol=1e-18)
+
+
+def test_a_difference_from_the_start_carries_the_reference_and_one_between_two_later_places_does_not():
+    t = np.arange(0, 4000.0, 10.0)
+    found = results(t)
+    assert value(found, "Z", "difference_60min", "uncertainty") == pytest.approx(U * np.sqrt(2 + 9), rel=1e-9)
+    assert found.series.difference_uncertainty(4, 100, 50) == pytest.approx(U * np.sqrt(2), rel=1e-9)
+
+
+def test_an_hour_that_was_not_measured_is_unknown():
+    found = results(np.arange(0, 1800.0, 1.0))
+    assert np.isnan(value(found, "Z", "range_60min"))
+    assert np.isfinite(value(found, "Z", "range_total"))
+
+
+def test_running_ends_where_the_speed_goes_to_zero():
+    t = np.arange(0, 7200.0, 1.0)
+    speed = np.where(t < 5000, 15000.0, 0.0)
+    found = results(t, spindle_speed=speed)
+    assert found.test == "rotating spindle"
+    assert value(found, "Z", "difference_running") == pytest.approx(20e-6 * -np.expm1(-4999 / 1500), rel=1e-9)
+    assert value(found, "Z", "range_total") > value(found, "Z", "range_running")
+
+
+def test_a_spindle_that_stands_still_makes_it_an_etve_test():
+    t = np.arange(0, 4000.0, 10.0)
+    assert results(t, spindle_speed=np.zeros(t.size)).test.startswith("ETVE")
+
+
+@pytest.mark.parametrize("tau", [300.0, 1500.0, 3000.0])
+def test_time_constant_is_found_and_never_made_up(tau):
+    t = np.arange(0, 7200.0, 1.0)
+    noise = np.random.default_rng(0).normal(0, 1e-8, (t.size, 6))
+    found = results(t, drift(t, tau) + noise)
+    assert value(found, "Z", "time_constant") == pytest.approx(tau, rel=0.01)
+    assert np.isnan(value(found, "Y1", "time_constant")) or value(found, "Y1", "time_constant") < 7200
+    straight = drift(t)
+    straight[:, 2] = 1e-9 * t
+    assert np.isnan(value(results(t, straight), "Z", "time_constant"))
+
+
+def test_end_slope_and_change_per_kelvin_with_their_uncertainty():
+    t = np.arange(0, 7200.0, 1.0)
+    errors = drift(t)
+    errors[:, 2] = 2e-9 * t
+    warmth = np.stack([np.full(t.size, 20.0), 20.0 + 1e-3 * t])
+    found = results(t, errors, temperature=warmth, sensors=("ambient", "front"))
+    assert found.sensor == "front"
+    assert value(found, "Z", "end_slope") == pytest.approx(2e-9, rel=1e-9)
+    assert value(found, "Z", "per_kelvin") == pytest.approx(2e-6, rel=1e-9)
+    # A slope over 601 s of 1 s samples with white noise: U / sqrt(sum of (t - mean)^2); the shared part drops out.
+    assert value(found, "Z", "end_slope", "uncertainty") == pytest.approx(
+        U / np.sqrt(601 * (601**2 - 1) / 12), rel=0.01
+    )
+
+
+def test_an_unknown_thermometer_is_named():
+    with pytest.raises(MethodError, match=r"iso_temperature = 'oil'.*front"):
+        results(np.arange(0, 100.0), temperature=np.ones((1, 100)), sensors=("front",), sensor="oil")
+
+
+def test_unknown_instants_are_stepped_over():
+    t = np.arange(0, 4000.0, 1.0)
+    errors = drift(t)
+    errors[100:700] = np.nan
+    assert value(results(t, errors), "Z", "range_60min") == pytest.approx(
+        value(results(t), "Z", "range_60min"), rel=1e-12
+    )
