@@ -326,24 +326,32 @@ def _failures(folder: RunFolder) -> Iterator[None]:
     """Bring what ended a test into its ``run.json`` and its log, and say where the data is."""
     try:
         yield
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         log.warning("interrupted by the operator")
         folder.step("stop", "interrupted")
         folder.save(status="interrupted", reason="stopped by the operator")
-        raise
+        raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_go_on(folder)}") from error
     except Exception as error:
         reason = str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
         log.exception("failed")
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
         folder.save(status="failed", reason=marked)
-        count = folder.data["samples"].get("count", 0)
-        kept = "The raw data is complete and kept" if folder.data["acquired"] else f"{count} samples are kept"
         raise RunError(
             f"Test '{folder.data['test']}' failed: {reason}\n"
-            f"{kept} in {folder.path}; the log is {folder.log}.\n"
-            "When the cause is mended, 'errormotion run --resume' goes on."
+            f"{_kept(folder)} in {folder.path}; the log is {folder.log}.\n"
+            f"When the cause is mended: {_go_on(folder)}"
         ) from error
+
+
+def _kept(folder: RunFolder) -> str:
+    if folder.data["acquired"]:
+        return "The raw data is complete and kept"
+    return f"{folder.data['samples'].get('count', 0)} samples are kept"
+
+
+def _go_on(folder: RunFolder) -> str:
+    return f"'errormotion run --resume --runs {folder.path.parent}' goes on."
 
 
 @contextmanager

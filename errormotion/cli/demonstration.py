@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,8 @@ from errormotion.twin import Event, VirtualMachine
 
 Array = NDArray[np.float64]
 
+CAMPAIGN = Path(__file__).parent / "demo" / "campaign.toml"
+
 UM, ARCSEC = (1e6, "um"), (648000 / np.pi, "arcsec")
 AROUND_A_STEP = 10.0
 """Seconds averaged before and after a compensation is switched off."""
@@ -39,10 +40,10 @@ class Number:
     unit: str
 
 
-def run(runs: Path, as_json: bool) -> None:
+def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     """Run the campaign, and print where the report is and the numbers that matter."""
     began = time.monotonic()
-    plan = load_campaign(Path(str(resources.files("errormotion.cli"))) / "demo" / "campaign.toml")
+    plan = load_campaign(campaign)
     beams, drift = work(plan, runs=runs, quiet=as_json)
     numbers = compare(plan, beams, drift)
     seconds = time.monotonic() - began
@@ -52,9 +53,8 @@ def run(runs: Path, as_json: bool) -> None:
         return
     settings = plan.tests[1].settings
     speed = settings.schedule[0].spindle_speed
-    show(
-        f"{plan.bench.machine}: {settings.duration / 60:.0f} simulated minutes at {speed:.0f} /min, measured over the wire"
-    )
+    minutes = f"{settings.duration / 60:.0f} simulated minutes at {speed:.0f} /min"
+    show(f"{plan.bench.machine}: {minutes}, measured over the wire")
     show(f"through {len(plan.bench.instruments)} simulated instruments in {seconds:.0f} s.\n")
     rows = [
         [n.name, f"{n.measured:.2f}", f"{n.expanded_uncertainty:.2f}", f"{n.truth:.2f}", n.unit]

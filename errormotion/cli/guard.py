@@ -8,7 +8,8 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -28,30 +29,33 @@ def guarded(function: Callable[P, None]) -> Callable[P, None]:
 
     @functools.wraps(function)
     def command(*args: P.args, **kwargs: P.kwargs) -> None:
-        as_json = bool(kwargs.get("json_", False))
-        signal.signal(signal.SIGTERM, _stop)
-        log_to_file()
-        try:
-            function(*args, **kwargs)
-            sys.stdout.flush()
-        except (typer.Exit, typer.Abort):
-            raise
-        except KeyboardInterrupt as error:
-            fail("Interrupted.", error, INTERRUPTED, as_json)
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone: nothing to tell it
-            raise typer.Exit(ERROR) from None
-        except ErrormotionError as error:
-            fail(str(error), error, ERROR, as_json)
-        except OSError as error:
-            name = f"{error.filename}: " if error.filename else ""
-            fail(f"{name}{error.strerror or error}", error, ERROR, as_json)
-        except Exception as error:  # noqa: BLE001 - the last place where it can be told to a person
-            text = f"Something went wrong that should not have: {type(error).__name__}: {error}\n"
-            text += f"The traceback is in {log_file()}."
-            fail(text, error, INTERNAL, as_json)
+        with _log(), _terminable():
+            _run(function, args, kwargs)
 
     return command
+
+
+def _run(function: Callable[..., None], args: Any, kwargs: Any) -> None:
+    as_json = bool(kwargs.get("json_", False))
+    try:
+        function(*args, **kwargs)
+        sys.stdout.flush()
+    except (typer.Exit, typer.Abort):
+        raise
+    except KeyboardInterrupt as error:
+        fail(f"Interrupted. {error}".strip(), error, INTERRUPTED, as_json)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone: nothing to tell it
+        raise typer.Exit(ERROR) from None
+    except ErrormotionError as error:
+        fail(str(error), error, ERROR, as_json)
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename else ""
+        fail(f"{name}{error.strerror or error}", error, ERROR, as_json)
+    except Exception as error:  # noqa: BLE001 - the last place where it can be told to a person
+        text = f"Something went wrong that should not have: {type(error).__name__}: {error}\n"
+        text += f"The traceback is in {log_file()}."
+        fail(text, error, INTERNAL, as_json)
 
 
 def fail(message: str, error: BaseException, code: int, as_json: bool) -> None:
@@ -70,26 +74,38 @@ def log_file() -> Path:
     return base / "errormotion" / "errormotion.log"
 
 
-def log_to_file() -> None:
-    """Send what errormotion logs to its file, 1 MB and one older file at most; and keep it off the terminal."""
-    logger = logging.getLogger("errormotion")
-    if any(isinstance(handler, RotatingFileHandler) for handler in logger.handlers):
-        return
+@contextmanager
+def _log() -> Iterator[None]:
+    """Send warnings and errors to the log file, 1 MB and one older file at most, and keep them off the terminal."""
     path = log_file()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handler = RotatingFileHandler(path, maxBytes=2**20, backupCount=1, encoding="utf-8", delay=True)
     except OSError:
-        handler = RotatingFileHandler(Path(tempfile.gettempdir()) / "errormotion.log", delay=True)
+        handler = RotatingFileHandler(Path(tempfile.gettempdir()) / "errormotion.log", encoding="utf-8", delay=True)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     handler.setLevel(logging.WARNING)
+    logger = logging.getLogger("errormotion")
+    before = logger.propagate
     logger.addHandler(handler)
     logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = before
+        handler.close()
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Obey a request to end (SIGTERM) as Ctrl-C is obeyed: in order."""
+    before = signal.signal(signal.SIGTERM, _stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _stop(*_: Any) -> None:
-    """Obey a request to end (SIGTERM) as Ctrl-C is obeyed: in order."""
     raise KeyboardInterrupt
-
-
-__all__ = ["ERROR", "INTERNAL", "INTERRUPTED", "INVALID", "OK", "USAGE", "fail", "guarded", "log_file", "log_to_file"]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import asdict
 from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from errormotion import plugins
 from errormotion.cli.output import show, show_json, table
@@ -50,13 +54,18 @@ def show_plugin(plugin_id: str, as_json: bool) -> None:
         show(f"{'needs':>10}  {', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}")
     rows = []
     for name, field in cls.Settings.model_fields.items():
-        about = schema.get("properties", {}).get(name, {})
-        default = (
-            "required" if field.is_required() else about.get("default", field.get_default(call_default_factory=True))
-        )
-        rows.append([name, str(default), str(field.description or about.get("description", ""))])
+        rows.append([name, _default(field), str(field.description or "")])
     show()
     show(table(["setting", "default (SI)", "meaning"], rows) if rows else "It has no settings.")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    default = field.get_default(call_default_factory=True)
+    if isinstance(default, BaseModel):
+        default = default.model_dump()
+    return textwrap.shorten("-" if default is None else str(default), 30, placeholder=" ...")
 
 
 def check_plugin(plugin_id: str, address: str | None, as_json: bool) -> bool:

@@ -1,0 +1,240 @@
+"""Every command answers a person in words, a program in JSON, and ends with the exit code that the reference states."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import Result
+
+from errormotion import datasets, plugins
+
+Run = Callable[..., Result]
+Answer = Callable[..., Any]
+ROOT = Path(__file__).parents[2]
+
+HEAVY = ("numpy", "scipy", "xarray", "zarr", "matplotlib", "numba", "pandas", "pint", "h5py", "serial")
+
+
+def python(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["plugins", "--help"], ["--version"]])
+def test_help_loads_nothing_heavy(words: list[str]) -> None:
+    script = (
+        "import sys\nfrom errormotion.cli import main\n"
+        f"try:\n    main({words!r})\nexcept SystemExit as end:\n    assert not end.code\n"
+        f"print('loaded:', *(name for name in {HEAVY!r} if name in sys.modules))"
+    )
+    result = python("-c", script)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "loaded:"
+
+
+def test_module_is_the_command() -> None:
+    result = python("-m", "errormotion", "--help")
+    for name in ("demo", "plugins", "bench", "run", "identify", "import", "report", "validate", "doctor"):
+        assert f"\n  {name} " in result.stdout
+
+
+def test_unknown_commands_and_options_are_mistakes_of_usage(run: Run) -> None:
+    run("frobnicate", code=2)
+    run("plugins", "list", "--frobnicate", code=2)
+    assert "--resume" in run("run", code=2).stderr
+
+
+def test_plugins_are_listed_with_what_they_are(run: Run, answer: Answer) -> None:
+    found = {plugin["id"]: plugin for plugin in answer("plugins", "list")["plugins"]}
+    assert found["spindle_drift"]["group"] == "methods"
+    assert found["optoncdt"]["kind"] == "point_lds"
+    assert found["optoncdt"]["status"] in ("hardware_verified", "replay_verified", "simulated_only")
+    assert "Micro-Epsilon" in run("plugins", "list").stdout
+
+
+def test_broken_plugin_is_listed_with_its_error(run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import EntryPoint
+
+    point = EntryPoint("broken", "nowhere_at_all:Thing", "errormotion.instruments")
+    monkeypatch.setattr(plugins, "_found", lambda: {"instruments": (point,), "methods": ()})
+    (plugin,) = answer("plugins", "list")["plugins"]
+    assert plugin["status"] == "broken"
+    assert "ModuleNotFoundError" in run("plugins", "list").stdout
+    assert "does not load: ModuleNotFoundError" in run("plugins", "show", "broken", code=1).stderr
+
+
+def test_plugin_shows_its_settings(run: Run, answer: Answer) -> None:
+    text = run("plugins", "show", "dcon_temperature").stdout
+    assert "thermometer" in text
+    assert "channels" in text
+    assert answer("plugins", "show", "spindle_drift")["settings"]["properties"]["average"]["default"] == 0.5
+
+
+def test_unknown_plugin_names_the_nearest(run: Run) -> None:
+    assert "did you mean 'optoncdt'?" in run("plugins", "show", "optoncd", code=1).stderr
+
+
+def test_plugin_check_prints_each_check_and_fails_with_the_plugin(
+    run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from errormotion import testing
+    from errormotion.testing.kit import CheckResult
+
+    good, bad = CheckResult("open", True, "opens", 0.1), CheckResult("close", False, "a thread is left", 0.2)
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address: [good], raising=False)
+    assert "dcon_temperature: passes" in run("plugins", "check", "dcon_temperature").stdout
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address: [good, bad], raising=False)
+    assert answer("plugins", "check", "dcon_temperature", code=3)["ok"] is False
+    text = run("plugins", "check", "dcon_temperature", code=3).stdout
+    assert "FAILED  close" in text
+    assert "1 of 2 checks failed" in text
+
+
+def test_identify_writes_errors_once(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
+    found = answer("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", "--set", "average=2 s")
+    assert found["component"] == "spindle"
+    assert {result["name"] for result in found["results"]} == {"EX", "EY", "EZ", "EA", "EB"}
+    errors = datasets.load(tmp_path / "errors.nc")
+    assert json.loads(errors.attrs["provenance"])["settings"]["average"] == 2.0
+    again = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", code=1)
+    assert "never overwritten" in again.stderr
+
+
+def test_settings_come_from_a_file_and_single_ones_over_it(run: Run, raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "settings.toml").write_text('average = "4 s"\nnoise = "stated"\n')
+    options = ("--settings", "settings.toml", "--set", "average='2 s'", "--set", "layout.rate=1.5 kHz")
+    run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", *options)
+    settings = json.loads(datasets.load(tmp_path / "errors.nc").attrs["provenance"])["settings"]
+    assert (settings["average"], settings["noise"], settings["layout"]["rate"]) == (2.0, "stated", 1500.0)
+
+
+def test_wrong_settings_are_all_told_at_once(run: Run, raw: Path, tmp_path: Path) -> None:
+    options = ("--set", "average=2", "--set", "avrage=2 s", "--set", "bar_radius_uncertainty=1 s")
+    text = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", *options, code=1).stderr
+    assert "--set: 3 mistakes" in text
+    assert "average: expected a time with its unit" in text
+    assert "avrage: unknown key; did you mean 'average'?" in text
+    assert "bar_radius_uncertainty: expected a length" in text
+    assert not (tmp_path / "errors.nc").exists()
+    wrong = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", "--set", "average", code=1)
+    assert "expected key=value" in wrong.stderr
+
+
+def test_error_is_one_message_and_the_traceback_is_in_the_log(run: Run, answer: Answer, tmp_path: Path) -> None:
+    result = run("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)
+    assert "nothing.nc: cannot be read: there is no such file" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert "Traceback" in (tmp_path / "state" / "errormotion" / "errormotion.log").read_text()
+    error = answer("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)["error"]
+    assert error["type"] == "DatasetError"
+    assert error["exit_code"] == 1
+
+
+def test_mistake_of_ours_has_its_own_exit_code_and_names_the_log(
+    run: Run, raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise KeyError("oops")
+
+    monkeypatch.setattr(plugins.get("methods", "spindle_drift"), "identify", broken)
+    result = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", code=70)
+    assert "KeyError: 'oops'" in result.stderr
+    assert str(tmp_path / "state" / "errormotion" / "errormotion.log") in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_validate_tells_every_violation(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
+    assert answer("validate", raw)["ok"] is True
+    assert "raw.nc: good" in run("validate", raw).stdout
+    with datasets.load(raw) as good:
+        bad = good.load().drop_vars(["bar_radius", "level"])
+    datasets.save(bad, tmp_path / "bad.nc")
+    found = answer("validate", "bad.nc", code=3)
+    assert len(found["violations"]) == 2
+    assert "bar_radius" in run("validate", "bad.nc", code=3).stdout
+    (tmp_path / "cut.nc").write_bytes(raw.read_bytes()[:5000])
+    assert "truncated" in answer("validate", "cut.nc", code=3)["violations"][0]
+
+
+def test_report_of_a_file_of_errors(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
+    run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc")
+    assert answer("report", "errors.nc")["report"] == "errors.html"
+    assert "<html" in (tmp_path / "errors.html").read_text()
+    assert "run folder" in run("report", tmp_path, code=1).stderr
+
+
+def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> None:
+    names = ("X1", "X2", "Y1", "Y2", "Z")
+    lines = ["t," + ",".join(names), *(f"{k / 2},1.1,1.2,1.3,1.4,1.{k}" for k in range(9))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    head = 'schema = "errormotion.map/1"\nmachine = "C-frame"\nbar_radius = "5 mm"\ndistance_noise = "0.3 um"\n'
+    head += 'levels = ["10 mm", "50 mm"]\ntime = {column = "t", unit = "s"}\n'
+    places = ["6 mm,0 mm,10 mm", "6 mm,0 mm,50 mm", "0 mm,6 mm,10 mm", "0 mm,6 mm,50 mm", "0 mm,0 mm,-1 mm"]
+    directions = ["[-1,0,0]", "[-1,0,0]", "[0,-1,0]", "[0,-1,0]", "[0,0,1]"]
+    for name, place, direction in zip(names, places, directions, strict=True):
+        head += (
+            f'[channels.{name}]\ncolumn = "{name}"\nunit = "mm"\norigin = {place.split(",")}\ndirection = {direction}\n'
+        )
+    (tmp_path / "map.toml").write_text(head)
+    found = answer("import", "log.csv", "--map", "map.toml", "--out", "raw.nc")
+    assert found["sizes"] == {"channel": 5, "time": 9, "direction": 3, "height": 2}
+    (tmp_path / "log.csv").write_text("t,X1\n")
+    run("import", "log.csv", "--map", "map.toml", "--out", "other.nc", code=1)
+
+
+def test_doctor_finds_this_machine_well_and_says_what_is_not(
+    run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from errormotion.cli import examination
+
+    monkeypatch.setattr(examination, "LEAST_DISK", 0)
+    assert answer("doctor")["ok"] is True
+    monkeypatch.setattr(examination, "LEAST_DISK", 2**60)
+    assert "BAD  disk here" in run("doctor", code=1).stdout
+
+
+BENCH = ROOT / "examples" / "virtual_cframe" / "bench.toml"
+
+
+def test_bench_validate_opens_nothing(run: Run, answer: Answer, tmp_path: Path) -> None:
+    assert [i["kind"] for i in answer("bench", "validate", BENCH)["instruments"]] == [
+        "spindle_frame",
+        "controller",
+        "thermometer",
+    ]
+    (tmp_path / "bench.toml").write_text(BENCH.read_text().replace('"5 mm"', "5").replace("rate", "raet"))
+    text = run("bench", "validate", "bench.toml", code=3).stderr
+    assert "bench.toml: 2 mistakes" in text
+    assert "instruments.frame.bar_radius: expected a length with its unit" in text
+    assert "instruments.frame.raet: unknown key; did you mean 'rate'?" in text
+    assert answer("bench", "validate", "bench.toml", code=3)["ok"] is False
+
+
+def test_bench_probe_reads_every_instrument(run: Run, answer: Answer, tmp_path: Path) -> None:
+    found = answer("bench", "probe", BENCH)
+    assert found["ok"] is True
+    assert len(found["instruments"][0]["reading"]) == 5
+    text = BENCH.read_text().replace("sim://cframe/thermometer?seed=3", "tcp://127.0.0.1:1")
+    (tmp_path / "bench.toml").write_text(text)
+    table = run("bench", "probe", "bench.toml", code=1).stdout.splitlines()
+    assert "five_sensor_frame with ILD2300" in table[2]
+    assert "FAILED: InstrumentError" in table[4]
+
+
+def test_example_is_the_campaign_that_the_demo_runs() -> None:
+    for name in ("bench.toml", "campaign.toml"):
+        example = ROOT / "examples" / "virtual_cframe" / name
+        assert example.read_text() == (ROOT / "errormotion" / "cli" / "demo" / name).read_text()
+
+
+def test_log_falls_back_where_the_state_folder_cannot_be_made(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    run("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)
+    assert "Traceback" in (tmp_path / "errormotion.log").read_text()
