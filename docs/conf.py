@@ -1,5 +1,10 @@
 """Sphinx settings: MyST pages, furo, API pages from the numpy-style docstrings."""
 
+import re
+from typing import Any
+
+from sphinx.application import Sphinx
+
 import errormotion
 
 project = "errormotion"
@@ -16,9 +21,24 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings say type, shape and unit
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = f"errormotion {release}"
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#1f5a96", "color-brand-content": "#1f5a96"},
 }
+
+
+def _escape_second_dims(*event: Any) -> None:
+    """Keep ``(dof, dof_)`` from being read as a link to "dof": second dims are named with an underscore here."""
+    lines = event[-1]
+    for i, line in enumerate(lines):
+        parts = line.split("``")  # every second part is code already
+        parts[::2] = [re.sub(r"(?<!\w)(\w+)_(?=[\s,)]|$)", r"\1\_", part) for part in parts[::2]]
+        lines[i] = "``".join(parts)
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _escape_second_dims)
