@@ -61,11 +61,11 @@ def spindle_drift(
     origin, direction, covariance = beams
     variables: dict[str, Any] = {
         "distance": (("channel", "time"), readings, _M),
-        "beam_origin": (("channel", "direction"), origin, _M),
-        "beam_direction": (("channel", "direction"), direction, _1),
+        "beam_origin": (("channel", "direction"), np.array(origin), _M),
+        "beam_direction": (("channel", "direction"), np.array(direction), _1),
         "bar_radius": ((), bar_radius, _M),
         "distance_noise": ((), noise, _M),
-        "level": ("height", frame.levels, _M),
+        "level": ("height", np.array(frame.levels), _M),
         **extras,
     }
     if covariance is not None:
@@ -129,8 +129,8 @@ def beam_detection(
         "sphere_centre": (("channel", "profile", "step", "direction"), centres, _M),
         "sphere_radius": ((), sphere_radius, _M),
         "scan_direction": (("channel", "profile", "direction"), scans, _1),
-        "nominal_origin": (("channel", "direction"), frame.nominal_origin, _M),
-        "nominal_direction": (("channel", "direction"), frame.nominal_direction, _1),
+        "nominal_origin": (("channel", "direction"), np.array(frame.nominal_origin), _M),
+        "nominal_direction": (("channel", "direction"), np.array(frame.nominal_direction), _1),
         "distance_noise": ((), float(np.hypot(noise.max(), repeatability)), _M),
     }
     coords = {"channel": list(frame.channels), "direction": list("xyz")}

@@ -26,7 +26,14 @@ def results(t, errors=None, **options):
     influence = np.zeros((1, t.size, 6))
     influence[0, 1:] = 3 * U  # the reference: one draw in all values but the first
     series = quantities(errors, independent, influence, np.array([0.01, 0.05]))
-    settings = {"temperature": None, "sensors": (), "spindle_speed": None, "running_end": None, "sensor": None}
+    settings = {
+        "temperature": None,
+        "sensors": (),
+        "spindle_speed": None,
+        "running_end": None,
+        "sensor": None,
+        "average": 30.0,
+    }
     return evaluate(series, t, **(settings | options))
 
 
@@ -40,11 +47,13 @@ def test_ranges_and_differences_are_told_apart():
     assert value(found, "X1", "range_total") == pytest.approx(
         3e-6 + abs(value(found, "B", "difference_total")) * 0.0, abs=1e-6
     )
-    assert value(found, "Z", "range_60min") == pytest.approx(20e-6 * -np.expm1(-3600 / 1500), rel=1e-9)
-    assert value(found, "Z", "difference_total") == pytest.approx(20e-6 * -np.expm1(-7200 / 1500), rel=1e-9)
+    # Means of half a minute of a curve that rises by 13 nm/s at first: 0.2 um at the start, 5 nm at the end.
+    assert value(found, "Z", "range_60min") == pytest.approx(20e-6 * -np.expm1(-3600 / 1500), abs=0.22e-6)
+    assert value(found, "Z", "difference_60min") == pytest.approx(20e-6 * -np.expm1(-3600 / 1500), abs=0.02e-6)
+    assert value(found, "Z", "difference_total") == pytest.approx(20e-6 * -np.expm1(-7200 / 1500), abs=0.002e-6)
     turned = drift(t)[:, 0] + drift(t)[:, 4] * 0.01
-    assert value(found, "X1", "range_total") == pytest.approx(np.ptp(turned), rel=1e-12)
-    assert value(found, "X1", "difference_total") == pytest.approx(turned[-1] - turned[0], rel=1e-12)
+    assert value(found, "X1", "range_total") == pytest.approx(np.ptp(turned), rel=0.02)
+    assert value(found, "X1", "difference_total") == pytest.approx(turned[-1] - turned[0], abs=0.022e-6)  # 1.3 nm/s
     assert abs(value(found, "X1", "difference_total")) < 0.3 * value(found, "X1", "range_total")
 
 
@@ -59,8 +68,20 @@ def test_levels_follow_from_displacement_and_tilt():
 def test_a_difference_from_the_start_carries_the_reference_and_one_between_two_later_places_does_not():
     t = np.arange(0, 4000.0, 10.0)
     found = results(t)
-    assert value(found, "Z", "difference_60min", "uncertainty") == pytest.approx(U * np.sqrt(2 + 9), rel=1e-9)
-    assert found.series.difference_uncertainty(4, 100, 50) == pytest.approx(U * np.sqrt(2), rel=1e-9)
+    # Three instants of 10 s in half a minute, one at the start, and the reference between them.
+    u = value(found, "Z", "difference_60min", "uncertainty")
+    assert u == pytest.approx(U * np.sqrt(1 / 3 + 1 + 9), rel=1e-9)
+    assert found.series.difference(4, np.array([100]), np.array([50]))[1] == pytest.approx(U * np.sqrt(2), rel=1e-9)
+
+
+def test_noise_does_not_widen_a_range():
+    t = np.arange(0, 7200.0, 0.5)
+    errors = drift(t)
+    errors[:, 2] += np.random.default_rng(0).normal(0, 0.1e-6, t.size)
+    # Of 7200 single values the largest lies 3.7 sigma out, on either side; of means of 60 half a sigma at most.
+    assert value(results(t, errors), "Z", "range_60min") == pytest.approx(
+        value(results(t), "Z", "range_60min"), abs=0.05e-6
+    )
 
 
 def test_an_hour_that_was_not_measured_is_unknown():
@@ -74,7 +95,7 @@ def test_running_ends_where_the_speed_goes_to_zero():
     speed = np.where(t < 5000, 15000.0, 0.0)
     found = results(t, spindle_speed=speed)
     assert found.test == "rotating spindle"
-    assert value(found, "Z", "difference_running") == pytest.approx(20e-6 * -np.expm1(-4999 / 1500), rel=1e-9)
+    assert value(found, "Z", "difference_running") == pytest.approx(20e-6 * -np.expm1(-4999 / 1500), abs=0.01e-6)
     assert value(found, "Z", "range_total") > value(found, "Z", "range_running")
 
 

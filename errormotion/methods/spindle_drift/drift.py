@@ -124,6 +124,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         spindle_speed=record.spindle_speed,
         running_end=settings.running_end,
         sensor=settings.iso_temperature,
+        average=settings.iso_average,
     )
     extras |= results.as_extras(time)
     start = str(raw.attrs.get("start", ""))

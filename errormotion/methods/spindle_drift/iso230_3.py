@@ -2,8 +2,9 @@
 
 Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. Of
 each, the range over a period and the difference between its end and its start; which is which is part of the name,
-since the two differ as soon as a curve turns back. The uncertainty of a range is that of the difference between the two
-instants that carry it.
+since the two differ as soon as a curve turns back. The largest and the smallest of thousands of noisy values lie too
+far apart; so ranges are taken over means of half a minute, and the uncertainty of a range is that of the difference
+between the two means that carry it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
+    Index = NDArray[np.int64]
 
 QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")
 MEASURES = (
@@ -50,14 +52,13 @@ class Series:
     influence: Array
     variance: Array
 
-    def difference_uncertainty(self, k: int, i: int, j: int) -> float:
-        """Return the standard uncertainty of quantity k at instant i minus at instant j."""
-        if i == j:
-            return 0.0
-        shared = self.influence[:, k, i] - self.influence[:, k, j]
-        return float(np.sqrt(shared @ shared + self.variance[k, i] + self.variance[k, j]))
+    def difference(self, k: int, later: Index, earlier: Index) -> tuple[float, float]:
+        """Return value and standard uncertainty of quantity k's mean over some instants minus that over others."""
+        index = np.concatenate([later, earlier])
+        weights = np.concatenate([np.full(later.size, 1.0 / later.size), np.full(earlier.size, -1.0 / earlier.size)])
+        return self.weighted(k, index, weights)
 
-    def weighted(self, k: int, index: NDArray[np.int64], weights: Array) -> tuple[float, float]:
+    def weighted(self, k: int, index: Index, weights: Array) -> tuple[float, float]:
         """Return value and standard uncertainty of a weighted sum of quantity k over some instants."""
         shared = self.influence[:, k, index] @ weights
         own = self.variance[k, index] @ weights**2
@@ -121,8 +122,12 @@ def evaluate(
     spindle_speed: Array | None,
     running_end: float | None,
     sensor: str | None,
+    average: float,
 ) -> Results:
-    """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state."""
+    """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state.
+
+    ``average`` (s) is the length of the means over which ranges and end values are taken.
+    """
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
     uncertainty = np.full_like(value, np.nan)
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
@@ -133,18 +138,17 @@ def evaluate(
     for k in range(len(QUANTITIES)):
         known = np.isfinite(series.value[k]) & (time >= -1e-9)
         for column, until in ((0, HOUR), (2, end), (4, time[-1])):
-            if time[-1] < until - 1.5 * step:
-                continue
             inside = np.flatnonzero(known & (time <= until + 1e-6))
-            if inside.size < 2:
+            if inside.size < 2 or time[-1] < until - 1.5 * step:
                 continue
-            top, bottom = inside[series.value[k, inside].argmax()], inside[series.value[k, inside].argmin()]
-            first, last = inside[0], inside[-1]
-            value[k, column] = series.value[k, top] - series.value[k, bottom]
-            uncertainty[k, column] = series.difference_uncertainty(k, top, bottom)
-            if time[last] >= until - max(10 * step, 5.0):
-                value[k, column + 1] = series.value[k, last] - series.value[k, first]
-                uncertainty[k, column + 1] = series.difference_uncertainty(k, last, first)
+            blocks = _blocks(inside, time, average)
+            means = np.array([series.value[k, block].mean() for block in blocks])
+            top, bottom = blocks[means.argmax()], blocks[means.argmin()]
+            value[k, column], uncertainty[k, column] = (
+                series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0)
+            )
+            if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
+                value[k, column + 1], uncertainty[k, column + 1] = series.difference(k, blocks[-1], inside[:1])
         running = np.flatnonzero(known & (time <= end))
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
@@ -156,6 +160,12 @@ def evaluate(
                 value[k, 8], uncertainty[k, 8] = series.weighted(k, warm, _slope_weights(change[warm]))
     test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"
     return Results(test, value, uncertainty, hottest, series)
+
+
+def _blocks(index: Index, time: Array, length: float) -> list[Index]:
+    """Cut instants into blocks of ``length`` seconds, counted back from the last one, which is whole."""
+    age = np.floor((time[index[-1]] - time[index]) / length + 1e-9)
+    return list(np.split(index, np.flatnonzero(np.diff(age)) + 1))
 
 
 def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:

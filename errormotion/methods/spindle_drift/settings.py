@@ -104,6 +104,9 @@ class Settings(PluginSettings):
     running_end: Time | None = Field(
         default=None, gt=0, description="end of running; default where the speed goes to zero"
     )
+    iso_average: Time = Field(
+        default=30.0, gt=0, description="length of the means over which ranges and end values are taken"
+    )
     iso_temperature: str | None = Field(
         default=None, description="temperature sensor for the change per kelvin; default the one that changes most"
     )
