@@ -176,6 +176,20 @@ def number_format(subject: MethodSubject) -> str:
 
 
 @METHOD_CHECKS.add()
+def units(subject: MethodSubject) -> str:
+    """Measured values in mm, marked as such, give the same errors or a typed error, never others."""
+    raw, _ = subject.make(0)
+    lengths = [name for name in measured_variables(subject, raw) if raw[name].attrs.get("units") == "m"]
+    require(bool(lengths), "no measured variable has the attribute units = 'm'")
+    straight, verdicts = subject.identify(raw), []
+    for name in lengths:
+        field = raw.copy()
+        field[name] = (raw[name] * 1e3).assign_attrs(units="mm")
+        verdicts.append(_same_or_refused(subject, straight, field, f"{name} in mm"))
+    return "; ".join(verdicts)
+
+
+@METHOD_CHECKS.add()
 def layout(subject: MethodSubject) -> str:
     """The order of dimensions does not matter, nor that of labels along them, unless a typed error refuses it."""
     raw, _ = subject.make(0)

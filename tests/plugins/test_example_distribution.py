@@ -57,7 +57,8 @@ def test_its_own_test_passes_where_it_lies():
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *arguments],
         cwd=EXAMPLE,
-        env=os.environ | {"PYTHONPATH": str(EXAMPLE), "PYTHONDONTWRITEBYTECODE": "1"},
+        env=os.environ
+        | {"PYTHONPATH": str(EXAMPLE), "PYTHONDONTWRITEBYTECODE": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
         capture_output=True,
         text=True,
     )

@@ -8,7 +8,6 @@ import xarray as xr
 from pydantic import ConfigDict
 
 from errormotion import datasets
-from errormotion.datasets import provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.plugins import MethodInfo, Needs, PluginSettings
@@ -49,7 +48,12 @@ class Sound:
         missing = [name for name in NEEDED if name not in raw]
         if missing:
             raise MethodError(f"missing: {', '.join(missing)}")
-        return raw
+        self.check_unit(raw["displacement"].attrs.get("units"))
+        return raw.sel(direction=["x", "y", "z"])
+
+    def check_unit(self, unit):
+        if unit != "m":
+            raise MethodError(f"displacement: expected units m, found {unit}")
 
     def displacement(self, raw):
         return raw["displacement"].transpose("channel", "time").values.astype(float)
@@ -64,14 +68,12 @@ class Sound:
         values = self.values((gain @ readings).T, gain)
         source = np.repeat(CALIBRATION * gain.T[:, None, :], len(values), axis=1)
         spread = np.broadcast_to((settings.noise**2 + CALIBRATION**2) * gain @ gain.T, (len(values), 6, 6))
-        return self.result(
-            raw["time"].values, values, spread, source, point, list(raw["channel"].values), settings, raw
-        )
+        return self.result(raw["time"].values, values, spread, source, point, list(raw["channel"].values), settings)
 
     def values(self, values, gain):
         return values
 
-    def result(self, time, values, spread, source, point, channels, settings, raw):
+    def result(self, time, values, spread, source, point, channels, settings):
         return datasets.build_errors(
             values,
             spread,
@@ -84,7 +86,7 @@ class Sound:
             reference="time 0",
             method="body",
             method_version="1",
-            provenance=provenance.make(settings, raw, []),
+            provenance={"settings": settings.model_dump()},
             influence=source,
             sources=channels,
             source_groups=["calibration"] * len(channels),
@@ -93,9 +95,7 @@ class Sound:
     def plan(self, settings):
         raw, _ = make(0)
         errors = self.identify(raw, settings)
-        return errors.assign({name: errors[name] * 0 for name in datasets.DOF}).assign(
-            {name: (errors[name] * 0).assign_attrs(errors[name].attrs) for name in datasets.DOF}
-        )
+        return errors.assign({name: (errors[name] * 0).assign_attrs(errors[name].attrs) for name in datasets.DOF})
 
 
 def design(origin, beam, point):
@@ -200,6 +200,11 @@ class TakesSinglePrecisionForMicrometres(Sound):
         return super().displacement(raw) * (1.0 if raw["displacement"].dtype == np.float64 else 1e-6)
 
 
+class TakesMillimetresForMetres(Sound):
+    def check_unit(self, unit):
+        pass
+
+
 class CountsOnTheOrderOfDimensions(Sound):
     def displacement(self, raw):
         return raw["displacement"].values.astype(float)
@@ -222,15 +227,17 @@ class TakesNothingForZero(Sound):
 
 class LeavesItsMark(Sound):
     def checked(self, raw):
-        super().checked(raw)["displacement"].attrs["identified"] = "yes"
-        return raw
+        checked = super().checked(raw)
+        raw["displacement"].attrs["identified"] = "yes"
+        return checked
 
 
 class ReadsMemoryOnly(Sound):
     def checked(self, raw):
-        if not isinstance(super().checked(raw)["displacement"].variable._data, np.ndarray):
+        checked = super().checked(raw)
+        if not isinstance(raw["displacement"].variable._data, np.ndarray):
             raise MethodError("expected arrays in memory")
-        return raw
+        return checked
 
 
 class PlansOneFreedom(Sound):
@@ -239,9 +246,7 @@ class PlansOneFreedom(Sound):
         values = np.stack([planned[name].values for name in datasets.DOF], axis=-1)
         values[:, 1:] = np.nan
         unit = np.broadcast_to(np.eye(6) * 1e-14, (12, 6, 6))
-        return self.result(
-            planned["time"].values, values, unit, np.zeros((8, 12, 6)), np.zeros(3), CHANNELS, settings, None
-        )
+        return self.result(planned["time"].values, values, unit, np.zeros((8, 12, 6)), np.zeros(3), CHANNELS, settings)
 
 
 BROKEN = [
@@ -255,6 +260,7 @@ BROKEN = [
     ("differences", ForgetsWhatTimesShare),
     ("frame_invariance", KnowsOnlyItsOwnFrame),
     ("number_format", TakesSinglePrecisionForMicrometres),
+    ("units", TakesMillimetresForMetres),
     ("layout", CountsOnTheOrderOfDimensions),
     ("refuses_missing_inputs", RaisesKeyErrors),
     ("refuses_missing_inputs", TakesAnySchema),
