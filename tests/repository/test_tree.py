@@ -27,14 +27,14 @@ def _lines(paths: list[Path]) -> list[tuple[str, str]]:
         data = path.read_bytes()
         if b"\0" not in data:
             name = path.relative_to(ROOT)
-            found += [(f"{name}:{n}", line) for n, line in enumerate(data.decode().splitlines(), 1)]
+            found += [(f"{name}:{n}", line) for n, line in enumerate(data.decode(errors="replace").splitlines(), 1)]
     return found
 
 
 @pytest.mark.parametrize(
     ("what", "pattern"),
     [
-        ("a path of one machine", r"(?<![\w.$}])/(?:root|home|work|Users|tmp)/(?!\.\.\.)\w"),
+        ("a path of one machine", r"(?<![\w.$}])/(?:root|home|work|Users)/\w"),
         ("the address of a package index", r"pypi\.|pythonhosted|(?:--|extra-)index" + "-url=?\\s*\\S*://"),
         ("the number of an issue", r"(?i)\b(?:issue|ticket|task) ?#?\d"),
     ],
@@ -58,9 +58,10 @@ def test_changelog_names_this_version() -> None:
 def test_makefile_has_the_targets_that_the_docs_promise() -> None:
     have = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
-    promised = {
-        target for page in pages for target in re.findall(r"(?:`|\$ |^)make ([a-z]+)", page.read_text(), re.MULTILINE)
-    }
+    code = re.compile(r"^```(?:sh|console)$.*?^```|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+    called = re.compile(r"(?:^|`|\$ |&& )make ([a-z]+)", re.MULTILINE)
+    blocks = [block for page in pages for block in code.findall(page.read_text())]
+    promised = {target for block in blocks for target in called.findall(block)}
     assert have >= TARGETS
     assert promised <= have
 
