@@ -1,0 +1,19 @@
+"""The page on checking a plugin lists every check, with the claim that the code makes."""
+
+from pathlib import Path
+
+import pytest
+
+from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
+from errormotion.testing.method_checks import METHOD_CHECKS
+
+PAGE = (Path(__file__).parents[2] / "docs" / "how-to" / "check-a-plugin.md").read_text()
+
+
+@pytest.mark.parametrize("check", [*INSTRUMENT_CHECKS, *METHOD_CHECKS], ids=lambda check: check.name)
+def test_lists_the_check_with_its_claim(check):
+    assert f"| `{check.name}` | {check.claim.replace('``', '`')} |" in PAGE
+
+
+def test_lists_no_other_check():
+    assert PAGE.count("\n| `") == len(INSTRUMENT_CHECKS) + len(METHOD_CHECKS)
