@@ -44,7 +44,7 @@ def drift(seeds: int) -> list[str]:
     score = np.array(miss) / np.array(sigma)
     chance = np.sqrt(0.05 * 0.95 / seeds)
     rows = [
-        "| freedom | coverage of 95 % intervals | at single instants | spread / stated | bias / stated | stated (k = 1) |",
+        "| freedom | coverage of 95 % intervals | at single instants | spread/stated | bias/stated | stated (k = 1) |",
         "|---|---|---|---|---|---|",
     ]
     for k, name in enumerate(FREEDOMS):
@@ -91,7 +91,7 @@ def beams(seeds: int) -> list[str]:
     )
     units = [("um", 1e6)] * 3 + [("urad", 1e6)] * 3
     rows = [
-        "| parameter | bound (k = 1) | likelihood fit / bound | circles and line / bound | coverage of 95 % intervals |",
+        "| parameter | bound (k = 1) | likelihood fit/bound | circles and line/bound | coverage of 95 % intervals |",
         "|---|---|---|---|---|",
     ]
     ratio, construction = (np.sqrt(np.mean(np.square(part), axis=0)) for part in (ours, paper))
@@ -120,8 +120,8 @@ def main() -> None:
         "# Validation",
         "",
         "Every figure on this page comes from one run of `make validate`; none is typed in. The truth is that of the",
-        "[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of each estimator's own model. A",
-        "ratio of 1 means that no unbiased estimator can do better.",
+        "[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of each estimator's own model.",
+        "A ratio of 1 means that no unbiased estimator can do better.",
         "",
         "## Spindle drift",
         "",
