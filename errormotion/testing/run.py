@@ -73,17 +73,20 @@ def subjects_of(
         Nothing is stated and nothing can be guessed.
     """
     cls = plugins.get(group, plugin_id)
-    stated = load_object(cls.conformance) if hasattr(cls, "conformance") else builtin_subjects(group, plugin_id, cls)
-    if not stated:
-        if group == "methods":
-            raise PluginError(
-                f"The method '{plugin_id}' does not say how to check it; give its class an attribute "
-                "conformance = 'module:name' that names a MethodSubject."
-            )
+    if hasattr(cls, "conformance"):
+        stated = load_object(cls.conformance)
+        subjects = stated if isinstance(stated, tuple) else (stated,)
+        if not all(isinstance(subject, InstrumentSubject | MethodSubject) for subject in subjects):
+            raise PluginError(f"'{cls.conformance}' of '{plugin_id}' is no InstrumentSubject or MethodSubject")
+    else:
+        subjects = builtin_subjects(group, plugin_id, cls)
+    if not subjects and group == "methods":
+        raise PluginError(
+            f"The method '{plugin_id}' does not say how to check it; give its class an attribute "
+            "conformance = 'module:name' that names a MethodSubject."
+        )
+    if not subjects:
         if address is None and not cls.info.simulator:
             raise PluginError(f"The instrument '{plugin_id}' has no simulator; give the address of a real one.")
-        stated = InstrumentSubject(cls, address or SIMULATED)
-    subjects = stated if isinstance(stated, tuple) else (stated,)
-    if address is None:
-        return subjects
-    return tuple(replace(subject, address=address) for subject in subjects)
+        subjects = (InstrumentSubject(cls, address or SIMULATED),)
+    return subjects if address is None else tuple(replace(subject, address=address) for subject in subjects)

@@ -1,0 +1,79 @@
+"""``check_plugin`` finds what to check, runs every check, and says what is missing."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from errormotion import plugins
+from errormotion.errors import PluginError
+from errormotion.plugins import InstrumentInfo, MethodInfo
+from errormotion.testing import InstrumentSubject, check_plugin, run_checks
+from errormotion.testing.run import subjects_of
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Put a class into the registry, under the id that it calls itself."""
+
+    def register(**attributes):
+        cls = type("Foreign", (), attributes)
+        monkeypatch.setattr(plugins, "get", lambda group, plugin_id: cls)
+        return cls
+
+    return register
+
+
+def test_runs_every_check_and_tells_which_do_not_apply():
+    results = check_plugin("instruments", "dcon_temperature")
+    assert all(result.ok for result in results)
+    assert {result.name for result in results if result.skipped} == {"stream_blocks", "monotonic_time", "counted_drops"}
+
+
+def test_an_address_takes_the_place_of_the_simulator():
+    (subject,) = subjects_of("instruments", "dcon_temperature", address="sim://cframe?seed=8")
+    assert subject.address == "sim://cframe?seed=8"
+
+
+def test_a_plugin_names_its_own_subjects(registered, tmp_path, monkeypatch):
+    (tmp_path / "mine_kit.py").write_text(
+        "from errormotion.testing import MethodSubject\n"
+        "ONE, TWO = (MethodSubject(None, None, {}, name=name) for name in ('one', 'two'))\n"
+        "BOTH = (ONE, TWO)\n"
+        "NONE = 3\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    info = MethodInfo("mine", "", "simulated_only")
+    registered(info=info, conformance="mine_kit:ONE")
+    assert [subject.name for subject in subjects_of("methods", "mine")] == ["one"]
+    registered(info=info, conformance="mine_kit:BOTH")
+    assert [subject.name for subject in subjects_of("methods", "mine")] == ["one", "two"]
+    registered(info=info, conformance="mine_kit:NONE")
+    with pytest.raises(PluginError, match="is no InstrumentSubject or MethodSubject"):
+        subjects_of("methods", "mine")
+
+
+def test_a_method_that_names_none_is_told_how_to(registered):
+    registered(info=MethodInfo("mine", "", "simulated_only"))
+    with pytest.raises(PluginError, match="conformance = 'module:name'"):
+        subjects_of("methods", "mine")
+
+
+def test_an_instrument_without_simulator_needs_an_address(registered):
+    registered(info=InstrumentInfo("mine", "point_lds", "", "hardware_verified"))
+    with pytest.raises(PluginError, match="give the address of a real one"):
+        subjects_of("instruments", "mine")
+    (subject,) = subjects_of("instruments", "mine", address="tcp://127.0.0.1:9")
+    assert not subject.simulated
+
+
+def test_an_unknown_plugin_is_named_with_the_nearest():
+    with pytest.raises(PluginError, match="Did you mean 'optoncdt'"):
+        check_plugin("instruments", "optonct")
+
+
+def test_a_simulator_that_does_not_load_fails_its_checks_and_stops_no_other():
+    info = InstrumentInfo("mine", "point_lds", "A sensor of nobody", "simulated_only", simulator="no_such:Device")
+    subject = InstrumentSubject(SimpleNamespace(info=info), "sim://cframe")
+    results = {result.name: result for result in run_checks(subject)}
+    assert "'no_such:Device' does not load" in results["info_complete"].message
+    assert not any(result.ok for name, result in results.items() if name in ("info_complete", "faults"))
