@@ -23,7 +23,7 @@ ADDRESS = "sim://cframe?seed=3"
 
 
 def settings(**changes: object) -> FrameSettings:
-    return FrameSettings(**{"rate": 1500.0, "timeout": 0.3, **changes})
+    return FrameSettings(**{"rate": 1500.0, "timeout": 10.0, **changes})
 
 
 def with_fault(channel: str, fault: str, **changes: object) -> FrameSettings:
@@ -95,14 +95,14 @@ def test_one_stream_at_a_time() -> None:
 
 @pytest.mark.parametrize("channel", ["X1", "Y2", "Z"])
 def test_a_stalled_channel_is_named(channel: str) -> None:
-    frame = FiveSensorFrame(settings=with_fault(channel, "silence&fault_at=2000"))
-    with frame, pytest.raises(InstrumentTimeoutError, match=f"^{channel}: no data for 0.3 s"):
+    frame = FiveSensorFrame(settings=with_fault(channel, "silence&fault_at=2000", timeout=0.5))
+    with frame, pytest.raises(InstrumentTimeoutError, match=f"^{channel}: no data for 0.5 s"):
         take(frame, 100)
 
 
 def test_a_channel_that_is_not_there_is_named() -> None:
     with pytest.raises(InstrumentTimeoutError, match=r"^Channel Y1: .* nothing came"):
-        FiveSensorFrame(settings=with_fault("Y1", "silence")).open()
+        FiveSensorFrame(settings=with_fault("Y1", "silence", timeout=0.5)).open()
 
 
 def test_a_broken_connection_is_an_instrument_error() -> None:

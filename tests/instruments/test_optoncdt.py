@@ -14,7 +14,7 @@ from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.plugins import Samples
 
-SLOW = OptoSettings(rate=1500.0)
+SLOW = OptoSettings(rate=1500.0, timeout=10.0)
 RESOLUTION = 2e-3 * 1.02 / 65520
 
 
@@ -80,7 +80,7 @@ def test_commands_are_answered_while_data_stream() -> None:
 
 
 def test_without_the_counter_distances_alone_are_sent() -> None:
-    with OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(rate=1500.0, counter=False)) as sensor:
+    with OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(rate=1500.0, counter=False, timeout=10.0)) as sensor:
         blocks = take(sensor, 3)
         truth = world("cframe", 3).machine.distances(0, 2250, 1500.0, ["X1"])[0]
     np.testing.assert_allclose(values(blocks), truth, rtol=0, atol=RESOLUTION / 2 * 1.001)

@@ -169,7 +169,7 @@ def test_garbage_makes_no_wrong_value_and_costs_few_samples(
     """One stray burst spoils at most the sample it hits and two after it; what keeps a value has the right one."""
     base = 123456  # no burst of 5 bytes is a sample with the right counter, which takes 6
     stream = wire(raws, base)
-    places = sorted(data.draw(st.lists(st.integers(1, 29), min_size=len(garbage), max_size=len(garbage), unique=True)))
+    places = sorted(data.draw(st.lists(st.integers(1, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
     for place, burst in reversed(list(zip(places, garbage, strict=True))):
         at = place * 6 + data.draw(st.integers(0, 5))
         stream = stream[:at] + burst + stream[at:]
@@ -177,7 +177,7 @@ def test_garbage_makes_no_wrong_value_and_costs_few_samples(
     known = np.isfinite(values)
     np.testing.assert_allclose(values[known], np.array(expected(raws))[: values.size][known], rtol=1e-12)
     assert (~known).sum() <= 3 * len(garbage)
-    assert values.size >= len(raws) - 1
+    assert values.size == len(raws)
     assert {codec.REASONS[code] for code in reasons} <= {"", "lost", "garbled"}
 
 

@@ -112,7 +112,7 @@ def step_in_front_of_x1(frame: FiveSensorFrame, controller: VirtualController, c
 
 def test_a_stepped_sphere_is_seen_after_a_lead_in_that_nobody_told() -> None:
     with (
-        FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0)) as frame,
+        FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
         VirtualController(ADDRESS) as controller,
     ):
         readings = step_in_front_of_x1(frame, controller, 11)
@@ -144,7 +144,7 @@ def test_two_lead_ins_differ_and_a_second_program_waits_for_the_first() -> None:
 
 def test_a_sphere_that_is_mounted_but_not_placed_is_not_seen() -> None:
     with (
-        FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0)) as frame,
+        FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
         VirtualController(ADDRESS) as controller,
     ):
         controller.mount("sphere")

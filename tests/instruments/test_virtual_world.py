@@ -16,8 +16,8 @@ from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFr
 from errormotion.instruments.thermometer.dcon import DconTemperature
 from errormotion.twin import Event
 
-SLOW = OptoSettings(rate=1500.0)
-FRAME = FrameSettings(rate=1500.0)
+SLOW = OptoSettings(rate=1500.0, timeout=10.0)
+FRAME = FrameSettings(rate=1500.0, timeout=10.0)
 
 
 def names() -> set[str]:
@@ -114,7 +114,7 @@ def test_a_pace_holds_the_clock_to_real_time() -> None:
 
 
 def test_sensors_that_are_not_synchronised_may_have_rates_of_their_own() -> None:
-    fast, slow = OptoSettings(rate=5000.0), OptoSettings(rate=2500.0)
+    fast, slow = OptoSettings(rate=5000.0, timeout=10.0), OptoSettings(rate=2500.0, timeout=10.0)
     with OptoNCDT("sim://cframe/X1?seed=3", fast) as one, OptoNCDT("sim://cframe/X2?seed=3", slow) as two:
         first, second = one.stream(block=1000), two.stream(block=500)
         blocks = [(next(first), next(second)) for _ in range(50)]

@@ -44,6 +44,8 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._mute = False
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self._mute = self.fault.from_the_start
+        kernels.quantise(np.zeros(1), 1.0, np.zeros(1, dtype=np.int32))  # compiled before anybody waits for it
+        kernels.encode(np.zeros(1, dtype=np.int32), 0, True, np.zeros(6, dtype=np.uint8))
         self._model = address.params.get("model", "ILD2300")
         own_range = self.world.machine.frame.range * 1e3 if self._model == "ILD2300" else 10.0
         self._range = address.number("range", own_range) * 1e-3
@@ -55,8 +57,9 @@ class SimulatedOptoNCDT(SimulatedDevice):
 
     def handed_over(self, samples: int) -> None:
         """Take note of how many samples of the running stream its reader has had."""
-        if self._stream is not None:
-            self._stream.taken = samples
+        stream = self._stream
+        if stream is not None:
+            stream.taken = samples
 
     # ------------------------------------------------------------------ commands
 
@@ -131,11 +134,15 @@ class SimulatedOptoNCDT(SimulatedDevice):
             self.world.end_stream(stream)
 
     def reply(self, data: bytes) -> None:
-        """Send an answer; a stream that was just switched on begins behind it."""
-        super().reply(data)
-        if self._starting and self._stream is not None:
-            self.world.begin_stream(self._stream)
-        self._starting = False
+        """Send an answer; a stream that was just switched on begins behind it.
+
+        It is known to the world before the answer is out: the next thing to come may be its master's start.
+        """
+        with self._server.lock:  # no sample passes before the answer
+            if self._starting and self._stream is not None:
+                self.world.begin_stream(self._stream)
+            self._starting = False
+            super().reply(data)
 
     def _silent(self) -> bool:
         stream = self._stream

@@ -77,6 +77,7 @@ class VirtualWorld:
         self.name = name
         self.seed = seed
         self.machine = VirtualMachine(name, seed, warm=warm)
+        self._compile()
         self.pace: float | None = None
         self._front = 0.0  # time up to which samples have been made
         self._settings_of_clock = 0
@@ -89,6 +90,12 @@ class VirtualWorld:
         self._armed: list[Stream] = []  # slaves that wait for their master
         self._change = threading.Condition()
         self._thread: threading.Thread | None = None
+
+    def _compile(self) -> None:
+        """Have the twin's loops compiled now, so that nobody waits in vain for the first samples."""
+        resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
+        self.machine.distances(0, 1, 1e3, tool="bar")
+        self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
 
     def attach(self, device: Device, pace: float | None = None) -> None:
         """Count a device in; ``pace`` holds for the whole world."""

@@ -93,9 +93,9 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
 def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: Array) -> int:
     """Pair distances with their counters and number the samples; return how many there are.
 
-    A counter that jumps is believed when the next one is further on in the same direction round the 18 bits: then
-    samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both garbled,
-    and so is a distance behind a counter that had none.
+    A counter that jumps is believed when the next sound sample is further on in the same direction round the 18 bits:
+    then samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both
+    garbled, and so is a distance behind a counter that had none.
 
     Parameters
     ----------
@@ -147,7 +147,11 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
                 continue
             state[ANCHORED], state[BASE] = 1, reading
         ahead = (reading - state[BASE] - state[NUMBER]) & MASK
+        garbled = raw == GARBLED_RAW
         if state[HAS_JUMP] and state[JUMP_AHEAD] < ahead:
+            if garbled:  # its counter may be damaged as well: no witness
+                state[ORPHANS] += 1
+                continue
             state[NUMBER] += state[JUMP_AHEAD]
             raws[count], numbers[count] = state[JUMP_RAW], state[NUMBER]
             state[NUMBER] += 1
@@ -160,6 +164,8 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
             raws[count], numbers[count] = raw, state[NUMBER]
             state[NUMBER] += 1
             count += 1
+        elif garbled:
+            state[ORPHANS] += 1
         else:
             state[JUMP_RAW], state[JUMP_AHEAD], state[HAS_JUMP] = raw, ahead, 1
     return count
