@@ -242,3 +242,16 @@ def test_plan_predicts_what_the_twin_shows(machine, method):
     stated = np.sqrt(np.diagonal(method.identify(raw)["covariance"].values[-1]))[SEEN]
     # The twin's frame is misaligned and its drift another one than the plan's: the same within a tenth.
     np.testing.assert_allclose(predicted, stated, rtol=0.1)
+
+
+# ------------------------------------------------------------------ while measuring
+
+
+def test_the_live_view_ends_where_the_identification_does(machine, method):
+    t = np.arange(0, 600.0, 0.5)
+    raw = machine.raw_spindle_drift(t, seed=9)
+    follow = method.follow(Settings(spin_up=0.0))
+    for begin in range(0, t.size, 70):
+        text = follow(raw.isel(time=slice(begin, begin + 70)))
+    last = np.asarray(method.identify(raw).em.at([0, 0, 0]).em.twist())[-1]
+    assert f"EZ {last[2] * 1e6:+.2f} um" in text

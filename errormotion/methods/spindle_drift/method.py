@@ -14,7 +14,7 @@ from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 SCHEMA = "errormotion.raw.spindle_drift/1"
 
@@ -61,6 +61,14 @@ class SpindleDrift:
         """Return the expected length: beams, or seconds of drift."""
         return 5.0 if settings.procedure == "beam_detection" else settings.duration
 
+    def follow(self, settings: DriftSettings) -> Callable[[xr.Dataset], str]:
+        """Return what tells, chunk by chunk while measuring, how far things are."""
+        if settings.procedure == "beam_detection":
+            return _beam_text
+        from errormotion.methods.spindle_drift.live import LiveDrift
+
+        return LiveDrift(settings).update
+
     def identify(self, raw: xr.Dataset, settings: DriftSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
 
@@ -90,3 +98,7 @@ class SpindleDrift:
         from errormotion.methods.spindle_drift.planning import plan
 
         return plan(self, settings or DriftSettings())
+
+
+def _beam_text(chunk: xr.Dataset) -> str:
+    return f"beam {chunk['channel'].values[-1]} scanned"
