@@ -120,7 +120,7 @@ def main() -> None:
         "# Validation",
         "",
         "Every figure on this page comes from one run of `make validate`; none is typed in. The truth is that of the",
-        "[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' own models.",
+        "[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' models.",
         "A ratio of 1 means that no unbiased estimator can do better.",
         "",
         "## Spindle drift",
