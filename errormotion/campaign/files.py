@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.datasets import tomlfile
@@ -61,6 +61,13 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
+
+    @field_validator("runs")
+    @classmethod
+    def _local(cls, value: str) -> str:
+        if "://" in value:
+            raise ValueError("expected a local folder; copy the run folders elsewhere afterwards")
+        return value
 
 
 @dataclass(frozen=True)

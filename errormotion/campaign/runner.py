@@ -329,19 +329,27 @@ def _failures(folder: RunFolder) -> Iterator[None]:
     except KeyboardInterrupt as error:
         log.warning("interrupted by the operator")
         folder.step("stop", "interrupted")
-        folder.save(status="interrupted", reason="stopped by the operator")
+        _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_go_on(folder)}") from error
     except Exception as error:
         reason = str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
         log.exception("failed")
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)
-        folder.save(status="failed", reason=marked)
+        _mark(folder, "failed", marked)
         raise RunError(
             f"Test '{folder.data['test']}' failed: {reason}\n"
             f"{_kept(folder)} in {folder.path}; the log is {folder.log}.\n"
             f"When the cause is mended: {_go_on(folder)}"
         ) from error
+
+
+def _mark(folder: RunFolder, status: str, reason: str) -> None:
+    """Write how a run ended; where even that cannot be written it stays 'running', which can be resumed as well."""
+    try:
+        folder.save(status=status, reason=reason)
+    except OSError:
+        log.exception("run.json cannot be written")
 
 
 def _kept(folder: RunFolder) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from errormotion import datasets, plugins
 from errormotion.cli.output import show, show_json
+from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import last_values
 from errormotion.errors import DatasetError, ErrormotionError
@@ -20,7 +21,8 @@ def identify(
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method = plugins.get("methods", method_id)
     settings = read_settings(method.Settings, settings_file, assignments)
-    with datasets.load(raw_of(raw)) as dataset:
+    with Bars(as_json) as bars, datasets.load(raw_of(raw)) as dataset:
+        bars.stage("identifying")
         errors = method().identify(dataset, settings)
     datasets.validate(errors)
     datasets.save(errors, out)
@@ -45,7 +47,9 @@ def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
     """Turn a log with columns into a raw dataset."""
     from errormotion.datasets.importer import import_log as read_log
 
-    raw = read_log(log, map_file, out)
+    with Bars(as_json) as bars:
+        bars.stage("importing")
+        raw = read_log(log, map_file, out)
     sizes = {str(dim): size for dim, size in raw.sizes.items()}
     if as_json:
         show_json({"ok": True, "raw": str(out), "schema": raw.attrs["schema"], "sizes": sizes})

@@ -23,7 +23,7 @@ class Bars:
     """What the runner does, as bars on stderr; shows nothing where stderr is no terminal."""
 
     def __init__(self, quiet: bool = False) -> None:
-        self._console = Console(stderr=True)
+        self._console = Console(stderr=True, highlight=False)
         self._shown = not quiet and sys.stderr.isatty()
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -53,7 +53,7 @@ class Bars:
         self._finish()
         self._name = f"{number + 1}/{total} {name}: "
         if self._shown:
-            self._progress.console.print(f"test {number + 1} of {total}, {name}: {folder}", highlight=False)
+            self._progress.console.print(f"test {number + 1} of {total}, {name}: {folder}")
 
     def stage(self, name: str, total: float | None = None) -> None:
         """Begin a part of a test."""

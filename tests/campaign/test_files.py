@@ -82,6 +82,13 @@ def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is
     )
 
 
+def test_runs_folder_elsewhere_is_refused(write: Callable[..., Path]) -> None:
+    path = write('name = "a"')
+    path.write_text(path.read_text().replace(str(path.parent / "runs"), "s3://bucket/runs"))
+    (mistake,) = complaints(path, load_campaign)
+    assert mistake.startswith("runs: expected a local folder")
+
+
 def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(BenchError, match=r"nowhere\.toml: cannot be read: No such file or directory"):
         load_bench(tmp_path / "nowhere.toml")

@@ -238,3 +238,21 @@ def test_log_falls_back_where_the_state_folder_cannot_be_made(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     run("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)
     assert "Traceback" in (tmp_path / "errormotion.log").read_text()
+
+
+def test_reference_names_every_command_and_option() -> None:
+    import typer
+
+    from errormotion.cli.app import app
+
+    page = (ROOT / "docs" / "reference" / "cli.md").read_text()
+    missing = []
+    commands: list[tuple[str, Any]] = [("errormotion", typer.main.get_command(app))]
+    for name, command in commands:
+        below = getattr(command, "commands", {})
+        commands += [(f"{name} {child}", each) for child, each in below.items()]
+        if not below and name not in page:
+            missing.append(name)
+        options = [option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)]
+        missing += [f"{name} {option}" for option in options if option.startswith("--") and f"`{option}" not in page]
+    assert missing == []

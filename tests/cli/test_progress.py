@@ -1,0 +1,71 @@
+"""Bars with the remaining time on a terminal, silence elsewhere."""
+
+import io
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from errormotion.cli.progress import Bars
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Terminal]:
+    """Make stderr a terminal; to be called in the test, because pytest sets stderr anew when a test begins."""
+
+    def make() -> Terminal:
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "120")
+        stream = Terminal()
+        monkeypatch.setattr(sys, "stderr", stream)
+        return stream
+
+    return make
+
+
+def work(quiet: bool = False) -> None:
+    with Bars(quiet) as bars:
+        bars.stage("opening the bench")
+        bars.test("drift", Path("runs/x-drift-y"), 1, 2)
+        bars.stage("measuring", 100.0)
+        bars.advance(40.0)
+        bars.advance(100.0)
+        bars.stage("identifying")
+
+
+def test_terminal_sees_test_part_share_and_remaining_time(terminal: Callable[[], Terminal]) -> None:
+    stderr = terminal()
+    work()
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stderr.getvalue())
+    assert "test 2 of 2, drift: runs/x-drift-y" in text
+    assert re.search(r"2/2 drift: measuring .*100% +0:00:0\d left 0:00:00", text)
+    assert "2/2 drift: identifying" in text
+
+
+def test_nothing_is_shown_where_a_program_reads(
+    terminal: Callable[[], Terminal], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stderr = terminal()
+    work(quiet=True)
+    assert stderr.getvalue() == ""
+    pipe = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", pipe)
+    work()
+    assert pipe.getvalue() == ""
+
+
+def test_operator_is_asked_between_the_bars(terminal: Callable[[], Terminal], monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr = terminal()
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
+    with Bars() as bars:
+        bars.stage("measuring", 10.0)
+        bars.ask("Mount the bar [10 mm].")
+        bars.advance(5.0)
+    assert "Mount the bar [10 mm]." in stderr.getvalue()
