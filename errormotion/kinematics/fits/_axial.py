@@ -17,7 +17,6 @@ __all__ = ["Cone", "Cylinder"]
 
 DIRECTIONS = 150  # over the half sphere: no axis is farther than 8 degrees from one of them
 SEARCHED_POINTS = 150
-KEPT = 8
 
 
 class _Axial(Shape):
@@ -26,9 +25,13 @@ class _Axial(Shape):
     spans = 3
     elements: int  # points that determine a candidate along a known direction
     near: Floats | None = None
+    robust_tries = 24
 
     def starts(self, q: Floats) -> list[Floats]:
         return self._search(q, np.random.default_rng(len(q)), robust=False)
+
+    def preference(self, theta: Floats) -> float:
+        return 0.0 if self.near is None else -abs(float(self.near @ theta[3:6]))
 
     def robust_starts(self, q: Floats, rng: np.random.Generator) -> Iterator[Floats]:
         yield from self._search(q, rng, robust=True)
@@ -50,7 +53,7 @@ class _Axial(Shape):
             cost = np.partition(miss, half, axis=-1)[..., half] if robust else np.mean(miss**2, axis=-1)
         cost[~np.isfinite(cost)] = np.inf
         best = np.argmin(cost, axis=1)
-        order = np.argsort(cost[np.arange(len(u)), best], kind="stable")[:KEPT]
+        order = np.argsort(cost[np.arange(len(u)), best], kind="stable")[: self.robust_tries if robust else 8]
         return [
             self.settle(self._vector(B[k] @ c[k, i], u[k], r[k, i], t[k, i]))
             for k, i in zip(order, best[order], strict=True)
@@ -82,10 +85,11 @@ class Cylinder(_Axial):
     def __init__(self, radius: float | None = None, near: Floats | None = None) -> None:
         self.radius, self.near = radius, near
         self.groups = (Group("point", "place", 3), Group("direction", "direction", 3))
-        self.minimum, self.elements = 4, 2
+        # A known radius is held even by two lines along the cylinder, a free one only by more than a plane.
+        self.minimum, self.elements, self.spans = 4, 2, 2
         if radius is None:
             self.groups = (*self.groups, Group("radius", "length"))
-            self.minimum, self.elements = 5, 3
+            self.minimum, self.elements, self.spans = 5, 3, 3
 
     def scaled(self, scale: float) -> Cylinder:
         return Cylinder(None if self.radius is None else self.radius / scale, self.near)

@@ -2,13 +2,17 @@
 
 1. Shapes through few points are tried; the one that half of the points are nearest to wins (least median of squares,
    Rousseeuw 1984), improved by fitting to the nearest half (concentration steps of least trimmed squares).
-2. Points within three robust standard deviations of it make a first clean set.
+2. Points within four robust standard deviations of it make a first clean set.
 3. The set is refitted and every point judged by a fit that does not contain it, until the set no longer changes. A
-   point is left out where Student's t says that among n clean Gaussian points the worst is this far off once in a
+   point is left out where Student's t says that among n clean Gaussian points the worst is so far off once in two
    hundred fits.
+4. Few points may look wrong only because the others happen to agree too well. Unless all left-out points together gain
+   more than such luck, the judging starts again from the set of all points.
 """
 
 from __future__ import annotations
+
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +25,8 @@ __all__ = ["FALSE_ALARMS", "outliers"]
 
 Flags = NDArray[np.bool_]
 
-FALSE_ALARMS = 0.01  # fits of clean Gaussian data in which any point is named
-KEPT = 8
+FALSE_ALARMS = 0.01  # fits of clean Gaussian data in which any point is named; steps 3 and 4 share it
 SEED = 230
-# Median of the length of a standard normal vector of 1 and 2 components.
-MEDIAN = {1: 0.6744897501960817, 2: 1.1774100225154747}
 
 
 def outliers(shape: Shape, points: Floats, weights: Floats, sigma: float | None) -> tuple[int, ...]:
@@ -53,15 +54,40 @@ def outliers(shape: Shape, points: Floats, weights: Floats, sigma: float | None)
     floor = floor if sigma is None else max(floor, sigma / scale)
 
     theta, spread = _least_trimmed(local, q, root)
-    clean = _misses(local, theta, q, root) <= 3 * max(spread, floor)
+    clean = _grown(local, theta, q, root, _misses(local, theta, q, root) <= 4 * max(spread, floor), floor)
+    if not _stand_out(local, theta, q, root, clean, floor):
+        clean = _grown(local, theta, q, root, np.ones(len(q), dtype=bool), floor)
+    return tuple(int(i) for i in np.flatnonzero(~clean))
+
+
+def _grown(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> Flags:
+    """Refit and judge until the clean set no longer changes."""
     seen: set[bytes] = set()
     while clean.tobytes() not in seen:
         seen.add(clean.tobytes())
         _majority(shape, clean)
-        theta = levenberg(local, theta, q[clean], root[clean]).theta
-        clean = _belongs(local, theta, q, root, clean, floor)
+        theta = levenberg(shape, theta, q[clean], root[clean]).theta
+        clean = _belongs(shape, theta, q, root, clean, floor)
     _majority(shape, clean)
-    return tuple(int(i) for i in np.flatnonzero(~clean))
+    return clean
+
+
+def _stand_out(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> bool:
+    """Whether leaving these points out gains more than the luckiest choice of clean ones would.
+
+    An F test of what the sum of squares loses; among n points there are n! / k! (n - k)! choices of k.
+    """
+    from scipy.special import betainc, gammaln
+
+    n, left = len(q), int((~clean).sum())
+    if not left:
+        return True
+    costs = [levenberg(shape, theta, q[part], root[part]).cost for part in (clean, np.ones(n, dtype=bool))]
+    freedoms = left * shape.components
+    dof = int(clean.sum()) * shape.components - shape.tangent(theta).shape[1]
+    gain = (costs[1] - costs[0]) / max(costs[0] / dof, floor**2)
+    choices = gammaln(n + 1) - gammaln(left + 1) - gammaln(n - left + 1)
+    return bool(betainc(dof / 2, freedoms / 2, dof / (dof + max(gain, 0.0))) <= FALSE_ALARMS / 2 * np.exp(-choices))
 
 
 def _least_trimmed(shape: Shape, q: Floats, root: Floats) -> tuple[Floats, float]:
@@ -72,12 +98,12 @@ def _least_trimmed(shape: Shape, q: Floats, root: Floats) -> tuple[Floats, float
     def rank(theta: Floats) -> float:
         return float(np.partition(_misses(shape, theta, q, root), half - 1)[half - 1])
 
-    starts = sorted(shape.robust_starts(q, rng), key=rank)[:KEPT]
+    starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
     if not starts:
         raise FitError(f"no few of the points make a {shape.name}; look at them")
     trimmed = [_concentrate(shape, theta, q, root, half) for theta in starts]
     best = min(trimmed, key=rank)
-    quantile = MEDIAN[shape.components]
+    quantile = _normal_length(half / n, shape.components)
     small_sample = 1 + 5 / max(n * shape.components - shape.tangent(best).shape[1], 1)
     return best, rank(best) / quantile * small_sample
 
@@ -88,7 +114,8 @@ def _concentrate(shape: Shape, theta: Floats, q: Floats, root: Floats, half: int
         nearest = np.sort(np.argpartition(_misses(shape, theta, q, root), half - 1)[:half])
         if before is not None and np.array_equal(nearest, before):
             break
-        theta, before = levenberg(shape, theta, q[nearest], root[nearest], limit=20).theta, nearest
+        before = nearest
+        theta = levenberg(shape, theta, q[nearest], root[nearest], limit=20, last_digits=False).theta
     return theta
 
 
@@ -114,14 +141,19 @@ def _belongs(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags,
 
 
 def _limit(m: int, dof: int, n: int) -> float:
-    """Return the F quantile with (m, dof) freedoms that the worst of n clean points exceeds in 1 % of fits."""
-    tail = FALSE_ALARMS / n
+    """Return the F quantile with (m, dof) freedoms that the worst of n clean points seldom exceeds."""
+    tail = FALSE_ALARMS / 2 / n
     if m == 2:
         return float(dof / 2 * (tail ** (-2 / dof) - 1))
     from scipy.special import stdtrit  # loaded here: half a second that only robust fits need
 
     quantile = float(stdtrit(dof, 1 - tail / 2))
     return quantile * quantile
+
+
+def _normal_length(share: float, m: int) -> float:
+    """Return the length below which this share of standard normal vectors of m = 1 or 2 components stay."""
+    return NormalDist().inv_cdf((1 + share) / 2) if m == 1 else float(np.sqrt(-2 * np.log(1 - share)))
 
 
 def _misses(shape: Shape, theta: Floats, q: Floats, root: Floats) -> Floats:

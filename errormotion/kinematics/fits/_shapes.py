@@ -49,6 +49,8 @@ class Shape(ABC):
         Parts of the vector from a point to the shape; its length is the orthogonal distance.
     spans : int
         Dimensions that the points must spread over: 1 a line, 2 a plane, 3 space.
+    robust_tries : int
+        Candidates that a robust fit follows to their minimum.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Shape(ABC):
     minimum: int
     components: int = 1
     spans: int
+    robust_tries: int = 8
 
     @abstractmethod
     def starts(self, q: Floats) -> list[Floats]:
@@ -76,6 +79,10 @@ class Shape(ABC):
     @abstractmethod
     def settle(self, theta: Floats) -> Floats:
         """Return the same shape with unit directions, a fixed sign, and its point nearest to the origin."""
+
+    def preference(self, theta: Floats) -> float:  # noqa: ARG002 - only shapes with a hint have one
+        """Return what is least for the shape to choose where several leave no residual."""
+        return 0.0
 
     def scaled(self, scale: float) -> Self:  # noqa: ARG002 - only shapes with a known length depend on it
         """Return the shape to fit when lengths are divided by ``scale``."""

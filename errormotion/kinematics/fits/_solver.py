@@ -20,6 +20,8 @@ SEARCHED_POINTS = 1000  # the best of several starts is chosen on a part of the 
 # Of a shape of size 1 a step of 1e-7 changes the sum of squares by 1e-14 of itself: from there on the steps, not the
 # sum, tell whether the solver comes nearer.
 LAST_DIGITS = 1e-7
+# Sum of squares of a fit that leaves nothing: among several such fits the shape prefers one.
+EXACT = 1e-20
 # Ratio of the least to the greatest singular value below which a freedom is numerically loose. An arc of one part in
 # 1e5 of its radius has 1e-10.
 LOOSE = 1e-11
@@ -117,7 +119,9 @@ def design(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> tupl
     return J.reshape(f.size, -1), f.ravel()
 
 
-def levenberg(shape: Shape, theta: Floats, q: Floats, root_weights: Floats, limit: int = 200) -> Solution:
+def levenberg(
+    shape: Shape, theta: Floats, q: Floats, root_weights: Floats, *, limit: int = 200, last_digits: bool = True
+) -> Solution:
     """Go from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
     damping, cost = 1e-3, np.inf
     for _ in range(limit):
@@ -125,7 +129,7 @@ def levenberg(shape: Shape, theta: Floats, q: Floats, root_weights: Floats, limi
         R, g = _triangle(J, f)
         cost = float(f @ f)
         if np.linalg.norm(_solve(R, g)) < LAST_DIGITS:
-            return _last_digits(shape, theta, q, root_weights)
+            return _last_digits(shape, theta, q, root_weights) if last_digits else Solution(theta, cost, converged=True)
         marquardt = np.maximum(np.linalg.norm(R, axis=0), 1e-6)
         while damping < 1e10:
             step = _solve(np.vstack([R, np.sqrt(damping) * np.diag(marquardt)]), np.append(g, 0 * marquardt))
@@ -160,8 +164,8 @@ def _best(shape: Shape, q: Floats, root_weights: Floats) -> Solution:
         raise FitError(f"the points single out no {shape.name}: they fit several equally well. Add points elsewhere")
     if len(starts) > 1:
         part = np.unique(np.linspace(0, len(q) - 1, min(len(q), SEARCHED_POINTS)).astype(int))
-        tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60) for theta in starts]
-        starts = [min(tried, key=lambda solution: solution.cost).theta]
+        tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60, last_digits=False) for theta in starts]
+        starts = [min(tried, key=lambda end: (max(end.cost, EXACT), shape.preference(end.theta))).theta]
     return levenberg(shape, starts[0], q, root_weights)
 
 

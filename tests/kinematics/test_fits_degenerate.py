@@ -1,0 +1,94 @@
+"""Points that do not hold a shape: every refusal is a FitError that says what is loose."""
+
+import numpy as np
+import pytest
+
+from errormotion.errors import FitError
+from errormotion.kinematics.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
+
+RNG = np.random.default_rng(6)
+PLACE = np.array([0.1, 0.2, 0.3])
+LINE = np.outer(np.linspace(-1, 1, 9), [0.3, 0.5, -0.2]) + PLACE
+PLANE = RNG.uniform(-1, 1, (12, 2)) @ RNG.normal(size=(2, 3)) + PLACE
+ANGLE = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+RING = np.column_stack([np.cos(ANGLE), np.sin(ANGLE), 0 * ANGLE])
+TWO_LINES = np.concatenate([np.column_stack([c * np.ones(6), 0 * np.ones(6), np.linspace(0, 3, 6)]) for c in (-1, 1)])
+
+
+@pytest.mark.parametrize(
+    ("fit", "points", "said"),
+    [
+        (fit_line, [(0.0, 0.0)], "at least 2 points; found 1"),
+        (fit_line, [(1.0, 2.0)] * 5, "all 5 are one point"),
+        (fit_line, [(1, 0), (0, 1), (-1, 0), (0, -1)], "single out no line"),
+        (fit_plane, LINE, "on one line, which leaves the plane loose"),
+        (fit_plane, [(0, 0, 0), (1, 0, 0)], "at least 3 points; found 2"),
+        (fit_circle, LINE[:, :2], r"on one line, which leaves the circle loose \(centre, radius\)"),
+        (fit_circle, LINE, "on one line"),
+        (fit_circle, [(0, 0), (1, 1), (1, 1), (0, 0)], "Only 2 of the 4 points are distinct"),
+        (fit_sphere, PLANE, r"in one plane, which leaves the sphere loose \(centre, radius\)"),
+        (fit_sphere, RING, "in one plane"),
+        (fit_cylinder, PLANE, "in one plane, which leaves the cylinder loose"),
+        (fit_cylinder, RING, "in one plane"),
+        (fit_cylinder, TWO_LINES, "in one plane"),
+        (fit_cylinder, LINE, "on one line"),
+        (fit_cone, RING + PLACE, "in one plane, which leaves the cone loose"),
+        (lambda p: fit_cylinder(p, 1.0), RING, "cylinder loose: .*direction"),
+        (lambda p: fit_cylinder(p, 1.0), LINE, "on one line"),
+        (lambda p: fit_cylinder(p, 1.0), LINE[:3], "at least 4 points; found 3"),
+    ],
+)
+def test_points_that_leave_a_freedom_loose_are_refused(fit, points, said):
+    with pytest.raises(FitError, match=said):
+        fit(points)
+
+
+@pytest.mark.parametrize("fit", [fit_line, fit_plane, fit_circle, fit_sphere, fit_cylinder, fit_cone])
+def test_values_that_are_no_points_are_refused(fit):
+    broken = RNG.normal(size=(20, 3))
+    broken[[3, 7]] = np.nan
+    with pytest.raises(FitError, match=r"2 of 20 points are not finite \(rows 3, 7\)"):
+        fit(broken)
+    with pytest.raises(FitError, match=r"one point a row; found \(20,\)"):
+        fit(np.zeros(20))
+    with pytest.raises(FitError, match=r"found \(3, 20\)"):
+        fit(np.zeros((3, 20)))
+    with pytest.raises(FitError, match="array of numbers"):
+        fit([("a", "b", "c")])
+    with pytest.raises(FitError, match=r"at least \d points; found 0"):
+        fit(np.zeros((0, 3)))
+
+
+def test_noise_that_hides_the_radius_is_refused():
+    # Sagitta 1 um on a chord of 100 mm, noise 10 um: a circle of any radius fits as well.
+    x = np.linspace(-0.05, 0.05, 20)
+    y = x**2 * 4e-4 + 1e-5 * np.random.default_rng(3).normal(size=20)
+    with pytest.raises(FitError, match=r"noise hides the radius|leave the circle loose|did not settle"):
+        fit_circle(np.column_stack([x, y]))
+
+
+def test_three_lines_hold_a_cylinder():
+    lines = [np.column_stack([np.full(5, np.cos(a)), np.full(5, np.sin(a)), np.linspace(0, 3, 5)]) for a in (0, 2, 4)]
+    cylinder = fit_cylinder(np.concatenate(lines))
+    assert cylinder.radius == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"sigma": 0.0}, "positive sigma"),
+        ({"sigma": float("nan")}, "positive sigma"),
+        ({"weights": [1.0, 1.0]}, "12 positive weights"),
+        ({"weights": [0.0] + [1.0] * 11}, "leave out points of weight 0"),
+    ],
+)
+def test_options_are_checked(options, said):
+    with pytest.raises(FitError, match=said):
+        fit_circle(RING[:, :2], **options)
+
+
+def test_radius_and_direction_of_a_cylinder_are_checked():
+    with pytest.raises(FitError, match="positive radius"):
+        fit_cylinder(PLANE, -1.0)
+    with pytest.raises(FitError, match="direction of three numbers"):
+        fit_cylinder(PLANE, direction=[0, 0, 0])
