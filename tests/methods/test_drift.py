@@ -255,3 +255,31 @@ def test_the_live_view_ends_where_the_identification_does(machine, method):
         text = follow(raw.isel(time=slice(begin, begin + 70)))
     last = np.asarray(method.identify(raw).em.at([0, 0, 0]).em.twist())[-1]
     assert f"EZ {last[2] * 1e6:+.2f} um" in text
+
+
+# ------------------------------------------------------------------ starting and stopping
+
+
+def test_stopping_leaves_the_run_out_in_the_readings_and_the_uncertainty_says_so(method):
+    machine = VirtualMachine("cframe", seed=4)
+    machine.start([Event(0.0, 15000.0), Event(8.0, 0.0)])
+    rate, seconds = 2500.0, 16
+    n = int(rate * seconds)
+    raw = machine.raw_spindle_drift(np.arange(n) / rate, seed=0, averaged=1)
+    raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
+    raw["spindle_speed"] = ("time", np.where(np.arange(n) / rate < 8.0, 15000.0, 0.0))
+    errors = method.identify(raw, Settings(compensate_frame=False))
+    u = np.sqrt(errors["covariance"].sel(dof="EX", dof_="EX").values)
+    time = errors["time"].values + errors.attrs["reference_time"]
+    unknown = np.isnan(errors["EX"].values)
+    np.testing.assert_array_equal(unknown, (time < 1.0) | ((time > 7.9) & (time < 9.0)))
+    rest, runs = time > 9.0, (time > 2.0) & (time < 7.9)
+    off = np.abs(errors["EX"].values[rest])
+    assert off.min() > 5 * u[runs].max()  # where it stopped, the bar stands off by its run-out
+    assert (off < 3 * u[rest]).all()
+    assert "run-out at rest" in errors["source_group"].values
+    # One draw for the whole rest: two instants of it differ by their own noise alone.
+    weights = np.zeros(time.size)
+    weights[np.flatnonzero(rest)[[0, -1]]] = -1.0, 1.0
+    spread = np.asarray(errors.where(~unknown.any(), errors).em.combine(weights, dim="time")[1])[0, 0]
+    assert np.sqrt(spread) < 0.1 * u[rest].min()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,12 +20,11 @@ from errormotion.methods.spindle_drift.record import (
     noise,
     reference_windows,
     sensors,
-    spin_up,
 )
+from errormotion.methods.spindle_drift.turning import run_out_at_rest, settling
 from errormotion.methods.spindle_drift.uncertainty import (
     CHANNELS,
     Frame,
-    Source,
     State,
     beam_sources,
     propagate,
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.spindle_drift.averaging import Averages
+    from errormotion.methods.spindle_drift.record import Record
     from errormotion.methods.spindle_drift.settings import Settings
 
     Array = NDArray[np.float64]
@@ -55,69 +56,61 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     notes: list[str] = []
     record = average_record(raw, settings)
     measured, raw = raw, raw.drop_vars("distance").sel(channel=list(CHANNELS))
-    levels = np.asarray(raw["level"].values, np.float64)
-    radius = float(raw["bar_radius"])
-    origin, direction, beam_covariance, beam_group = _beams(raw, settings, notes)
     averages = record.averages
-    mean = averages.mean.copy()
     count_unknown(averages, notes)
-    spinning_up = spin_up(record, settings)
-    reference = reference_windows(averages, mean, settings, spinning_up)
+    bar = _bar(raw, settings, notes)
+    coming_up = settling(record, settings.spin_up)
+    reference = reference_windows(averages, averages.mean, settings, coming_up)
+    mean, state = averages.mean, _fit(averages.mean, bar)
+    scaled: list[tuple[str, str, Array]] = run_out_at_rest(record, reference, float(raw["distance_noise"]))
+    own: list[Array] = []
     warming = frame_warming(raw, record, settings, notes)
-    state = _fit(mean, origin, direction, radius, levels)
     if warming is not None:
-        # The frame's expansion moves the readings along the normals that a first fit finds.
-        per_kelvin = readings_per_kelvin(warming, state, origin, direction, levels)
+        # The frame's expansion moves the readings along the normals that the first fit found.
+        per_kelvin = readings_per_kelvin(warming, state, bar.origin, bar.direction, bar.levels)
         change = per_kelvin * (warming.temperature - warming.temperature[reference].mean())
-        mean = mean + change
-        state = _fit(mean, origin, direction, radius, levels)
-    then = _fit(mean[:, reference].mean(axis=1, keepdims=True), origin, direction, radius, levels)
+        mean, state = mean + change, _fit(mean + change, bar)
+        unknown = np.sqrt(np.sum(warming.uncertainty[reference] ** 2)) / reference.size
+        scaled.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
+        scaled.append(("frame temperature at the reference", "frame temperature", -per_kelvin * unknown))
+        own.append(per_kelvin * warming.uncertainty)
+    then = _fit(mean[:, reference].mean(axis=1, keepdims=True), bar)
     if not np.isfinite(then.E).all():
         raise MethodError(
             "No cylinder of the stated radius touches the five readings of the reference state. Check bar_radius "
-            f"({radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
+            f"({bar.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
         )
     point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
-    frame = Frame(origin, direction, levels, point)
     sigma = noise(raw, averages, settings, notes)
-    sigma_then = np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size
-    sources: list[Source] = [*reading_sources(sigma_then), *beam_sources(beam_covariance, beam_group)]
-    if settings.bar_radius_uncertainty:
-        sources.append(radius_source(settings.bar_radius_uncertainty))
-    scaled: list[tuple[str, str, Array]] = []
-    own: list[Array] = []
-    if warming is not None:
-        scaled.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
-        unknown = np.sqrt(np.sum(warming.uncertainty[reference] ** 2)) / reference.size
-        scaled.append(("frame temperature at the reference", "frame temperature", -per_kelvin * unknown))
-        own.append(per_kelvin * warming.uncertainty)
+    sources = [
+        *reading_sources(np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size),
+        *beam_sources(bar.covariance, bar.known_from),
+        *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
+    ]
     errors = twist(state, then, point)
-    coming = averages.time < averages.time[0] + spinning_up - 1e-6
-    if settings.reference_time is None and coming.any():
-        errors[coming] = np.nan
-        notes.append(f"The first {spinning_up:g} s, in which the spindle comes to its speed, are NaN (spin_up).")
+    frame = Frame(bar.origin, bar.direction, bar.levels, point)
     independent, influence = propagate(state, then, frame, sigma, sources, [effect for *_, effect in scaled], own)
-    # Errors inside the reference state share its noise: what is left of it is 1 - 1/m of each mean.
-    independent[reference] *= 1.0 - 1.0 / reference.size
-    influence[:, reference] = 0.0
-    names = [s.name for s in sources] + [name for name, *_ in scaled]
-    groups = [s.group for s in sources] + [group for _, group, _ in scaled]
+    names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in scaled]
     unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
     if np.linalg.norm(unseen) > 0:
         row = np.zeros((1, len(errors), 6))
         row[..., :3] = unseen
-        row[:, reference] = 0.0
         influence = np.concatenate([influence, row])
-        names.append("rotation about the spindle axis")
-        groups.append("rotation about the spindle axis")
+        names.append(("rotation about the spindle axis", "rotation about the spindle axis"))
+    # Errors inside the reference state share its noise: what is left of it is 1 - 1/m of each mean.
+    independent[reference] *= 1.0 - 1.0 / reference.size
+    influence[:, reference] = 0.0
     independent[:, 5, :] = independent[:, :, 5] = np.nan
     influence[..., 5] = np.nan
-    covariance = independent + np.einsum("sti,stj->tij", influence, influence)
+    if coming_up.any():
+        errors[coming_up] = np.nan
+        notes.append(
+            f"{int(coming_up.sum())} means within {settings.spin_up:g} s of a change of the spindle's speed are NaN."
+        )
     zero = float(averages.time[reference].mean())
     time = averages.time - zero
-    extras = _extras(raw, averages, mean, state, origin, direction, radius, levels, time)
     results = iso230_3.evaluate(
-        iso230_3.quantities(errors, independent, influence, levels - point[2]),
+        iso230_3.quantities(errors, independent, influence, bar.levels - point[2]),
         time,
         temperature=record.temperature,
         sensors=sensors(raw) if record.temperature is not None else (),
@@ -126,23 +119,13 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         sensor=settings.iso_temperature,
         average=settings.iso_average,
     )
-    extras |= results.as_extras(time)
-    start = str(raw.attrs.get("start", ""))
-    coords: dict[str, Any] = {
-        "time": ("time", time, {"units": "s", **({"start": start} if start else {})}),
-    }
-    if record.temperature is not None:
-        coords["temperature"] = (("time", "sensor"), record.temperature.T, {"units": "degC"})
-        coords["sensor"] = ("sensor", sensors(raw))
-    if record.spindle_speed is not None:
-        coords["spindle_speed"] = ("time", record.spindle_speed, {"units": "1/min"})
     for note in notes:
         log.warning(note)
     ds = build_errors(
         errors,
-        covariance,
+        independent + np.einsum("sti,stj->tij", influence, influence),
         dims=("time",),
-        coords=coords,
+        coords=_coordinates(raw, record, time),
         component="spindle",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
@@ -157,9 +140,9 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
             settings, measured, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]
         ),
         influence=influence,
-        sources=names,
-        source_groups=groups,
-        extras=extras,
+        sources=[name for name, _ in names],
+        source_groups=[group for _, group in names],
+        extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time),
     )
     return ds.assign_attrs(
         notes=list(notes) or [""],
@@ -170,10 +153,26 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     )
 
 
-def _fit(mean: Array, origin: Array, direction: Array, radius: float, levels: Array) -> State:
-    q = fit_axis(mean, origin, direction, radius, levels)
-    a, E = end_point(q, mean[4], origin[4], direction[4], levels)
-    return State(mean, q, a, E)
+@dataclass(frozen=True)
+class Bar:
+    """What is known beforehand: beams (5, 3) with their covariance (5, 6, 6), bar radius and levels, SI."""
+
+    origin: Array
+    direction: Array
+    covariance: Array
+    known_from: str
+    radius: float
+    levels: Array
+
+
+def _bar(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Bar:
+    levels = np.asarray(raw["level"].values, np.float64)
+    return Bar(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
+
+
+def _fit(mean: Array, bar: Bar) -> State:
+    q = fit_axis(mean, bar.origin, bar.direction, bar.radius, bar.levels)
+    return State(mean, q, *end_point(q, mean[4], bar.origin[4], bar.direction[4], bar.levels))
 
 
 def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
@@ -214,16 +213,19 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     return origin, direction, np.zeros((5, 6, 6)), "beam calibration"
 
 
+def _coordinates(raw: xr.Dataset, record: Record, time: Array) -> dict[str, Any]:
+    start = str(raw.attrs.get("start", ""))
+    coords: dict[str, Any] = {"time": ("time", time, {"units": "s", **({"start": start} if start else {})})}
+    if record.temperature is not None:
+        coords["temperature"] = (("time", "sensor"), record.temperature.T, {"units": "degC"})
+        coords["sensor"] = ("sensor", sensors(raw))
+    if record.spindle_speed is not None:
+        coords["spindle_speed"] = ("time", record.spindle_speed, {"units": "1/min"})
+    return coords
+
+
 def _extras(
-    raw: xr.Dataset,
-    averages: Averages,
-    mean: Array,
-    state: State,
-    origin: Array,
-    direction: Array,
-    radius: float,
-    levels: Array,
-    time: Array,
+    raw: xr.Dataset, averages: Averages, mean: Array, state: State, bar: Bar, time: Array
 ) -> dict[str, xr.DataArray]:
     channel = ("channel", list(CHANNELS))
     axis = ("direction", list("xyz"))
@@ -234,13 +236,13 @@ def _extras(
         )
 
     # What the fitted bar would have shown; zero but for rounding, where the fit is exact.
-    S = origin[:, None] + direction[:, None] * mean[:, :, None]
-    w = S - np.column_stack([state.q[:, :2], np.full(len(state.q), levels[0])])
+    S = bar.origin[:, None] + bar.direction[:, None] * mean[:, :, None]
+    w = S - np.column_stack([state.q[:, :2], np.full(len(state.q), bar.levels[0])])
     off = w - np.einsum("cti,ti->ct", w, state.a)[..., None] * state.a
-    residual = np.linalg.norm(off, axis=2) - radius
+    residual = np.linalg.norm(off, axis=2) - bar.radius
     residual[4] = np.einsum("ti,ti->t", S[4] - state.E, state.a)
     first = int(np.flatnonzero(np.isfinite(state.E).all(axis=1))[0])
-    vectors = {"beam_origin": (origin, "m"), "beam_direction": (direction, "1")}
+    vectors = {"beam_origin": (bar.origin, "m"), "beam_direction": (bar.direction, "1")}
     extras = {
         name: xr.DataArray(
             values, coords={"channel": channel, "direction": axis}, dims=("channel", "direction"), attrs={"units": unit}
@@ -257,8 +259,8 @@ def _extras(
         "bar_axis_direction": xr.DataArray(
             state.a[first], coords={"direction": axis}, dims="direction", attrs={"units": "1"}
         ),
-        "bar_radius": xr.DataArray(radius, attrs={"units": "m"}),
-        "level_height": xr.DataArray(levels, coords={"level": ["L1", "L2"]}, dims="level", attrs={"units": "m"}),
+        "bar_radius": xr.DataArray(bar.radius, attrs={"units": "m"}),
+        "level_height": xr.DataArray(bar.levels, coords={"level": ["L1", "L2"]}, dims="level", attrs={"units": "m"}),
     }
     for name in ("dropped_samples", "invalid_samples"):
         if name in raw:

@@ -26,11 +26,25 @@ _ENOUGH = 30
 
 @dataclass(frozen=True)
 class Record:
-    """Means on one clock; ``temperature`` (sensor, window) degC and ``spindle_speed`` (window,) 1/min where known."""
+    """Means on one clock.
+
+    Attributes
+    ----------
+    averages : Averages
+        Of the five channels.
+    temperature : ndarray (sensor, window) or None
+        degC.
+    spindle_speed : ndarray (window,) or None
+        1/min.
+    scatter : ndarray (5,) or None
+        Standard deviation of single readings within one mean while the spindle turns steadily, m; None where the
+        record came as means, or does not say when the spindle turns.
+    """
 
     averages: Averages
     temperature: Array | None
     spindle_speed: Array | None
+    scatter: Array | None
 
 
 def average_record(raw: xr.Dataset, settings: Settings) -> Record:
@@ -42,20 +56,36 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
+    scatter: Array | None = None
     for time, part in slices(raw):
         if not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
         readings = _with_time_last(part["distance"])
-        parts.append(averager.update(time, readings if order == [0, 1, 2, 3, 4] else readings[order]))
+        readings = readings if order == [0, 1, 2, 3, 4] else readings[order]
+        parts.append(averager.update(time, readings))
         for name in slow:
             values = _with_time_last(part[name]).astype(np.float64)
             slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
+            if name == "spindle_speed" and scatter is None:
+                scatter = _scatter(time, readings, values, settings)
     parts.append(averager.finish())
     means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
     speed = means.get("spindle_speed")
-    if speed is None and "spindle_speed" in raw:
-        speed = np.broadcast_to(np.float64(raw["spindle_speed"].values), (1, join(parts).time.size))
-    return Record(join(parts), means.get("temperature"), None if speed is None else speed[0])
+    return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
+
+
+def _scatter(
+    time: NDArray[np.float64], readings: NDArray[np.floating[Any]], speed: NDArray[np.float64], settings: Settings
+) -> Array | None:
+    """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
+    start = int(np.argmax(speed > 0))
+    begin, end = np.searchsorted(time, time[start] + settings.spin_up + np.array([0.0, settings.average]))
+    if not speed[start] > 0 or end - begin < _ENOUGH or end >= time.size or np.ptp(speed[begin:end]) > 0:
+        return None
+    part = readings[:, begin:end].astype(np.float64)
+    if np.isnan(part).all(axis=1).any():
+        return None
+    return np.asarray(np.nanstd(part, axis=1, ddof=1))
 
 
 def _with_time_last(variable: xr.DataArray) -> NDArray[np.floating[Any]]:
@@ -79,26 +109,21 @@ def count_unknown(averages: Averages, notes: list[str]) -> None:
             )
 
 
-def spin_up(record: Record, settings: Settings) -> float:
-    """Return how long after its start a record is still coming to speed, s: its run-out is not averaged away there."""
-    speed, time = record.spindle_speed, record.averages.time
-    starts_turning = speed is not None and bool(np.nan_to_num(speed[0]) > 0)
-    samples = record.averages.expected[0] > 1
-    return settings.spin_up if samples and starts_turning and np.ptp(time) > settings.spin_up else 0.0
-
-
-def reference_windows(averages: Averages, mean: Array, settings: Settings, spinning_up: float) -> NDArray[np.int64]:
+def reference_windows(
+    averages: Averages, mean: Array, settings: Settings, coming_up: NDArray[np.bool_]
+) -> NDArray[np.int64]:
     """Return the windows of the reference state; MethodError where there is none with all five readings."""
-    wanted = spinning_up if settings.reference_time is None else settings.reference_time
-    begin = averages.time[0] + wanted
+    begin = averages.time[0] + (settings.reference_time or 0.0)
+    if settings.reference_time is None and coming_up[0]:
+        begin = averages.time[int(np.argmin(coming_up))]
     length = settings.reference_average or 0.0
     inside = (averages.time >= begin - 1e-6) & (averages.time < begin + max(length - 0.5 * settings.average, 1e-6))
     if not inside.any():
         later = np.flatnonzero(averages.time >= begin - 1e-6)
         if later.size == 0:
             raise MethodError(
-                f"The record ends at {averages.time[-1]:.1f} s; the reference state was to begin at {wanted:g} s "
-                "(reference_time)."
+                f"The record ends at {averages.time[-1]:.1f} s; the reference state was to begin at "
+                f"{begin:g} s (reference_time)."
             )
         inside[later[0]] = True
     known = inside & np.isfinite(mean).all(axis=0)

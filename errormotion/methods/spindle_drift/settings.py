@@ -65,7 +65,7 @@ class Settings(PluginSettings):
         description="beginning of the reference state, from the record's start; default the first mean, after spin_up "
         "where the record begins with the start of the spindle",
     )
-    spin_up: Time = Field(default=1.0, ge=0, description="time in which the spindle comes to its speed")
+    spin_up: Time = Field(default=1.0, ge=0, description="time that the spindle takes to come to another speed")
     reference_average: Time | None = Field(
         default=None, gt=0, description="length of the reference state; default one mean"
     )
