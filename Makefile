@@ -14,8 +14,8 @@ setup: .venv/.dev  ## install everything into .venv (uv where it is, else pip)
 demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, report
 	@$(BIN)/errormotion demo $(ARGS)
 
-test: .venv/.dev  ## run the tests (ARGS="tests/kinematics -k fit" runs some)
-	$(BIN)/python -m pytest $(ARGS)
+test: .venv/.dev  ## run the tests (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
+	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: .venv/.dev  ## style, types, and which package imports which
 	$(BIN)/ruff check .

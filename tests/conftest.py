@@ -1,11 +1,21 @@
-"""What holds for every test: in CI (environment variable CI set) a skipped test is a failed test."""
+"""What holds for every test: in CI (environment variable CI set) a skipped test is a failed test.
+
+Property tests have no time limit an example, since machines differ. In CI their examples are the same each time;
+elsewhere they are drawn anew, and so find more.
+"""
 
 import os
 from collections.abc import Generator
 
+import hypothesis
 import pytest
 
 IN_CI = os.environ.get("CI", "").lower() not in ("", "0", "false")
+
+hypothesis.settings.register_profile(
+    "errormotion", deadline=None, derandomize=IN_CI, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("errormotion")
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

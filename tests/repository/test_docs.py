@@ -27,8 +27,9 @@ def _shell(command: str) -> str:
     """Return the command to run: ``make TARGET`` becomes what the Makefile does, here instead of in the repository."""
     if not command.startswith("make "):
         return command
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
     recipe = subprocess.run(
-        ["make", "-n", *command.split()[1:]], cwd=ROOT, capture_output=True, text=True, check=True
+        ["make", "-n", "-s", *command.split()[1:]], cwd=ROOT, env=outside, capture_output=True, text=True, check=True
     ).stdout
     return recipe.splitlines()[-1].replace(".venv/bin/", "")
 
