@@ -180,7 +180,7 @@ class Method(Protocol):
         """Return the dimension along which the yielded datasets are joined."""
 
     def progress(self, settings: Any) -> float:
-        """Return the expected total length of ``append_dim`` (samples or items), for the progress bar."""
+        """Return the expected total for the progress bar: seconds, where chunks state a ``sample_rate``; else items."""
 
     def identify(self, raw: xr.Dataset, settings: Any) -> xr.Dataset:
         """Turn a raw dataset into an error dataset; leaves ``raw`` as it is."""

@@ -261,7 +261,7 @@ class _Session:
                 for chunk in chunks:
                     recorder.put(chunk)
                     taken += chunk.sizes.get(dim, 0)
-                    rate = chunk.attrs.get("sample_rate") if dim == "time" else None
+                    rate = chunk.attrs.get("sample_rate")
                     self.progress.advance(taken / rate if rate else taken)
         finally:
             folder.give_reserve()

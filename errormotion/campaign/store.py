@@ -95,9 +95,7 @@ class RawStore:
             raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
         growing = {str(name): variable for name, variable in _stored(first, dim).items() if dim in variable.dims}
         packings = {name: _packing(variable) for name, variable in growing.items()}
-        length = (
-            expected * float(first.attrs["sample_rate"]) if dim == "time" and "sample_rate" in first.attrs else expected
-        )
+        length = expected * float(first.attrs.get("sample_rate", 1.0))
         block = _block_length(growing, packings, dim, length)
         skeleton = first.isel({dim: slice(0, 0)}).drop_vars(
             [n for n in first.variables if n not in _stored(first, dim)]

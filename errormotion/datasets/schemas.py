@@ -178,6 +178,34 @@ RAW_SCHEMAS = (
     ),
     RawSchema(
         "errormotion.raw.spindle_drift/1",
+        "beam detection as recorded",
+        "scan",
+        (
+            Row("record", ("sample",), "m", *_READING, "reading along the beam that is scanned; NaN = none"),
+            Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
+            Row(
+                "sphere_centre",
+                ("channel", "profile", "step", "direction"),
+                "m",
+                *_PLACE,
+                "commanded centre of the sphere",
+            ),
+            Row("sphere_radius", (), "m", *_RADIUS, "radius of the calibrated sphere"),
+            Row("scan_direction", ("channel", "profile", "direction"), "1", *_UNIT_VECTOR, "direction of the steps"),
+            Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "origin of the beam, from the drawing"),
+            Row(
+                "nominal_direction",
+                ("channel", "direction"),
+                "1",
+                *_UNIT_VECTOR,
+                "direction of the beam, from the drawing",
+            ),
+        ),
+        sizes={**_DIRECTION, "channel": 5},
+        labels={**_XYZ, "channel": CHANNELS},
+    ),
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
         "beam detection",
         "step",
         (

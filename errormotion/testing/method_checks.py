@@ -15,7 +15,7 @@ import xarray as xr
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from errormotion import datasets
-from errormotion.datasets.schemas import RAW_SCHEMAS
+from errormotion.datasets.schemas import RAW_SCHEMAS, variants
 from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
@@ -85,7 +85,10 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
     method, settings = subject.plugin(), subject.effective_settings()
     dim, length = method.append_dim(settings), method.progress(settings)
     raw, _ = subject.make(0)
-    require(dim in raw.dims, f"append_dim: expected one of {tuple(map(str, raw.dims))}, found '{dim}'")
+    # What is acquired may be another variant of the schema than what is handed to the kit.
+    known = {str(d) for d in raw.dims}
+    known |= {d for variant in variants(method.needs.raw_schema) for row in variant.rows for d in row.dims}
+    require(dim in known, f"append_dim: expected one of {', '.join(sorted(known))}; found '{dim}'")
     require(0 < length < float("inf"), f"progress: expected a positive length, found {length}")
     return f"{length:g} along {dim}"
 

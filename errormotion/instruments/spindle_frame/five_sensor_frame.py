@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.point_lds.optoncdt.codec import LOST, OVERRUN
+from errormotion.instruments.point_lds.optoncdt.codec import LOST, OFFSET, OVERRUN, SCALE
 from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT, count_reasons
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
 from errormotion.instruments.spindle_frame.geometry import FrameGeometry
@@ -65,6 +65,16 @@ class FiveSensorFrame:
     def rate(self) -> float:
         """Samples per second of each channel."""
         return self.settings.rate
+
+    @property
+    def encoding(self) -> dict[str, Any]:
+        """How distances are kept without loss: the 16-bit numbers that came over the wire."""
+        return {
+            "dtype": "uint16",
+            "scale_factor": SCALE * self.settings.range,
+            "add_offset": -OFFSET * self.settings.range,
+            "_FillValue": 65535,
+        }
 
     @property
     def addresses(self) -> dict[str, str]:

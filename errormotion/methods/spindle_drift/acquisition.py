@@ -1,7 +1,6 @@
 """Measuring: a drift record from five channels on one clock, and the readings of a stepped sphere.
 
-Everything that a sensor said goes into the raw dataset before anything is computed from it: the drift record sample by
-sample, the scans of the sphere as whole records beside the means of their steps.
+Everything that a sensor said goes into the raw dataset, sample by sample, before anything is computed from it.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ import xarray as xr
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.beams import across
-from errormotion.methods.spindle_drift.segmentation import segment_steps
 from errormotion.methods.spindle_drift.uncertainty import CHANNELS
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -63,7 +61,7 @@ def record_drift(
     static = _static(bench, frame, settings, beams)
     static.attrs["sample_rate"] = rate
     virtual = _start_machine(bench, settings, first / rate)
-    pending = _Pending(static, rate, settings, first, thermometer)
+    pending = _Pending(static, rate, settings, first, thermometer, frame.encoding)
     if done is not None and not virtual:
         pending.fill_gap(min(_missed(done, rate), total))
         while pending.samples:
@@ -154,6 +152,7 @@ class _Pending:
     settings: Settings
     end: int
     thermometer: Any
+    encoding: Mapping[str, Any]
     blocks: list[Array] = field(default_factory=list)
     warmth: list[Array] = field(default_factory=list)
     samples: int = 0
@@ -204,6 +203,7 @@ class _Pending:
         first = self.end - self.samples
         ds = self.static.copy()
         ds["distance"] = (("channel", "time"), np.concatenate(self.blocks, axis=1), {"units": "m"})
+        ds["distance"].encoding = dict(self.encoding)
         if self.thermometer is not None:
             ds = ds.assign_coords(sensor=list(self._temperature))
             ds["temperature"] = (("time", "sensor"), np.concatenate(self.warmth), {"units": "degC"})
@@ -223,9 +223,10 @@ class _Pending:
 
 
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
-    """Yield the readings of a stepped sphere, one beam at a time along ``channel``.
+    """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
 
-    The machine needs no synchronous reading: it steps by its own clock, and the steps are found in the record.
+    The machine needs no synchronous reading: it steps by its own clock, and the steps are found in the record. A scan
+    that an interruption cut off is made anew; of its samples the last ones count.
     """
     frame = bench.of_kind("spindle_frame")
     if not bench.has_kind("controller"):
@@ -234,66 +235,63 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
             "it; the bench has none. Give the beams of an earlier detection, or measure with the nominal ones."
         )
     controller = bench.of_kind("controller")
-    finished = [] if done is None else [str(name) for name in done["channel"].values]
+    static = _scan_plan(bench, frame, settings)
+    length = round(scan_seconds(settings) * frame.rate)
+    recorded = np.zeros(0, np.int64) if done is None else np.bincount(done["scan"].values)
     controller.mount("sphere")
-    for name in CHANNELS:
-        if name not in finished:
-            yield _detect_beam(bench, frame, controller, settings, name)
-
-
-def _detect_beam(bench: Bench, frame: Any, controller: Any, settings: Settings, name: str) -> xr.Dataset:
-    g = frame.geometry
-    i = CHANNELS.index(name)
-    origin, direction = g.nominal_origin[i], g.nominal_direction[i]
-    offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
-    step = settings.scan_length / (settings.steps - 1)
-    scans = np.array([v for _ in settings.depths for v in _machine_axes(direction)])
-    depths = np.repeat(settings.depths, 2)
-    middle = origin + (depths + settings.sphere_radius)[:, None] * direction
-    centre = middle[:, None] + offsets[:, None] * scans[:, None]
-    length = round((settings.steps * settings.dwell * 1.25 + LEAD) * frame.rate)
-    record = np.full((len(scans), length), np.nan, np.float32)
-    means = np.full((len(scans), settings.steps), np.nan)
-    problems = []
-    for profile, v in enumerate(scans):
+    profiles = static.sizes["profile"]
+    for scan in range(len(CHANNELS) * profiles):
+        if scan < recorded.size and recorded[scan] >= length:
+            continue
+        channel, profile = divmod(scan, profiles)
         controller.run_steps(
-            start=[float(x) for x in centre[profile, 0]],
-            direction=[float(x) for x in v],
-            step=step,
+            start=[float(x) for x in static["sphere_centre"].values[channel, profile, 0]],
+            direction=[float(x) for x in static["scan_direction"].values[channel, profile]],
+            step=settings.scan_length / (settings.steps - 1),
             count=settings.steps,
             dwell=settings.dwell,
         )
-        record[profile] = _take_record(frame, name, length)
-        try:
-            means[profile] = segment_steps(
-                record[profile].astype(np.float64), frame.rate, settings.steps, settings.dwell, settings.step_average
-            ).mean
-        except MethodError as error:
-            problems.append(f"profile {profile}: {error}")
-    one = {"channel": [name], "direction": list("xyz")}
+        yield from _record_scan(frame, static, CHANNELS[channel], scan, length)
+
+
+def scan_seconds(settings: Settings) -> float:
+    """Return how long one scan is recorded: its rests, a quarter more for the moves, and a lead."""
+    return settings.steps * settings.dwell * 1.25 + LEAD
+
+
+def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
+    """Return everything of a beam detection but its samples."""
+    g = frame.geometry
+    offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
+    scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in g.nominal_direction])
+    ahead = np.repeat(settings.depths, 2) + settings.sphere_radius
+    middle = g.nominal_origin[:, None] + ahead[:, None] * g.nominal_direction[:, None]
     m = {"units": "m"}
     return xr.Dataset(
         {
-            "distance": (("channel", "profile", "step"), means[None], m),
-            "record": (("channel", "profile", "sample"), record[None], {**m, "rate": float(frame.rate)}),
-            "problems": ("channel", np.array(["; ".join(problems)]).astype("U500")),
-            "sphere_centre": (("channel", "profile", "step", "direction"), centre[None], m),
-            "scan_direction": (("channel", "profile", "direction"), scans[None], {"units": "1"}),
-            "nominal_origin": (("channel", "direction"), origin[None], m),
-            "nominal_direction": (("channel", "direction"), direction[None], {"units": "1"}),
+            "sphere_centre": (
+                ("channel", "profile", "step", "direction"),
+                middle[:, :, None] + offsets[:, None] * scans[:, :, None],
+                m,
+            ),
+            "scan_direction": (("channel", "profile", "direction"), scans, {"units": "1"}),
+            "nominal_origin": (("channel", "direction"), g.nominal_origin, m),
+            "nominal_direction": (("channel", "direction"), g.nominal_direction, {"units": "1"}),
             "sphere_radius": ((), settings.sphere_radius, m),
         },
-        coords=one,
+        coords={"channel": list(CHANNELS), "direction": list("xyz")},
         attrs={
             "schema": SCHEMA,
             "machine": bench.machine,
             "start": datetime.now(UTC).isoformat(timespec="seconds"),
             "sensors_warm": int(bool(frame.warm)),
+            "sample_rate": float(frame.rate),
+            "dwell": settings.dwell,
         },
     )
 
 
-def _machine_axes(direction: Array) -> Array:
+def machine_axes(direction: Array) -> Array:
     """Return the two machine axes across a beam; for a beam far from all axes, two vectors across it."""
     axis = int(np.argmax(np.abs(direction)))
     if abs(direction[axis]) < 0.9:
@@ -301,16 +299,23 @@ def _machine_axes(direction: Array) -> Array:
     return np.delete(np.eye(3), axis, axis=0)
 
 
-def _take_record(frame: Any, channel: str, length: int) -> NDArray[np.float32]:
-    """Return ``length`` samples of one channel, m."""
-    record = np.empty(length, np.float32)
-    taken = 0
+def _record_scan(frame: Any, static: xr.Dataset, channel: str, scan: int, length: int) -> Iterator[xr.Dataset]:
+    """Yield ``length`` samples of one channel."""
+    taken, since = 0, time.monotonic()
+    waiting: list[Array] = []
     for samples in frame.stream([channel]):
-        part = samples.values[0, : length - taken]
-        record[taken : taken + part.size] = part
-        taken += part.size
+        waiting.append(samples.values[0, : length - taken])
+        taken += waiting[-1].size
+        if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
+            record = np.concatenate(waiting)
+            chunk = static.assign(
+                record=("sample", record, {"units": "m"}), scan=("sample", np.full(record.size, scan, np.int16))
+            )
+            chunk["record"].encoding = dict(frame.encoding)
+            yield chunk
+            waiting, since = [], time.monotonic()
         if taken == length:
-            return record
+            return
     raise MethodError(
         f"Channel {channel}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s."
     )

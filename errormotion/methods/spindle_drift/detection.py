@@ -10,7 +10,10 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import cross_matrix
+from errormotion.methods.spindle_drift.acquisition import LEAD
 from errormotion.methods.spindle_drift.beams import Beam, circles_and_line, likelihood_fit
+from errormotion.methods.spindle_drift.segmentation import segment_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,6 +39,10 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     MethodError
         Readings that do not determine a beam; the beam is named.
     """
+    notes: list[str] = []
+    measured = raw
+    if "scan" in raw.variables:
+        raw = segmented(raw, settings, notes)
     names = [str(name) for name in raw["channel"].values]
     radius = float(raw["sphere_radius"])
     distance = raw["distance"].transpose("channel", "profile", "step").values.astype(np.float64)
@@ -46,7 +53,6 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     direction0 = direction0 / np.linalg.norm(direction0, axis=1, keepdims=True)
     found: list[Beam] = []
     paper_origin, paper_direction = np.full_like(origin0, np.nan), np.full_like(origin0, np.nan)
-    notes: list[str] = []
     for i, name in enumerate(names):
         beam = likelihood_fit(distance[i], centre[i], radius, origin0[i], direction0[i], name)
         found.append(beam)
@@ -59,7 +65,7 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         if len(beam.left_out):
             places = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
             notes.append(f"{name}: {len(beam.left_out)} readings left out as outliers: {places}.")
-    errors, covariance = _errors(origin0, direction0, found)
+    errors, covariance = beam_errors(origin0, direction0, found)
     for note in notes:
         log.warning(note)
     beam_axis, axis = ("beam", names), ("direction", list("xyz"))
@@ -106,13 +112,41 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         reference="nominal beams; each beam's errors are stated at its own nominal zero point (nominal_origin)",
         method=method,
         method_version=version,
-        provenance=provenance.make(settings, raw, None, steps=["ray-sphere likelihood fit", "circles and line"]),
+        provenance=provenance.make(settings, measured, None, steps=["ray-sphere likelihood fit", "circles and line"]),
         extras=extras,
     )
     return ds.assign_attrs(notes=notes or [""])
 
 
-def _errors(origin0: Array, direction0: Array, found: list[Beam]) -> tuple[Array, Array]:
+def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Dataset:
+    """Return a beam detection with the mean reading of every step, from one as recorded.
+
+    A scan that was cut off and made anew counts with its last samples; one whose steps are not found is NaN, and
+    ``notes`` say why.
+    """
+    centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction")
+    channels, profiles, steps = centre.shape[:3]
+    rate, dwell = float(raw.attrs["sample_rate"]), float(raw.attrs.get("dwell", settings.dwell))
+    length = round((steps * dwell * 1.25 + LEAD) * rate)
+    scan = raw["scan"].values
+    means = np.full((channels, profiles, steps), np.nan)
+    for number in range(channels * profiles):
+        channel, profile = divmod(number, profiles)
+        place = f"{raw['channel'].values[channel]}, profile {profile}"
+        samples = np.flatnonzero(scan == number)[-length:]
+        if samples.size == 0:
+            notes.append(f"{place}: not recorded.")
+            continue
+        record = raw["record"].isel(sample=slice(int(samples[0]), int(samples[-1]) + 1)).values.astype(np.float64)
+        try:
+            means[channel, profile] = segment_steps(record, rate, steps, dwell, settings.step_average).mean
+        except MethodError as error:
+            notes.append(f"{place}: {error}")
+    return raw.drop_dims("sample").assign(distance=(("channel", "profile", "step"), means, {"units": "m"}))
+
+
+def beam_errors(origin0: Array, direction0: Array, found: list[Beam]) -> tuple[Array, Array]:
+    """Return the errors (beam, 6) of beams against nominal ones, and their covariance (beam, 6, 6)."""
     errors = np.empty((len(found), 6))
     covariance = np.empty((len(found), 6, 6))
     for i, (p0, u0, beam) in enumerate(zip(origin0, direction0, found, strict=True)):
@@ -126,7 +160,7 @@ def _errors(origin0: Array, direction0: Array, found: list[Beam]) -> tuple[Array
         # d(u0 x u) = [u0] du; the angle's stretch is 1 to second order in a few mrad.
         chart = np.zeros((6, 6))
         chart[:3, :3] = np.eye(3)
-        chart[3:, 3:] = np.cross(np.eye(3), u0) * -1.0
+        chart[3:, 3:] = cross_matrix(u0)
         covariance[i] = chart @ beam.covariance @ chart.T
         along = int(np.argmax(np.abs(u0)))
         if abs(u0[along]) >= _ALONG:

@@ -54,12 +54,16 @@ class SpindleDrift:
         return acquisition.record_drift(bench, settings, inputs.get("beams"), done)
 
     def append_dim(self, settings: DriftSettings) -> str:
-        """Return ``channel`` for a beam detection (beam by beam), ``time`` for a drift record."""
-        return "channel" if settings.procedure == "beam_detection" else "time"
+        """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""
+        return "sample" if settings.procedure == "beam_detection" else "time"
 
     def progress(self, settings: DriftSettings) -> float:
-        """Return the expected length: beams, or seconds of drift."""
-        return 5.0 if settings.procedure == "beam_detection" else settings.duration
+        """Return the expected length of the record, s."""
+        from errormotion.methods.spindle_drift.acquisition import scan_seconds
+
+        if settings.procedure == "beam_detection":
+            return 5 * 2 * len(settings.depths) * scan_seconds(settings)
+        return settings.duration
 
     def follow(self, settings: DriftSettings) -> Callable[[xr.Dataset], str]:
         """Return what tells, chunk by chunk while measuring, how far things are."""
@@ -90,7 +94,7 @@ class SpindleDrift:
         validate(checked)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"spindle_drift reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        part = identify_beams if "step" in raw.dims else identify_drift
+        part = identify_beams if "sphere_radius" in raw else identify_drift
         return part(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
@@ -101,4 +105,5 @@ class SpindleDrift:
 
 
 def _beam_text(chunk: xr.Dataset) -> str:
-    return f"beam {chunk['channel'].values[-1]} scanned"
+    channel, profile = divmod(int(chunk["scan"].values[-1]), chunk.sizes["profile"])
+    return f"beam {chunk['channel'].values[channel]}, profile {profile + 1} of {chunk.sizes['profile']}"

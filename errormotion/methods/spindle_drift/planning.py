@@ -7,36 +7,74 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.spindle_drift.beams import fisher_bound
+from errormotion.datasets import build_errors, provenance
+from errormotion.methods.spindle_drift.acquisition import machine_axes
+from errormotion.methods.spindle_drift.beams import Beam, fisher_bound
+from errormotion.methods.spindle_drift.detection import beam_errors
 from errormotion.methods.spindle_drift.uncertainty import CHANNELS
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.method import SpindleDrift
     from errormotion.methods.spindle_drift.settings import Settings
 
+_PLANNED = "planned, not measured"
 _TWIST = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])
 
 
 def plan(method: SpindleDrift, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros with the covariance to expect, reference state and one later instant.
+    """Return an error dataset of zeros with the covariance to expect, of the procedure that the settings name."""
+    return _plan_beams(method, settings) if settings.procedure == "beam_detection" else _plan_drift(method, settings)
+
+
+def _frame(settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origins, directions (5, 3) and bounds (5, 6, 6) of the beams of a frame as drawn in ISO 230-3."""
+    p = settings.layout
+    near = p.bar_radius + p.standoff
+    z1, z2 = p.levels
+    origin = np.array([[near, 0, z1], [near, 0, z2], [0, near, z1], [0, near, z2], [0, 0, -p.standoff]])
+    direction = np.array([[-1.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]])
+    bounds = [
+        fisher_bound(o, u, _centres(o, u, settings), settings.sphere_radius, p.step_noise)
+        for o, u in zip(origin, direction, strict=True)
+    ]
+    return origin, direction, np.array(bounds)
+
+
+def _plan_beams(method: SpindleDrift, settings: Settings) -> xr.Dataset:
+    origin, direction, bounds = _frame(settings)
+    none = np.zeros((0, 2), np.int64)
+    found = [
+        Beam(o, u, c, settings.layout.step_noise, np.zeros((0, 0)), none)
+        for o, u, c in zip(origin, direction, bounds, strict=True)
+    ]
+    errors, covariance = beam_errors(origin, direction, found)
+    return build_errors(
+        errors,
+        covariance,
+        dims=("beam",),
+        coords={"beam": list(CHANNELS)},
+        component="beam",
+        machine="plan",
+        frame="machine",
+        functional_point=origin.mean(axis=0),
+        reference=_PLANNED,
+        method=method.info.id,
+        method_version=method.info.version,
+        provenance=provenance.make(settings, None, None),
+    )
+
+
+def _plan_drift(method: SpindleDrift, settings: Settings) -> xr.Dataset:
+    """Plan a drift: the reference state and one later instant.
 
     A bar of the stated radius stands in a frame as drawn in ISO 230-3, its readings mid-range; the beams come from a
     detection with the stated steps. The later instant has drifted by a typical amount (5 um sideways, 20 um in Z,
     0.1 mrad), since what the beams' uncertainty does grows with the drift.
     """
     p = settings.layout
-    r = p.bar_radius
-    near = r + p.standoff
-    z1, z2 = p.levels
-    origin = np.array([[near, 0, z1], [near, 0, z2], [0, near, z1], [0, near, z2], [0, 0, -p.standoff]])
-    direction = np.array([[-1.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]])
-    covariance = np.zeros((5, 6, 6))
-    for i in range(5):
-        covariance[i] = fisher_bound(
-            origin[i], direction[i], _centres(origin[i], direction[i], settings), settings.sphere_radius, p.step_noise
-        )
+    origin, direction, covariance = _frame(settings)
     ex, ey, ez, ea, eb = _TWIST
-    zs = np.array([z1, z2])
+    zs = np.array(p.levels)
     still = np.full(5, p.standoff)
     # Distances to first order: the bar comes nearer by its displacement along the beam's way back.
     moved = still + np.array([*-(ex + eb * zs), *-(ey - ea * zs), ez])
@@ -50,7 +88,7 @@ def plan(method: SpindleDrift, settings: Settings) -> xr.Dataset:
             "beam_covariance": (("channel", "p", "p_"), covariance),
             "nominal_origin": (("channel", "direction"), origin),
             "nominal_direction": (("channel", "direction"), direction),
-            "bar_radius": r,
+            "bar_radius": p.bar_radius,
             "distance_noise": p.noise / np.sqrt(samples),
             "level": ("height", zs),
         },
@@ -61,12 +99,10 @@ def plan(method: SpindleDrift, settings: Settings) -> xr.Dataset:
     for name in ("EX", "EY", "EZ", "EA", "EB"):
         expected[name] = expected[name] * 0.0
     kept = ["EX", "EY", "EZ", "EA", "EB", "EC", "covariance", "influence"]
-    return expected[kept].assign_attrs(reference="planned, not measured")
+    return expected[kept].assign_attrs(reference=_PLANNED)
 
 
 def _centres(origin: np.ndarray, direction: np.ndarray, settings: Settings) -> np.ndarray:
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
-    axis = int(np.argmax(np.abs(direction)))
-    scans = np.delete(np.eye(3), axis, axis=0)
     middle = origin + (np.array(settings.depths) + settings.sphere_radius)[:, None] * direction
-    return np.asarray(middle[:, None, None] + offsets[:, None] * scans[:, None])
+    return np.asarray(middle[:, None, None] + offsets[:, None] * machine_axes(direction)[:, None])

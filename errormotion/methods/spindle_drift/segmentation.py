@@ -121,7 +121,7 @@ def _large_moves(level: Array, seconds: float, steps: int, dwell: float) -> tupl
     back = int(pair.argmax()) + least
     out = int(change[: back - least + 1].argmax())
     ordinary = np.median(change)
-    if min(change[out], change[back]) < _STANDS_OUT * ordinary or out + rest >= back:
+    if not min(change[out], change[back]) > _STANDS_OUT * ordinary or out + rest >= back:
         raise MethodError(
             "No move out and back stands out of the record: expected the sphere to go to one end of the scan, step "
             "through it and return. Did the program run, and was the sphere in the beam?"
