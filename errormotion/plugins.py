@@ -156,7 +156,11 @@ class Bench(Protocol):
 
 @runtime_checkable
 class Method(Protocol):
-    """What is measured and how it becomes an error dataset."""
+    """What is measured and how it becomes an error dataset.
+
+    A method may also have ``follow(settings)``: it returns a function that takes each acquired dataset and returns a
+    line of text for the person at the machine.
+    """
 
     info: ClassVar[MethodInfo]
     needs: ClassVar[Needs]

@@ -45,6 +45,13 @@ class Progress(Protocol):
     def advance(self, done: float) -> None:
         """Say how much of the part is done: seconds of evenly spaced samples, else items."""
 
+    @property
+    def shown(self) -> bool:
+        """Whether anybody sees it: what costs time to find out is told only then."""
+
+    def note(self, text: str) -> None:
+        """Say what the measurement shows so far."""
+
 
 class Quiet:
     """Tells nothing."""
@@ -56,6 +63,14 @@ class Quiet:
         """Tell nothing."""
 
     def advance(self, done: float) -> None:
+        """Tell nothing."""
+
+    @property
+    def shown(self) -> bool:
+        """Nobody sees it."""
+        return False
+
+    def note(self, text: str) -> None:
         """Tell nothing."""
 
 
@@ -252,6 +267,8 @@ class _Session:
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
+        follow = getattr(method, "follow", None) if self.progress.shown else None
+        tell = follow(test.settings) if follow else None
         try:
             with (
                 _in_order(),
@@ -263,6 +280,8 @@ class _Session:
                     taken += chunk.sizes.get(dim, 0)
                     rate = chunk.attrs.get("sample_rate")
                     self.progress.advance(taken / rate if rate else taken)
+                    if tell:
+                        self.progress.note(tell(chunk))
         finally:
             folder.give_reserve()
             folder.data["samples"] = {

@@ -77,7 +77,7 @@ def check_plugin(plugin_id: str, address: str | None, as_json: bool) -> bool:
     if as_json:
         show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})
         return good
-    rows = [["ok" if r.ok else "FAILED", r.name, f"{r.seconds:.2f}", r.message] for r in results]
+    rows = [["-" if r.skipped else "ok" if r.ok else "FAILED", r.name, f"{r.seconds:.2f}", r.message] for r in results]
     show(table(["", "check", "seconds", "message"], rows))
     failed = sum(not result.ok for result in results)
     show(f"{plugin_id}: " + ("passes" if good else f"{failed} of {len(results)} checks failed"))

@@ -32,6 +32,7 @@ class Bars:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
             console=self._console,
             disable=not self._shown,
         )
@@ -58,12 +59,22 @@ class Bars:
     def stage(self, name: str, total: float | None = None) -> None:
         """Begin a part of a test."""
         self._finish()
-        self._task = self._progress.add_task(self._name + name, total=total)
+        self._task = self._progress.add_task(self._name + name, total=total, note="")
 
     def advance(self, done: float) -> None:
         """Say how much of the part is done."""
         if self._task is not None:
             self._progress.update(self._task, completed=done)
+
+    @property
+    def shown(self) -> bool:
+        """Whether there is a terminal that shows it."""
+        return self._shown
+
+    def note(self, text: str) -> None:
+        """Say what the measurement shows so far, behind the bar."""
+        if self._task is not None:
+            self._progress.update(self._task, note=text)
 
     def ask(self, message: str) -> None:
         """Ask the operator for something and wait for Enter."""

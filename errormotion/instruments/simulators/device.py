@@ -55,7 +55,7 @@ class SimulatedDevice:
     faults: tuple[str, ...] = ()
     """What of the fault menu the device offers."""
 
-    _drops_answers = True
+    drops_answers = True
     """Whether ``drop`` and ``disconnect`` count answers; else they are about samples."""
 
     def close(self) -> None:
@@ -74,9 +74,9 @@ class SimulatedDevice:
         """Send an answer, with whatever fault is due."""
         number, fault = self._answers, self.fault
         self._answers += 1
-        if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self._drops_answers):
+        if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self.drops_answers):
             return
-        if fault.kind == "disconnect" and self._drops_answers and number >= fault.at:
+        if fault.kind == "disconnect" and self.drops_answers and number >= fault.at:
             self._server.hang_up()
             return
         if fault.hits("garbage", number):

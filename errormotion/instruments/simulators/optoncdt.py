@@ -33,7 +33,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
     """
 
     faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
-    _drops_answers = False
+    drops_answers = False
 
     def __init__(self, address: Address) -> None:
         self._rate = 20e3
