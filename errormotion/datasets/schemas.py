@@ -135,6 +135,26 @@ ERROR_ATTRIBUTES = {
 _DIRECTION = {"direction": 3}
 _XYZ = {"direction": ("x", "y", "z")}
 
+_STEPPED_SPHERE = (
+    Row(
+        "sphere_centre",
+        ("channel", "profile", "step", "direction"),
+        "m",
+        *_PLACE,
+        "commanded centre of the sphere",
+    ),
+    Row("sphere_radius", (), "m", *_RADIUS, "radius of the calibrated sphere"),
+    Row("scan_direction", ("channel", "profile", "direction"), "1", *_UNIT_VECTOR, "direction of the steps"),
+    Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "origin of the beam, from the drawing"),
+    Row(
+        "nominal_direction",
+        ("channel", "direction"),
+        "1",
+        *_UNIT_VECTOR,
+        "direction of the beam, from the drawing",
+    ),
+)
+
 RAW_SCHEMAS = (
     RawSchema(
         "errormotion.raw.spindle_drift/1",
@@ -183,23 +203,7 @@ RAW_SCHEMAS = (
         (
             Row("record", ("sample",), "m", *_READING, "reading along the beam that is scanned; NaN = none"),
             Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
-            Row(
-                "sphere_centre",
-                ("channel", "profile", "step", "direction"),
-                "m",
-                *_PLACE,
-                "commanded centre of the sphere",
-            ),
-            Row("sphere_radius", (), "m", *_RADIUS, "radius of the calibrated sphere"),
-            Row("scan_direction", ("channel", "profile", "direction"), "1", *_UNIT_VECTOR, "direction of the steps"),
-            Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "origin of the beam, from the drawing"),
-            Row(
-                "nominal_direction",
-                ("channel", "direction"),
-                "1",
-                *_UNIT_VECTOR,
-                "direction of the beam, from the drawing",
-            ),
+            *_STEPPED_SPHERE,
         ),
         sizes={**_DIRECTION, "channel": 5},
         labels={**_XYZ, "channel": CHANNELS},
@@ -210,23 +214,7 @@ RAW_SCHEMAS = (
         "step",
         (
             Row("distance", ("channel", "profile", "step"), "m", *_READING, "mean reading at rest; NaN = none"),
-            Row(
-                "sphere_centre",
-                ("channel", "profile", "step", "direction"),
-                "m",
-                *_PLACE,
-                "commanded centre of the sphere",
-            ),
-            Row("sphere_radius", (), "m", *_RADIUS, "radius of the calibrated sphere"),
-            Row("scan_direction", ("channel", "profile", "direction"), "1", *_UNIT_VECTOR, "direction of the steps"),
-            Row("nominal_origin", ("channel", "direction"), "m", *_PLACE, "origin of the beam, from the drawing"),
-            Row(
-                "nominal_direction",
-                ("channel", "direction"),
-                "1",
-                *_UNIT_VECTOR,
-                "direction of the beam, from the drawing",
-            ),
+            *_STEPPED_SPHERE,
             Row(
                 "distance_noise",
                 (),
