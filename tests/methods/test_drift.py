@@ -283,3 +283,44 @@ def test_stopping_leaves_the_run_out_in_the_readings_and_the_uncertainty_says_so
     weights[np.flatnonzero(rest)[[0, -1]]] = -1.0, 1.0
     spread = np.asarray(errors.where(~unknown.any(), errors).em.combine(weights, dim="time")[1])[0, 0]
     assert np.sqrt(spread) < 0.1 * u[rest].min()
+
+
+def test_each_rest_is_a_draw_of_its_own_and_a_resting_reference_is_in_everything_else(method):
+    """Cold and still, then running, then still again: the bar stops at another angle than it started from."""
+    machine = VirtualMachine("cframe", seed=4)
+    machine.start([Event(6.0, 15000.0), Event(12.0, 0.0)])
+    rate, seconds = 2500.0, 18
+    n = int(rate * seconds)
+    clock = np.arange(n) / rate
+    raw = machine.raw_spindle_drift(clock, seed=0, averaged=1)
+    raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
+    raw["spindle_speed"] = ("time", np.where((clock < 6.0) | (clock >= 12.0), 0.0, -15000.0))
+    errors = method.identify(raw, Settings(compensate_frame=False))
+    time = errors["time"].values + errors.attrs["reference_time"]
+    u = np.sqrt(errors["covariance"].sel(dof="EX", dof_="EX").values)
+    first, running, last = (time > 2) & (time < 5.5), (time > 8) & (time < 11.5), time > 14
+    assert u[running].min() > 5 * u[first].max()
+    np.testing.assert_allclose(u[last], np.sqrt(2) * u[running].mean(), rtol=0.02)
+    off = np.abs(errors["EX"].values)
+    assert (off[running] < 3 * u[running]).all()
+    assert (off[last] < 3 * u[last]).all()
+
+
+def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, method):
+    """Means over half a minute share their smoothed temperature: their difference over seeds is what is stated."""
+    t = np.arange(0, 1800.0, 2.0)
+    late, later = (t > 600) & (t <= 630), (t > 1500) & (t <= 1530)
+    weights = later / later.sum() - late / late.sum()
+    found, stated = [], []
+    raw = machine.raw_spindle_drift(t, seed=0, expansion=True)
+    raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
+    warm = raw["temperature"].sel(sensor="frame").values.copy()
+    column = list(raw["sensor"].values).index("frame")
+    settings = Settings(frame_expansion_uncertainty=0.0, frame_smoothing=60.0)
+    for seed in range(40):
+        raw["temperature"][:, column] = warm + np.random.default_rng(seed).normal(0, 0.03, t.size)
+        change = method.identify(raw, settings).em.combine(weights, dim="time")
+        found.append(np.asarray(change[0])[1])
+        stated.append(np.sqrt(np.asarray(change[1])[1, 1]))
+    # The readings' noise is the same in all seeds; of the spread of 40 draws 11 % is chance.
+    assert np.std(found) == pytest.approx(np.mean(stated), rel=0.4)

@@ -25,7 +25,7 @@ def results(t, errors=None, **options):
     independent = np.tile(np.diag([U**2] * 6), (t.size, 1, 1))
     influence = np.zeros((1, t.size, 6))
     influence[0, 1:] = 3 * U  # the reference: one draw in all values but the first
-    series = quantities(errors, independent, influence, np.array([0.01, 0.05]))
+    series = quantities(errors, independent, influence, np.array([0.01, 0.05]), np.zeros(3))
     settings = {
         "temperature": None,
         "sensors": (),
@@ -68,9 +68,9 @@ def test_levels_follow_from_displacement_and_tilt():
 def test_a_difference_from_the_start_carries_the_reference_and_one_between_two_later_places_does_not():
     t = np.arange(0, 4000.0, 10.0)
     found = results(t)
-    # Three instants of 10 s in half a minute, one at the start, and the reference between them.
+    # Three instants of 10 s in half a minute, and the reference that they share.
     u = value(found, "Z", "difference_60min", "uncertainty")
-    assert u == pytest.approx(U * np.sqrt(1 / 3 + 1 + 9), rel=1e-9)
+    assert u == pytest.approx(U * np.sqrt(1 / 3 + 9), rel=1e-9)
     assert found.series.difference(4, np.array([100]), np.array([50]))[1] == pytest.approx(U * np.sqrt(2), rel=1e-9)
 
 
@@ -82,6 +82,26 @@ def test_noise_does_not_widen_a_range():
     assert value(results(t, errors), "Z", "range_60min") == pytest.approx(
         value(results(t), "Z", "range_60min"), abs=0.05e-6
     )
+
+
+def test_a_spindle_that_turns_backwards_turns():
+    t = np.arange(0, 4000.0, 10.0)
+    speed = np.where(t < 3000, -15000.0, 0.0)
+    found = results(t, spindle_speed=speed)
+    assert found.test == "rotating spindle"
+    assert value(found, "Z", "difference_running") == pytest.approx(20e-6 * -np.expm1(-2990 / 1500), abs=0.05e-6)
+
+
+def test_all_quantities_are_those_on_the_axis_wherever_the_errors_are_stated():
+    t = np.arange(0, 4000.0, 10.0)
+    errors = drift(t)
+    point = np.array([0.1, 0.05, -0.05])
+    there = errors.copy()
+    there[:, :3] += np.cross(np.nan_to_num(errors[:, 3:]), point)
+    none = np.zeros((t.size, 6, 6)), np.zeros((1, t.size, 6))
+    here = quantities(errors, *none, np.array([0.01, 0.05]), np.zeros(3))
+    moved = quantities(there, *none, np.array([0.01, 0.05]) - point[2], -point)
+    np.testing.assert_allclose(moved.value, here.value, atol=1e-18)
 
 
 def test_an_hour_that_was_not_measured_is_unknown():

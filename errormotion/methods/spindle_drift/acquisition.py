@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.beams import across
-from errormotion.methods.spindle_drift.uncertainty import CHANNELS
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:

@@ -30,6 +30,7 @@ UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""
 _OUTLIER = 6.0
 """Readings further than this many (robust) standard deviations off are left out and named."""
+_LEAST_USED = 0.7
 
 
 @dataclass(frozen=True)
@@ -117,14 +118,20 @@ def likelihood_fit(
         )
     direction = direction / np.linalg.norm(direction)
     origin, direction = _first_shift(distance, centre, radius, origin, direction, used)
-    for _ in range(5):
+    everything = used.copy()
+    while True:
         origin, direction, jacobian = _gauss_newton(distance, centre, radius, origin, direction, used, name)
         residual = distance - sphere_reading(origin, direction, centre, radius)[0]
         spread = 1.4826 * np.median(np.abs(residual[used] - np.median(residual[used])))
         outlier = used & ~(np.abs(residual) <= max(_OUTLIER * spread, 1e-12))
-        if not outlier.any() or (used & ~outlier).sum() < 0.7 * used.sum():
+        if not outlier.any():
             break
-        used &= ~outlier
+        used = used & ~outlier
+        if used.sum() < _LEAST_USED * everything.sum():
+            raise MethodError(
+                f"Beam {name}: more than {1 - _LEAST_USED:.0%} of the readings lie far off any beam. Check that the "
+                "sphere centres belong to the readings."
+            )
     freedom = int(used.sum()) - UNKNOWNS
     noise = float(np.sqrt(np.sum(residual[used] ** 2) / freedom))
     size = np.linalg.norm(jacobian, axis=0)
@@ -137,7 +144,7 @@ def likelihood_fit(
     chart = np.zeros((6, UNKNOWNS))
     chart[:3, :3] = np.eye(3)
     chart[3:, 3:] = across(direction).T
-    lost = np.isfinite(distance) & np.isfinite(centre).all(axis=-1) & ~used
+    lost = everything & ~used
     return Beam(origin, direction, chart @ small @ chart.T, noise, residual, np.argwhere(lost))
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift import iso230_3
 from errormotion.methods.spindle_drift.bar import SIDE, end_point, fit_axis
-from errormotion.methods.spindle_drift.frame_expansion import frame_warming, readings_per_kelvin
+from errormotion.methods.spindle_drift.frame_expansion import frame_warming, readings_per_kelvin, smoothing_sources
 from errormotion.methods.spindle_drift.record import (
     average_record,
     count_unknown,
@@ -23,7 +24,6 @@ from errormotion.methods.spindle_drift.record import (
 )
 from errormotion.methods.spindle_drift.turning import run_out_at_rest, settling
 from errormotion.methods.spindle_drift.uncertainty import (
-    CHANNELS,
     Frame,
     State,
     beam_sources,
@@ -60,48 +60,28 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     count_unknown(averages, notes)
     bar = _bar(raw, settings, notes)
     coming_up = settling(record, settings.spin_up)
-    reference = reference_windows(averages, averages.mean, settings, coming_up)
-    mean, state = averages.mean, _fit(averages.mean, bar)
-    scaled: list[tuple[str, str, Array]] = run_out_at_rest(record, reference, float(raw["distance_noise"]))
-    own: list[Array] = []
-    warming = frame_warming(raw, record, settings, notes)
-    if warming is not None:
-        # The frame's expansion moves the readings along the normals that the first fit found.
-        per_kelvin = readings_per_kelvin(warming, state, bar.origin, bar.direction, bar.levels)
-        change = per_kelvin * (warming.temperature - warming.temperature[reference].mean())
-        mean, state = mean + change, _fit(mean + change, bar)
-        unknown = np.sqrt(np.sum(warming.uncertainty[reference] ** 2)) / reference.size
-        scaled.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
-        scaled.append(("frame temperature at the reference", "frame temperature", -per_kelvin * unknown))
-        own.append(per_kelvin * warming.uncertainty)
-    then = _fit(mean[:, reference].mean(axis=1, keepdims=True), bar)
+    reference = reference_windows(averages, settings, coming_up, notes)
+    mean, effects = _compensated(raw, record, bar, reference, settings, notes)
+    state, then = _fit(mean, bar), _fit(mean[:, reference].mean(axis=1, keepdims=True), bar)
     if not np.isfinite(then.E).all():
         raise MethodError(
             "No cylinder of the stated radius touches the five readings of the reference state. Check bar_radius "
             f"({bar.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
         )
     point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
+    errors = twist(state, then, point)
     sigma = noise(raw, averages, settings, notes)
     sources = [
         *reading_sources(np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size),
         *beam_sources(bar.covariance, bar.known_from),
         *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
     ]
-    errors = twist(state, then, point)
     frame = Frame(bar.origin, bar.direction, bar.levels, point)
-    independent, influence = propagate(state, then, frame, sigma, sources, [effect for *_, effect in scaled], own)
-    names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in scaled]
-    unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
-    if np.linalg.norm(unseen) > 0:
-        row = np.zeros((1, len(errors), 6))
-        row[..., :3] = unseen
-        influence = np.concatenate([influence, row])
-        names.append(("rotation about the spindle axis", "rotation about the spindle axis"))
+    independent, influence = propagate(state, then, frame, sigma, sources, [change for *_, change in effects])
     # Errors inside the reference state share its noise: what is left of it is 1 - 1/m of each mean.
     independent[reference] *= 1.0 - 1.0 / reference.size
     influence[:, reference] = 0.0
-    independent[:, 5, :] = independent[:, :, 5] = np.nan
-    influence[..., 5] = np.nan
+    independent[:, 5, :] = independent[:, :, 5] = influence[..., 5] = np.nan
     if coming_up.any():
         errors[coming_up] = np.nan
         notes.append(
@@ -110,15 +90,20 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     zero = float(averages.time[reference].mean())
     time = averages.time - zero
     results = iso230_3.evaluate(
-        iso230_3.quantities(errors, independent, influence, bar.levels - point[2]),
+        iso230_3.quantities(errors, independent, influence, bar.levels - point[2], then.E[0] - point),
         time,
         temperature=record.temperature,
         sensors=sensors(raw) if record.temperature is not None else (),
         spindle_speed=record.spindle_speed,
-        running_end=settings.running_end,
+        running_end=None if settings.running_end is None else settings.running_end - zero,
         sensor=settings.iso_temperature,
         average=settings.iso_average,
     )
+    names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in effects]
+    unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
+    if np.linalg.norm(unseen) > 0:
+        influence = np.concatenate([influence, _unseen(unseen, len(errors), reference)])
+        names.append(("rotation about the spindle axis", "rotation about the spindle axis"))
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -151,6 +136,36 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         iso_temperature_sensor=results.sensor,
         beams=settings.beams,
     )
+
+
+def _compensated(
+    raw: xr.Dataset, record: Record, bar: Bar, reference: NDArray[np.int64], settings: Settings, notes: list[str]
+) -> tuple[Array, list[tuple[str, str, Array]]]:
+    """Return the mean readings without the frame's expansion, and what disturbs them as (name, group, change).
+
+    The frame's expansion moves the readings along the normals that a first fit finds.
+    """
+    mean = record.averages.mean
+    effects = run_out_at_rest(record, reference, float(raw["distance_noise"]))
+    warming = frame_warming(raw, record, settings, notes)
+    if warming is None:
+        return mean, effects
+    per_kelvin = readings_per_kelvin(warming, _fit(mean, bar), bar.origin, bar.direction, bar.levels)
+    change = per_kelvin * (warming.temperature - warming.temperature[reference].mean())
+    effects.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
+    unknown = smoothing_sources(warming, record.averages.time, settings.frame_smoothing, reference)
+    for k, u in enumerate(unknown, start=1):
+        effects.append((f"frame temperature, part {k}", "frame temperature", per_kelvin * u))
+    return mean + change, effects
+
+
+def _unseen(effect: Array, instants: int, reference: NDArray[np.int64]) -> Array:
+    """Return the influence (1, instant, 6) of the rotation about the axis; EC itself stays unknown."""
+    row = np.zeros((1, instants, 6))
+    row[..., :3] = effect
+    row[:, reference] = 0.0
+    row[..., 5] = np.nan
+    return row
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+_MOST_KNOTS = 32
+
 
 @dataclass(frozen=True)
 class FrameWarming:
@@ -40,7 +42,13 @@ class FrameWarming:
 
 def frame_warming(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> FrameWarming | None:
     """Return how the frame warmed, or None where its expansion is not to be or cannot be compensated."""
-    if not settings.compensate_frame or "frame_expansion" not in raw:
+    if not settings.compensate_frame:
+        return None
+    if "frame_expansion" not in raw:
+        notes.append(
+            "The raw dataset states no frame_expansion: the measuring frame's own warming is neither taken out nor in "
+            "the uncertainty (about 2 um a kelvin for a frame of steel)."
+        )
         return None
     if record.temperature is None or settings.frame_temperature not in sensors(raw):
         notes.append(
@@ -87,9 +95,30 @@ def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]
             if lag < 0.1 * lags[0]:
                 break
             repeats += 2.0 * lag / lags[0]
+    # Where a window holds too few values to scatter, the second differences of the record tell the noise.
+    second = np.diff(values[known], 2)
+    variance = max(float(np.mean(residual**2)) * repeats, float(np.mean(second**2)) / 6.0)
     weight = 1.0 / n + np.where(spread > 0, at * at / np.maximum(spread, 1e-30), 0.0)
-    uncertainty = np.sqrt(np.mean(residual**2) * repeats * weight)
+    uncertainty = np.sqrt(variance * np.minimum(weight, 1.0))
     return np.where(known, smooth, np.nan), np.where(known, uncertainty, np.nan)
+
+
+def smoothing_sources(warming: FrameWarming, time: Array, length: float, reference: NDArray[np.int64]) -> list[Array]:
+    """Return what is unknown of the smoothed temperature as shared sources, each a change over time (instant,), K.
+
+    Instants closer than the smoothing's length share what is unknown of their temperature, those further apart do
+    not: knots at that distance (at most ``_MOST_KNOTS`` of them), each one draw, with weights whose squares add up to
+    one between them. All is relative to the reference state.
+    """
+    span = float(np.ptp(time))
+    knots = int(np.clip(np.ceil(span / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
+    place = (time - time[0]) / max(span, 1e-9) * (knots - 1)
+    known = np.nan_to_num(warming.uncertainty)
+    found = []
+    for k in range(knots):
+        effect = np.sqrt(np.maximum(1.0 - np.abs(place - k), 0.0)) * known
+        found.append(effect - effect[reference].mean())
+    return found
 
 
 def readings_per_kelvin(warming: FrameWarming, state: State, origin: Array, direction: Array, levels: Array) -> Array:

@@ -17,6 +17,7 @@ import xarray as xr
 from scipy.optimize import minimize_scalar
 
 from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.turning import turns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,17 +66,18 @@ class Series:
         return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own))
 
 
-def quantities(errors: Array, independent: Array, influence: Array, heights: Array) -> Series:
-    """Return the seven quantities of error twists (t, 6).
+def quantities(errors: Array, independent: Array, influence: Array, heights: Array, arm: Array) -> Series:
+    """Return the seven quantities of error twists (t, 6), all on the spindle's axis.
 
-    ``heights`` (2,) are those of L1 and L2 above the functional point, m. The levels lie on the axis, where the unseen
-    rotation about it does nothing.
+    ``heights`` (2,) are those of L1 and L2 above the functional point, ``arm`` (3,) leads from it to the end of the bar
+    on its axis, m. On the axis the unseen rotation about it does nothing: its source is no part of ``influence``.
     """
     G = np.zeros((7, 5))
     for level, z in enumerate(heights):
         G[level, [0, 4]] = 1.0, z  # X: EX + EB z
         G[2 + level, [1, 3]] = 1.0, -z  # Y: EY - EA z
-    G[4, 2] = G[5, 3] = G[6, 4] = 1.0
+    G[4, [2, 3, 4]] = 1.0, arm[1], -arm[0]  # Z: EZ + EA y - EB x
+    G[5, 3] = G[6, 4] = 1.0
     return Series(
         G @ errors[:, :5].T,
         np.einsum("ki,sti->skt", G, influence[..., :5]),
@@ -131,7 +133,7 @@ def evaluate(
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
     uncertainty = np.full_like(value, np.nan)
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    turning = spindle_speed is not None and bool(np.nanmax(np.nan_to_num(spindle_speed)) > 0)
+    turning = spindle_speed is not None and bool(turns(spindle_speed).any())
     still = spindle_speed is not None and not turning
     end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning)
     hottest, change = _thermometer(temperature, sensors, sensor, time <= end)
@@ -148,7 +150,9 @@ def evaluate(
                 series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0)
             )
             if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
-                value[k, column + 1], uncertainty[k, column + 1] = series.difference(k, blocks[-1], inside[:1])
+                # The reference state is where the errors are zero: the end's own value is the difference from it.
+                weights = np.full(blocks[-1].size, 1.0 / blocks[-1].size)
+                value[k, column + 1], uncertainty[k, column + 1] = series.weighted(k, blocks[-1], weights)
         running = np.flatnonzero(known & (time <= end))
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
@@ -171,7 +175,7 @@ def _blocks(index: Index, time: Array, length: float) -> list[Index]:
 def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:
     if speed is None or not turning:
         return float(time[-1])
-    return float(time[np.flatnonzero(np.nan_to_num(speed) > 0)[-1]])
+    return float(time[np.flatnonzero(turns(speed))[-1]])
 
 
 def _thermometer(

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.methods.spindle_drift.averaging import Averager, slices
 from errormotion.methods.spindle_drift.bar import end_point, fit_axis
-from errormotion.methods.spindle_drift.uncertainty import CHANNELS, State, twist
+from errormotion.methods.spindle_drift.uncertainty import State, twist
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,7 +43,8 @@ class LiveDrift:
                 self._begin = float(time[0])
             found = self._averager.update(time, part["distance"].transpose("channel", "time").values)
             known = np.isfinite(found.mean).all(axis=0)
-            known &= found.time >= self._begin + (self._settings.reference_time or self._settings.spin_up)
+            wanted = self._settings.reference_time
+            known &= found.time >= self._begin + (self._settings.spin_up if wanted is None else wanted)
             if known.any():
                 self._take(found.mean[:, known], chunk)
         return self.text()

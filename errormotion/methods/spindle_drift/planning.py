@@ -8,10 +8,10 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.methods.spindle_drift.acquisition import machine_axes
 from errormotion.methods.spindle_drift.beams import Beam, fisher_bound
 from errormotion.methods.spindle_drift.detection import beam_errors
-from errormotion.methods.spindle_drift.uncertainty import CHANNELS
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.method import SpindleDrift

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.averaging import Averager, Averages, join, slices
-from errormotion.methods.spindle_drift.uncertainty import CHANNELS
+from errormotion.methods.spindle_drift.turning import turns
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,9 +58,11 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
+    last = -np.inf
     for time, part in slices(raw):
-        if not (np.isfinite(time).all() and (np.diff(time) > 0).all()):
+        if not (np.isfinite(time).all() and (np.diff(time, prepend=last) > 0).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
+        last = float(time[-1])
         readings = _with_time_last(part["distance"])
         readings = readings if order == [0, 1, 2, 3, 4] else readings[order]
         parts.append(averager.update(time, readings))
@@ -78,9 +81,10 @@ def _scatter(
     time: NDArray[np.float64], readings: NDArray[np.floating[Any]], speed: NDArray[np.float64], settings: Settings
 ) -> Array | None:
     """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
-    start = int(np.argmax(speed > 0))
+    turning = turns(speed)
+    start = int(np.argmax(turning))
     begin, end = np.searchsorted(time, time[start] + settings.spin_up + np.array([0.0, settings.average]))
-    if not speed[start] > 0 or end - begin < _ENOUGH or end >= time.size or np.ptp(speed[begin:end]) > 0:
+    if not turning[start] or end - begin < _ENOUGH or end >= time.size or not turning[begin:end].all():
         return None
     part = readings[:, begin:end].astype(np.float64)
     if np.isnan(part).all(axis=1).any():
@@ -110,9 +114,10 @@ def count_unknown(averages: Averages, notes: list[str]) -> None:
 
 
 def reference_windows(
-    averages: Averages, mean: Array, settings: Settings, coming_up: NDArray[np.bool_]
+    averages: Averages, settings: Settings, coming_up: NDArray[np.bool_], notes: list[str]
 ) -> NDArray[np.int64]:
     """Return the windows of the reference state; MethodError where there is none with all five readings."""
+    mean = averages.mean
     begin = averages.time[0] + (settings.reference_time or 0.0)
     if settings.reference_time is None and coming_up[0]:
         begin = averages.time[int(np.argmin(coming_up))]
@@ -126,6 +131,8 @@ def reference_windows(
                 f"{begin:g} s (reference_time)."
             )
         inside[later[0]] = True
+    if settings.reference_time is not None and coming_up[inside].any():
+        notes.append("The reference state lies within spin_up of a change of speed: its run-out is in all errors.")
     known = inside & np.isfinite(mean).all(axis=0)
     if not known.any():
         lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]

@@ -91,7 +91,9 @@ class Settings(PluginSettings):
     )
     frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
     frame_smoothing: Time = Field(
-        default=60.0, ge=0, description="length of the moving mean of the frame's temperature, against its resolution"
+        default=180.0,
+        ge=0,
+        description="length of the moving fit to the frame's temperature, against its noise",
     )
     frame_expansion_uncertainty: float = Field(
         default=0.1, ge=0, description="relative standard uncertainty of the frame's expansion"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.methods.spindle_drift.uncertainty import CHANNELS
+from errormotion.datasets.schemas import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,14 +22,25 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
 
 _SAME_SPEED = 0.02
-"""Share of the highest speed within which two speeds count as the same: a spindle's speed is never quite steady."""
+"""Share of the highest speed within which two speeds count as the same: a measured speed is never quite steady."""
 
 
-def turning(record: Record) -> Mask:
-    """Return where the spindle turns; nowhere, where its speed is not known."""
-    if record.spindle_speed is None:
-        return np.zeros(record.averages.time.size, bool)
-    return np.nan_to_num(record.spindle_speed) > 0
+def turns(speed: Array) -> Mask:
+    """Return where a spindle turns, either way round; a speed that is not known (NaN) is the one before it."""
+    known = np.isfinite(speed)
+    if not known.any():
+        return np.zeros(speed.shape, bool)
+    size = np.abs(held(speed))
+    return np.asarray((size > _SAME_SPEED * size.max()) & (size > 0))
+
+
+def held(speed: Array) -> Array:
+    """Return speeds with unknown ones replaced by the last known one, at the beginning by the first."""
+    known = np.isfinite(speed)
+    if not known.any():
+        return np.zeros(speed.shape)
+    place = np.maximum.accumulate(np.where(known, np.arange(speed.size), -1))
+    return np.asarray(speed[np.where(place < 0, int(np.argmax(known)), place)])
 
 
 def settling(record: Record, spin_up: float) -> Mask:
@@ -42,31 +53,36 @@ def settling(record: Record, spin_up: float) -> Mask:
     found = np.zeros(time.size, bool)
     if speed is None or time.size < 2 or record.averages.expected[0] <= 1 or spin_up == 0 or np.ptp(time) <= spin_up:
         return found
-    steady = np.nan_to_num(speed)
+    steady = held(speed)
     length = float(np.median(np.diff(time)))
-    changed = np.flatnonzero(np.abs(np.diff(steady, prepend=0.0)) > _SAME_SPEED * steady.max())
-    for k in changed:
+    for k in np.flatnonzero(np.abs(np.diff(steady, prepend=0.0)) > _SAME_SPEED * np.abs(steady).max()):
         found |= (time > time[k] - 0.6 * length) & (time < time[k] + spin_up - 1e-6)
     return found
 
 
 def run_out_at_rest(record: Record, reference: NDArray[np.int64], noise: float) -> list[tuple[str, str, Array]]:
-    """Return, per channel and rest, what stopping anywhere in a turn may do to the readings, (5, instant), m.
+    """Return, per channel and rest, what stopping anywhere in a turn may do to the errors, as readings (5, instant), m.
 
-    Against a reference state that turns these are the rests; against one that rests, the times of turning. Each is
-    one draw for its whole length. Empty where the spindle never changes between the two, or its speed is not known.
+    Each rest is one draw. Where the reference state rests, its own draw is in everything outside of that rest. Empty
+    where the spindle always turns, always rests, or its speed is not known.
     """
-    turns = turning(record)
-    other = turns != turns[reference[0]]
-    if record.scatter is None or not other.any():
+    if record.scatter is None or record.spindle_speed is None:
+        return []
+    rests = ~turns(record.spindle_speed)
+    if rests.all() or not rests.any():
         return []
     spread = np.sqrt(np.maximum(record.scatter**2 - noise**2, 0.0))
-    edges = np.flatnonzero(np.diff(other, prepend=False, append=False))
     found = []
-    for number, (begin, end) in enumerate(edges.reshape(-1, 2), start=1):
-        for i, channel in enumerate(CHANNELS):
-            if spread[i] > 0:
-                change = np.zeros((len(CHANNELS), other.size))
-                change[i, begin:end] = spread[i]
-                found.append((f"run-out {channel}, rest {number}", "run-out at rest", change))
+    edges = np.flatnonzero(np.diff(rests, prepend=False, append=False)).reshape(-1, 2)
+    for number, (begin, end) in enumerate(edges, start=1):
+        if begin <= reference[0] < end:
+            effect = -np.ones(rests.size)
+            effect[begin:end] = 0.0
+        else:
+            effect = np.zeros(rests.size)
+            effect[begin:end] = 1.0
+        for i in np.flatnonzero(spread > 0):
+            change = np.zeros((len(CHANNELS), rests.size))
+            change[i] = effect * spread[i]
+            found.append((f"run-out {CHANNELS[i]}, rest {number}", "run-out at rest", change))
     return found

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.datasets.schemas import CHANNELS
 from errormotion.methods.spindle_drift.bar import PARAMETERS, state_jacobian
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 _BLOCK = 1024
 
 
@@ -87,7 +87,6 @@ def propagate(
     sigma: Array,
     sources: Sequence[Source],
     scaled: Sequence[Array],
-    own: Sequence[Array] = (),
 ) -> tuple[Array, Array]:
     """Return what the readings' own noise and the shared sources do to the errors.
 
@@ -103,13 +102,11 @@ def propagate(
         Shared by all instants.
     scaled : sequence of ndarray (5, instant)
         Effects of further shared sources as changes of the readings, m, in each instant.
-    own : sequence of ndarray (5, instant)
-        Effects of sources that are drawn anew in each instant and act on all readings together, m.
 
     Returns
     -------
     independent : ndarray (instant, 6, 6)
-        Covariance from the readings' own noise and from ``own``.
+        Covariance from the readings' own noise.
     influence : ndarray (source, instant, 6)
         Of ``sources``, then of ``scaled``.
     """
@@ -130,9 +127,6 @@ def propagate(
         dw = _cross(a0, da[:, :, :5])
         J = np.concatenate([dE[:, :, :5] + _cross(-arm, dw), dw], axis=1)
         independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J)
-        for change in own:
-            effect = np.einsum("tip,pt->ti", J, change[:, part])
-            independent[part] += effect[:, :, None] * effect[:, None, :]
         for k, change in enumerate(scaled):
             influence[len(sources) + k, part] = np.einsum("tip,pt->ti", J, change[:, part])
         # What is shared acts on the instant and on the reference state.
