@@ -92,9 +92,14 @@ class ErrorMotion:
         Raises
         ------
         DatasetError
-            Not three finite coordinates.
+            Not three finite coordinates, or beams: each is stated about its own zero point, and has no common one.
         """
         target = _point(point)
+        if self._ds.attrs.get("component") == "beam":
+            raise DatasetError(
+                "The errors of beams are stated about each beam's own zero point and have no common functional point. "
+                "A beam's origin and direction are in the dataset."
+            )
         moved = self._transformed(twists.adjoint(shift=target - _point(self._ds.attrs["functional_point"])))
         return moved.assign_attrs(functional_point=target)
 

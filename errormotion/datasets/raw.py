@@ -101,6 +101,9 @@ def _norm_violations(name: str, variable: xr.Variable) -> Iterator[str]:
 
 def _covariance_violations(variable: xr.Variable, row: Row) -> Iterator[str]:
     C = np.asarray(variable.values, dtype=float)
+    if row.name == "beam_covariance" and np.isnan(C).any():
+        yield f"{row.name}: expected numbers; found NaN. Leave the variable out where it is not known"
+        return
     C = C[~np.isnan(C).any(axis=(-2, -1))]
     scale = np.sqrt(np.abs(np.diagonal(C, axis1=-2, axis2=-1)))
     scale[scale == 0] = 1.0

@@ -203,6 +203,7 @@ RAW_SCHEMAS = (
         (
             Row("record", ("sample",), "m", *_READING, "reading along the beam that is scanned; NaN = none"),
             Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
+            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one counts", required=False),
             *_STEPPED_SPHERE,
         ),
         sizes={**_DIRECTION, "channel": 5},

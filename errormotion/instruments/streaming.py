@@ -195,13 +195,19 @@ class Reader:
                 now = time.monotonic()
                 self._accept(self._decode(data), now)
         except InstrumentError as error:
-            with self._change:
-                self._error = type(error)(f"{self._name}: {error}")
-                self._change.notify_all()
+            self._fail(type(error)(f"{self._name}: {error}"))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the caller must hear of it and not wait
+            self._fail(InstrumentError(f"{self._name}: the reader broke: {type(error).__name__}: {error}"))
+
+    def _fail(self, error: InstrumentError) -> None:
+        with self._change:
+            self._error = error
+            self._change.notify_all()
 
     def _accept(self, chunk: Chunk, now: float) -> None:
         with self._change:
-            self._heard = now
+            if chunk.values.size:  # bytes without samples are no sign that the stream is well
+                self._heard = now
             if chunk.text:
                 self._accept_text(chunk.text)
             size = chunk.values.size

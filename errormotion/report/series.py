@@ -84,7 +84,9 @@ def end_of_running(errors: xr.Dataset) -> int | None:
     """
     stated = read(errors).get("settings", {}).get("running_end")
     if isinstance(stated, (int, float)):
-        before = np.flatnonzero(errors["time"].values <= stated + 1e-6)
+        # Stated from the record's start; the dataset's time counts from the reference state.
+        end = stated - float(errors.attrs.get("reference_time", 0.0))
+        before = np.flatnonzero(errors["time"].values <= end + 1e-6)
         return int(before[-1]) if before.size else None
     turning = running(errors)
     return int(np.flatnonzero(turning)[-1]) if turning is not None and turning.any() else None

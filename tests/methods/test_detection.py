@@ -6,7 +6,8 @@ import xarray as xr
 
 from errormotion.datasets import load, save, validate
 from errormotion.methods.spindle_drift import Settings, SpindleDrift
-from errormotion.methods.spindle_drift.acquisition import scan_seconds
+from errormotion.methods.spindle_drift.scanning import last_attempts
+from errormotion.methods.spindle_drift.segmentation import scan_seconds
 from errormotion.twin import StepProgram, VirtualMachine
 
 RATE = 1500.0
@@ -30,7 +31,7 @@ def recorded(machine, method):
     """Return a detection as the runner stores it: every scan as a record, one after the other."""
     frame = machine.frame
     whole = machine.raw_beam_detection(seed=0)
-    length = round(scan_seconds(SETTINGS) * RATE)
+    length = round(scan_seconds(SETTINGS.steps, SETTINGS.dwell) * RATE)
     offsets = np.linspace(-1e-3, 1e-3, SETTINGS.steps)
     scans = whole["scan_direction"].values
     middle = whole["sphere_centre"].values[:, :, 50]
@@ -52,6 +53,7 @@ def recorded(machine, method):
         sphere_centre=(("channel", "profile", "step", "direction"), centre),
         record=("sample", record.ravel(), {"units": "m"}),
         scan=("sample", number),
+        attempt=("sample", np.zeros(number.size, np.int16)),
     )
     return raw.assign_attrs(sample_rate=RATE, dwell=SETTINGS.dwell)
 
@@ -86,11 +88,20 @@ def test_beams_are_found_within_their_uncertainty_from_the_record(machine, metho
     assert beams.attrs["notes"] == [""]
 
 
-def test_a_scan_that_was_cut_off_and_made_anew_counts_with_its_last_samples(method, recorded):
+def test_of_a_scan_that_was_cut_off_and_made_anew_the_last_attempt_counts(method, recorded):
     whole = method.identify(recorded, SETTINGS)
-    cut = recorded.isel(sample=slice(0, 9000))  # the first scan and a part of it, then everything again
-    anew = xr.concat([cut, recorded], dim="sample", data_vars="minimal", coords="minimal", compat="override")
+    second = recorded.assign(attempt=recorded["attempt"] + 1)
+    cut = recorded.isel(sample=slice(0, 9000))  # a part of the first scan, twice, then everything again
+    anew = xr.concat([cut, cut, second], dim="sample", data_vars="minimal", coords="minimal", compat="override")
     np.testing.assert_array_equal(method.identify(anew, SETTINGS)["beam_origin"], whole["beam_origin"])
+
+
+def test_a_scan_cut_off_twice_is_made_a_third_time(recorded):
+    length = recorded.sizes["sample"] // 30
+    parts = [recorded.isel(sample=slice(0, round(0.6 * length))).assign_coords() for _ in range(2)]
+    parts[1] = parts[1].assign(attempt=parts[1]["attempt"] + 1)
+    done = xr.concat(parts, dim="sample", data_vars="minimal", coords="minimal", compat="override")
+    assert last_attempts(done) == {0: (1, round(0.6 * length))}
 
 
 def test_a_scan_that_went_wrong_is_unknown_and_said(machine, method, recorded):

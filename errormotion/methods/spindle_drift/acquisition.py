@@ -1,4 +1,4 @@
-"""Measuring: a drift record from five channels on one clock, and the readings of a stepped sphere.
+"""Measuring a drift: the record of five channels on one clock, with what the thermometers say beside it.
 
 Everything that a sensor said goes into the raw dataset, sample by sample, before anything is computed from it.
 """
@@ -6,17 +6,17 @@ Everything that a sensor said goes into the raw dataset, sample by sample, befor
 from __future__ import annotations
 
 import json
+import logging
 import time
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from errormotion.datasets.schemas import CHANNELS
-from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.beams import across
+from errormotion.errors import InstrumentError, MethodError
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:
@@ -28,14 +28,16 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+log = logging.getLogger(__name__)
+
 SCHEMA = "errormotion.raw.spindle_drift/1"
 HAND_OVER_SECONDS = 0.4
 """A chunk is handed over at least this often, so that a crash loses little."""
 HAND_OVER_SAMPLES = 1 << 18
 POLL_SECONDS = 2.0
 """Temperatures are asked for this often, in seconds of the record."""
-LEAD = 10.0
-"""A scan is recorded this much longer than its rests, s; its moves may take a quarter of them."""
+PATIENCE = 30
+"""So many polls in a row may a thermometer fail before the record is given up."""
 
 
 def record_drift(
@@ -63,8 +65,9 @@ def record_drift(
     virtual = _start_machine(bench, settings, first / rate)
     pending = _Pending(static, rate, settings, first, thermometer, frame.encoding)
     if done is not None and not virtual:
-        pending.fill_gap(min(_missed(done, rate), total))
-        while pending.samples:
+        due = min(_missed(done, rate), total)
+        while pending.end < due:
+            pending.fill_gap(due)
             yield pending.hand_over()
     for samples in frame.stream():
         pending.add(samples, total)
@@ -135,7 +138,6 @@ def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | No
     attrs = {
         "schema": SCHEMA,
         "machine": bench.machine,
-        "start": datetime.now(UTC).isoformat(timespec="seconds"),
         "events": json.dumps(events),
         "sensors_warm": int(bool(frame.warm)),
         "beam_source": "beam detection" if beams is not None else "nominal",
@@ -154,7 +156,7 @@ class _Pending:
     thermometer: Any
     encoding: Mapping[str, Any]
     blocks: list[Array] = field(default_factory=list)
-    warmth: list[Array] = field(default_factory=list)
+    warmth: list[NDArray[np.float32]] = field(default_factory=list)
     samples: int = 0
     dropped: int = 0
     invalid: dict[str, int] = field(default_factory=dict)
@@ -162,9 +164,12 @@ class _Pending:
     def __post_init__(self) -> None:
         self._since = time.monotonic()
         self._polled = -np.inf
-        self._temperature: dict[str, float] = {}
+        self._failures = 0
+        self._sensors: list[str] = []
+        self._warmth = np.zeros(0, np.float32)
         if self.thermometer is not None:
-            self._poll()
+            reading = self.thermometer.read()  # the names; a thermometer that is not there shows before the bar turns
+            self._sensors = [str(name) for name in reading]
 
     @property
     def due(self) -> bool:
@@ -172,31 +177,45 @@ class _Pending:
         return self.samples >= HAND_OVER_SAMPLES or time.monotonic() - self._since >= HAND_OVER_SECONDS
 
     def add(self, block: Samples, total: int) -> None:
+        """Take in a block of samples, up to ``total`` of the whole record."""
         values = block.values[:, : total - self.end]
+        if "start" not in self.static.attrs:
+            begun = datetime.now(UTC) - timedelta(seconds=values.shape[1] / self.rate)
+            self.static.attrs["start"] = begun.isoformat(timespec="milliseconds")
         if self.thermometer is not None and self.end / self.rate - self._polled >= POLL_SECONDS:
             self._poll()
-        self._take(values)
+        self._take(values, self._warmth)
         self.dropped += block.dropped
         for reason, count in block.invalid.items():
             self.invalid[reason] = self.invalid.get(reason, 0) + count
 
     def fill_gap(self, until: int) -> None:
-        """Fill with NaN up to a sample number."""
-        missing = until - self.end
-        if missing > 0:
-            self._take(np.full((len(CHANNELS), missing), np.nan))
-            self.dropped += missing * len(CHANNELS)
+        """Fill with NaN, a chunk at most, up to a sample number: nobody measured there."""
+        missing = min(until - self.end, HAND_OVER_SAMPLES)
+        self._take(np.full((len(CHANNELS), missing), np.nan), np.full(len(self._sensors), np.nan, np.float32))
+        self.dropped += missing * len(CHANNELS)
 
-    def _take(self, values: Array) -> None:
+    def _take(self, values: Array, warmth: NDArray[np.float32]) -> None:
         self.blocks.append(values)
-        self.warmth.append(np.tile(np.array(list(self._temperature.values()), np.float32), (values.shape[1], 1)))
+        self.warmth.append(np.tile(warmth, (values.shape[1], 1)))
         self.end += values.shape[1]
         self.samples += values.shape[1]
 
     def _poll(self) -> None:
-        reading = self.thermometer.read()
-        self._temperature = {str(name): float(value) for name, value in reading.items()}
+        """Ask for the temperatures; a failure is NaN and counted, since hours of readings depend on no thermometer."""
         self._polled = self.end / self.rate
+        try:
+            reading = self.thermometer.read()
+        except InstrumentError as error:
+            self._failures += 1
+            if self._failures > PATIENCE:
+                raise
+            log.warning("no temperatures at %.1f s: %s", self._polled, error)
+            self.invalid["thermometer silent"] = self.invalid.get("thermometer silent", 0) + 1
+            self._warmth = np.full(len(self._sensors), np.nan, np.float32)
+            return
+        self._failures = 0
+        self._warmth = np.array([reading.get(name, np.nan) for name in self._sensors], np.float32)
 
     def hand_over(self) -> xr.Dataset:
         """Return all pending samples as a dataset."""
@@ -205,7 +224,7 @@ class _Pending:
         ds["distance"] = (("channel", "time"), np.concatenate(self.blocks, axis=1), {"units": "m"})
         ds["distance"].encoding = dict(self.encoding)
         if self.thermometer is not None:
-            ds = ds.assign_coords(sensor=list(self._temperature))
+            ds = ds.assign_coords(sensor=self._sensors)
             ds["temperature"] = (("time", "sensor"), np.concatenate(self.warmth), {"units": "degC"})
         if any(e.spindle_speed is not None for e in self.settings.schedule):
             ds["spindle_speed"] = ("time", self._speed(first), {"units": "1/min"})
@@ -220,102 +239,3 @@ class _Pending:
         starts = np.array([at for at, _ in orders]) * self.rate
         speeds = np.array([0.0, *(speed for _, speed in orders)], np.float32)
         return speeds[np.searchsorted(starts, np.arange(first, self.end), side="right")]
-
-
-def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
-    """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
-
-    The machine needs no synchronous reading: it steps by its own clock, and the steps are found in the record. A scan
-    that an interruption cut off is made anew; of its samples the last ones count.
-    """
-    frame = bench.of_kind("spindle_frame")
-    if not bench.has_kind("controller"):
-        raise MethodError(
-            "A beam detection steps a sphere through the beams and needs an instrument of kind 'controller' to move "
-            "it; the bench has none. Give the beams of an earlier detection, or measure with the nominal ones."
-        )
-    controller = bench.of_kind("controller")
-    static = _scan_plan(bench, frame, settings)
-    length = round(scan_seconds(settings) * frame.rate)
-    recorded = np.zeros(0, np.int64) if done is None else np.bincount(done["scan"].values)
-    controller.mount("sphere")
-    profiles = static.sizes["profile"]
-    for scan in range(len(CHANNELS) * profiles):
-        if scan < recorded.size and recorded[scan] >= length:
-            continue
-        channel, profile = divmod(scan, profiles)
-        controller.run_steps(
-            start=[float(x) for x in static["sphere_centre"].values[channel, profile, 0]],
-            direction=[float(x) for x in static["scan_direction"].values[channel, profile]],
-            step=settings.scan_length / (settings.steps - 1),
-            count=settings.steps,
-            dwell=settings.dwell,
-        )
-        yield from _record_scan(frame, static, CHANNELS[channel], scan, length)
-
-
-def scan_seconds(settings: Settings) -> float:
-    """Return how long one scan is recorded: its rests, a quarter more for the moves, and a lead."""
-    return settings.steps * settings.dwell * 1.25 + LEAD
-
-
-def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
-    """Return everything of a beam detection but its samples."""
-    g = frame.geometry
-    offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
-    scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in g.nominal_direction])
-    ahead = np.repeat(settings.depths, 2) + settings.sphere_radius
-    middle = g.nominal_origin[:, None] + ahead[:, None] * g.nominal_direction[:, None]
-    m = {"units": "m"}
-    return xr.Dataset(
-        {
-            "sphere_centre": (
-                ("channel", "profile", "step", "direction"),
-                middle[:, :, None] + offsets[:, None] * scans[:, :, None],
-                m,
-            ),
-            "scan_direction": (("channel", "profile", "direction"), scans, {"units": "1"}),
-            "nominal_origin": (("channel", "direction"), g.nominal_origin, m),
-            "nominal_direction": (("channel", "direction"), g.nominal_direction, {"units": "1"}),
-            "sphere_radius": ((), settings.sphere_radius, m),
-        },
-        coords={"channel": list(CHANNELS), "direction": list("xyz")},
-        attrs={
-            "schema": SCHEMA,
-            "machine": bench.machine,
-            "start": datetime.now(UTC).isoformat(timespec="seconds"),
-            "sensors_warm": int(bool(frame.warm)),
-            "sample_rate": float(frame.rate),
-            "dwell": settings.dwell,
-        },
-    )
-
-
-def machine_axes(direction: Array) -> Array:
-    """Return the two machine axes across a beam; for a beam far from all axes, two vectors across it."""
-    axis = int(np.argmax(np.abs(direction)))
-    if abs(direction[axis]) < 0.9:
-        return across(direction)
-    return np.delete(np.eye(3), axis, axis=0)
-
-
-def _record_scan(frame: Any, static: xr.Dataset, channel: str, scan: int, length: int) -> Iterator[xr.Dataset]:
-    """Yield ``length`` samples of one channel."""
-    taken, since = 0, time.monotonic()
-    waiting: list[Array] = []
-    for samples in frame.stream([channel]):
-        waiting.append(samples.values[0, : length - taken])
-        taken += waiting[-1].size
-        if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
-            record = np.concatenate(waiting)
-            chunk = static.assign(
-                record=("sample", record, {"units": "m"}), scan=("sample", np.full(record.size, scan, np.int16))
-            )
-            chunk["record"].encoding = dict(frame.encoding)
-            yield chunk
-            waiting, since = [], time.monotonic()
-        if taken == length:
-            return
-    raise MethodError(
-        f"Channel {channel}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s."
-    )

@@ -11,9 +11,8 @@ import xarray as xr
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.methods.spindle_drift.acquisition import LEAD
 from errormotion.methods.spindle_drift.beams import Beam, circles_and_line, likelihood_fit
-from errormotion.methods.spindle_drift.segmentation import segment_steps
+from errormotion.methods.spindle_drift.segmentation import scan_seconds, segment_steps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -121,22 +120,24 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
 def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Dataset:
     """Return a beam detection with the mean reading of every step, from one as recorded.
 
-    A scan that was cut off and made anew counts with its last samples; one whose steps are not found is NaN, and
+    Of a scan that was cut off and made anew the last attempt counts; one whose steps are not found is NaN, and
     ``notes`` say why.
     """
     centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction")
     channels, profiles, steps = centre.shape[:3]
     rate, dwell = float(raw.attrs["sample_rate"]), float(raw.attrs.get("dwell", settings.dwell))
-    length = round((steps * dwell * 1.25 + LEAD) * rate)
+    length = round(scan_seconds(steps, dwell) * rate)
     scan = raw["scan"].values
+    attempt = raw["attempt"].values if "attempt" in raw else np.zeros(scan.size, np.int16)
     means = np.full((channels, profiles, steps), np.nan)
     for number in range(channels * profiles):
         channel, profile = divmod(number, profiles)
         place = f"{raw['channel'].values[channel]}, profile {profile}"
-        samples = np.flatnonzero(scan == number)[-length:]
+        samples = np.flatnonzero(scan == number)
         if samples.size == 0:
             notes.append(f"{place}: not recorded.")
             continue
+        samples = samples[attempt[samples] == attempt[samples].max()][:length]
         record = raw["record"].isel(sample=slice(int(samples[0]), int(samples[-1]) + 1)).values.astype(np.float64)
         try:
             means[channel, profile] = segment_steps(record, rate, steps, dwell, settings.step_average).mean

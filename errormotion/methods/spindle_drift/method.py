@@ -8,15 +8,15 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.acquisition import SCHEMA
 from errormotion.methods.spindle_drift.detection import identify_beams
 from errormotion.methods.spindle_drift.drift import identify_drift
+from errormotion.methods.spindle_drift.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-
-SCHEMA = "errormotion.raw.spindle_drift/1"
 
 
 class SpindleDrift:
@@ -46,11 +46,11 @@ class SpindleDrift:
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition``."""
-        from errormotion.methods.spindle_drift import acquisition
+        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``scanning``."""
+        from errormotion.methods.spindle_drift import acquisition, scanning
 
         if settings.procedure == "beam_detection":
-            return acquisition.detect_beams(bench, settings, done)
+            return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, inputs.get("beams"), done)
 
     def append_dim(self, settings: DriftSettings) -> str:
@@ -59,10 +59,8 @@ class SpindleDrift:
 
     def progress(self, settings: DriftSettings) -> float:
         """Return the expected length of the record, s."""
-        from errormotion.methods.spindle_drift.acquisition import scan_seconds
-
         if settings.procedure == "beam_detection":
-            return 5 * 2 * len(settings.depths) * scan_seconds(settings)
+            return 5 * 2 * len(settings.depths) * scan_seconds(settings.steps, settings.dwell)
         return settings.duration
 
     def follow(self, settings: DriftSettings) -> Callable[[xr.Dataset], str]:

@@ -9,9 +9,9 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.schemas import CHANNELS
-from errormotion.methods.spindle_drift.acquisition import machine_axes
 from errormotion.methods.spindle_drift.beams import Beam, fisher_bound
 from errormotion.methods.spindle_drift.detection import beam_errors
+from errormotion.methods.spindle_drift.scanning import machine_axes
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.method import SpindleDrift

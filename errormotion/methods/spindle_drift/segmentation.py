@@ -26,6 +26,15 @@ _TICK = 0.01
 _STANDS_OUT = 20.0
 
 
+LEAD = 10.0
+"""A scan is recorded this much longer than its rests and moves, s."""
+
+
+def scan_seconds(steps: int, dwell: float) -> float:
+    """Return how long one scan is recorded, s: its rests, a quarter more for the moves, and a lead."""
+    return steps * dwell * 1.25 + LEAD
+
+
 @dataclass(frozen=True)
 class Steps:
     """A scan cut into steps.

@@ -1,0 +1,142 @@
+"""Measuring, with instruments that do what real ones do: go on late, fall silent, start when the operator is ready."""
+
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.errors import InstrumentError, MethodError
+from errormotion.methods.spindle_drift import Event, Settings, SpindleDrift
+from errormotion.methods.spindle_drift.acquisition import HAND_OVER_SAMPLES, PATIENCE
+from errormotion.plugins import Samples
+from errormotion.twin import VirtualMachine
+
+RATE = 1000.0
+ENCODING = {"dtype": "uint16", "scale_factor": 3e-8, "add_offset": -2e-5, "_FillValue": 65535}
+
+
+class Frame:
+    """Five channels that read 1 mm; a sample is its own number times 1 pm more."""
+
+    def __init__(self):
+        nominal = VirtualMachine("cframe", seed=1).frame
+        self.rate, self.warm, self.encoding = RATE, True, ENCODING
+        self.geometry = SimpleNamespace(
+            nominal_origin=nominal.nominal_origin, nominal_direction=nominal.nominal_direction, bar_radius=5e-3,
+            levels=nominal.levels, noise=nominal.noise, expansion=nominal.expansion,
+        )  # fmt: skip
+
+    def stream(self, channels=None):
+        first = 0
+        while True:
+            values = 1e-3 + np.tile(np.arange(first, first + 500) * 1e-12, (5, 1))
+            yield Samples(values, first, RATE, 0.0, dropped=1, invalid={"X1 lost": 1})
+            first += 500
+
+
+class Thermometer:
+    def __init__(self, fails=()):
+        self.polls, self.fails = 0, fails
+
+    def read(self):
+        self.polls += 1
+        if self.polls in self.fails:
+            raise InstrumentError("no answer")
+        return {"frame": 20.0 + self.polls, "ambient": 19.0}
+
+
+class Bench:
+    machine = "a machine"
+
+    def __init__(self, **instruments):
+        self.instruments, self.asked = instruments, []
+
+    def has_kind(self, kind):
+        return kind in self.instruments
+
+    def of_kind(self, kind):
+        return self.instruments[kind]
+
+    def ask(self, message):
+        self.asked.append(message)
+
+
+def record(bench, settings, done=None):
+    chunks = list(SpindleDrift().acquire(bench, settings, inputs={}, done=done))
+    return chunks, xr.concat(chunks, dim="time", data_vars="minimal", coords="minimal", compat="override", join="exact")
+
+
+def test_the_record_is_whole_and_counts_what_was_lost():
+    bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
+    chunks, raw = record(bench, Settings(duration=10.2, schedule=(Event(at=2.0, spindle_speed=3000.0),)))
+    assert raw.sizes["time"] == 10200
+    np.testing.assert_allclose(np.diff(raw["distance"].values[0]), 1e-12, rtol=1e-3)
+    assert sum(chunk.attrs["dropped"] for chunk in chunks) == 21
+    assert sum(chunk.attrs["invalid"]["X1 lost"] for chunk in chunks) == 21
+    np.testing.assert_array_equal(raw["spindle_speed"].values, np.where(np.arange(10200) < 2000, 0.0, 3000.0))
+    assert "3000 /min at 2 s" in bench.asked[0]
+    assert chunks[0]["distance"].encoding == ENCODING
+
+
+def test_the_record_begins_with_its_first_sample_and_not_with_the_question():
+    class Slow(Bench):
+        def ask(self, message):
+            self.answered = datetime.now(UTC)
+
+    bench = Slow(spindle_frame=Frame())
+    chunks, _ = record(bench, Settings(duration=2.0))
+    # The first block holds half a second that lay before it came.
+    assert datetime.fromisoformat(chunks[0].attrs["start"]) > bench.answered - timedelta(seconds=0.51)
+
+
+def test_a_thermometer_that_falls_silent_for_a_while_costs_its_own_values_only():
+    bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=(3, 4)))
+    chunks, raw = record(bench, Settings(duration=10.0))
+    warmth = raw["temperature"].sel(sensor="frame").values
+    assert np.isnan(warmth[2000:6000]).all()
+    assert np.isfinite(np.delete(warmth, slice(2000, 6000))).all()
+    assert np.isfinite(raw["distance"]).all()
+    assert sum(chunk.attrs["invalid"].get("thermometer silent", 0) for chunk in chunks) == 2
+
+
+def test_a_thermometer_that_is_gone_for_good_ends_the_record():
+    bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=range(3, 1000)))
+    with pytest.raises(InstrumentError, match="no answer"):
+        record(bench, Settings(duration=2.0 * (PATIENCE + 10)))
+
+
+def interrupted(ago):
+    """Return what a record holds that began ``ago`` seconds ago and was cut off after one second."""
+    _, raw = record(Bench(spindle_frame=Frame(), thermometer=Thermometer()), Settings(duration=1.0))
+    return raw.assign_attrs(start=(datetime.now(UTC) - timedelta(seconds=ago)).isoformat())
+
+
+def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
+    bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
+    settings = Settings(duration=900.0)
+    chunks, raw = record(bench, settings, interrupted(600.0))
+    assert bench.asked == []
+    assert max(chunk.sizes["time"] for chunk in chunks) <= HAND_OVER_SAMPLES + 500
+    assert raw.sizes["time"] == 900_000 - 1000
+    assert chunks[0].attrs["time_start"] == 1.0
+    gap = np.isnan(raw["distance"].values[0])
+    assert gap.argmin() == pytest.approx(599_000, abs=5000)  # a few seconds for the test itself
+    np.testing.assert_array_equal(np.isnan(raw["temperature"].sel(sensor="frame").values), gap)
+
+
+def test_a_record_that_does_not_say_when_it_began_is_not_gone_on_with():
+    done = interrupted(10.0)
+    del done.attrs["start"]
+    with pytest.raises(MethodError, match="does not say when it began"):
+        record(Bench(spindle_frame=Frame()), Settings(duration=900.0), done)
+
+
+def test_beams_are_not_scanned_without_a_machine_that_moves():
+    with pytest.raises(MethodError, match="instrument of kind 'controller'"):
+        list(
+            SpindleDrift().acquire(
+                Bench(spindle_frame=Frame()), Settings(procedure="beam_detection"), inputs={}, done=None
+            )
+        )
