@@ -15,6 +15,8 @@ RANGE = 2e-3
 LEVELS = (0.010, 0.050)
 #: expansion of the frame per kelvin at the sensors looking along X, Y, Z, m/K
 EXPANSION = (2.1e-6, 2.4e-6, 1.3e-6)
+#: how far the true expansion of a frame is off that of the drawing, relative (one sigma)
+EXPANSION_SPREAD = 0.1
 #: how much a sensor's reading rises after it is switched on, m, and its time constant, s: settled after two hours
 WARM_UP = 10.5e-6
 WARM_UP_TIME = 1440.0
@@ -44,8 +46,8 @@ class FrameGeometry:
         Rise of the reading after switching on, m.
     warm_up_time : float
         Its time constant, s.
-    expansion : ndarray, (channel, 3)
-        Where the origins go per kelvin of the frame, m/K.
+    expansion, true_expansion : ndarray, (channel, 3)
+        Where the origins go per kelvin of the frame, m/K: by the drawing, and as it is (a tenth of it off, one sigma).
     """
 
     channels: tuple[str, ...]
@@ -59,11 +61,12 @@ class FrameGeometry:
     warm_up: Array
     warm_up_time: float
     expansion: Array
+    true_expansion: Array
 
     def origins(self, warming: ArrayLike) -> Array:
         """Return the true origins after the frame has warmed by this many kelvins (n,), m, shape (channel, n, 3)."""
         rise = np.asarray(warming, dtype=float)
-        return np.asarray(self.true_origin[:, None, :] + self.expansion[:, None, :] * rise[:, None])
+        return np.asarray(self.true_origin[:, None, :] + self.true_expansion[:, None, :] * rise[:, None])
 
     def warm_up_offset(self, since_on: ArrayLike) -> Array:
         """Return what the readings lack of their settled value, m (not positive), shape (channel, n)."""
@@ -94,6 +97,7 @@ def seeded_frame(rng: np.random.Generator, bar_radius: float) -> FrameGeometry:
     for channel, name in enumerate(CHANNELS):
         axis = "XYZ".index(name[0])
         expansion[channel, axis] = EXPANSION[axis]
+    warm_up = WARM_UP * rng.uniform(0.95, 1.05, len(CHANNELS))
     return FrameGeometry(
         channels=CHANNELS,
         nominal_origin=origin,
@@ -103,7 +107,8 @@ def seeded_frame(rng: np.random.Generator, bar_radius: float) -> FrameGeometry:
         levels=np.array(LEVELS),
         range=RANGE,
         noise=np.full(len(CHANNELS), NOISE),
-        warm_up=WARM_UP * rng.uniform(0.95, 1.05, len(CHANNELS)),
+        warm_up=warm_up,
         warm_up_time=WARM_UP_TIME,
         expansion=expansion,
+        true_expansion=expansion * rng.normal(1.0, EXPANSION_SPREAD),
     )

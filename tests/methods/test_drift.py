@@ -163,9 +163,10 @@ def test_the_frames_expansion_is_taken_out_by_its_temperature(machine, method):
     truth = truth - truth[0]
     with_it, without = method.identify(raw), method.identify(raw, Settings(compensate_frame=False))
     miss = [np.abs(np.asarray(e.em.twist()) - truth)[-1, :3] for e in (with_it, without)]
-    assert (miss[1] > 0.5e-6).all()  # 1.3 to 2.4 um/K over about a kelvin
-    assert (miss[0] < 0.05e-6).all()
     sigma = np.sqrt(np.diagonal(with_it["covariance"].values[-1]))[:3]
+    assert (miss[1] > 0.5e-6).all()  # 1.3 to 2.4 um/K over about a kelvin
+    assert (miss[0] < 3 * sigma).all()
+    assert (miss[0] < 0.3 * miss[1]).all()
     assert (sigma > 0.05 * miss[1]).all()  # a tenth of what was taken out is in the budget
 
 

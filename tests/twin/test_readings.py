@@ -130,8 +130,20 @@ def test_frame_expands_with_its_temperature(warming):
     with_it = warming.still_readings(t)[:, 0]
     without = warming.still_readings(t, expansion=False)[:, 0]
     # sideways sensors back away from the bar, the lower one comes nearer; obliquity of 12 mrad and 30 mrad is 1e-3
-    expected = np.array([2.1e-6, 2.1e-6, 2.4e-6, 2.4e-6, -1.3e-6]) * rise
+    along = np.sum(warming.frame.true_expansion * warming.frame.nominal_direction, axis=1)
+    expected = -along * rise
     assert with_it - without == pytest.approx(expected, rel=2e-3)
+
+
+def test_the_true_expansion_is_a_tenth_off_the_drawn_one():
+    ratios = []
+    for seed in range(60):
+        frame = VirtualMachine("cframe", seed).frame
+        drawn = np.abs(frame.expansion).sum(axis=1)
+        assert drawn == pytest.approx([2.1e-6, 2.1e-6, 2.4e-6, 2.4e-6, 1.3e-6])
+        ratios.append(frame.true_expansion.sum(axis=1) / drawn)
+    assert np.ptp(ratios, axis=1) == pytest.approx(0.0, abs=1e-12)  # one frame, one material
+    assert np.std(ratios) == pytest.approx(0.1, rel=0.3)  # of 60 draws 9 % is chance
 
 
 def test_out_of_range_is_nan(machine):

@@ -95,9 +95,11 @@ def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]
             if lag < 0.1 * lags[0]:
                 break
             repeats += 2.0 * lag / lags[0]
-    # Where a window holds too few values to scatter, the second differences of the record tell the noise.
-    second = np.diff(values[known], 2)
-    variance = max(float(np.mean(residual**2)) * repeats, float(np.mean(second**2)) / 6.0)
+    variance = float(np.mean(residual**2)) * repeats
+    if np.median(np.diff(time[known])) <= length:
+        # Where a window holds too few values to scatter, second differences tell the noise; further apart than that
+        # they would tell the warming itself.
+        variance = max(variance, float(np.mean(np.diff(values[known], 2) ** 2)) / 6.0)
     weight = 1.0 / n + np.where(spread > 0, at * at / np.maximum(spread, 1e-30), 0.0)
     uncertainty = np.sqrt(variance * np.minimum(weight, 1.0))
     return np.where(known, smooth, np.nan), np.where(known, uncertainty, np.nan)
