@@ -15,4 +15,9 @@ The packages, from the bottom up (imports run one way, and a contract holds it):
 ``cli``          the command ``errormotion``
 """
 
+import logging
+
 __version__ = "0.1.0"
+
+# A library speaks when its user listens: without this, Python prints every warning of every call.
+logging.getLogger(__name__).addHandler(logging.NullHandler())

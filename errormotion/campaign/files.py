@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.datasets import tomlfile
-from errormotion.errors import BenchError, PluginError
+from errormotion.errors import BenchError, InstrumentError, PluginError
+from errormotion.instruments.transports.address import parse_address
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
@@ -149,8 +150,18 @@ def load_campaign(path: str | Path) -> CampaignPlan:
     path = Path(path)
     data = tomlfile.read_toml(path, error=BenchError)
     bench = data.get("bench")
-    plan = load_bench(path.parent / bench) if isinstance(bench, str) else None
-    return parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
+    plan, trouble = None, None
+    if isinstance(bench, str):
+        try:
+            plan = load_bench(path.parent / bench)
+        except BenchError as error:
+            trouble = error
+    try:
+        return parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
+    except BenchError as error:
+        if trouble is None:
+            raise
+        raise trouble if not str(error).strip() else BenchError(f"{error}\n{trouble}") from None
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
@@ -163,7 +174,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             continue
         own = {key: value for key, value in entry.items() if key not in InstrumentTable.model_fields}
         settings, found = _settings("instruments", entry["driver"], own, ("instruments", name))
-        mistakes += found
+        mistakes += [*found, *_address_mistakes(entry, ("instruments", name))]
         if settings is not None:
             driver = plugins.get("instruments", entry["driver"])
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
@@ -186,8 +197,10 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for number, test in enumerate(table.test if table else ()):
         mistakes += _name_mistakes(test, ("test", number), earlier)
         earlier.append(test.name)
-    if table is None or bench is None or mistakes:
+    if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
+    if bench is None:
+        raise BenchError("")
     tests = tuple(
         TestPlan(
             test.name,
@@ -198,6 +211,21 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         for test in table.test
     )
     return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text)
+
+
+def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:
+    several = entry.get("addresses")
+    found = {"address": entry.get("address")} | {
+        f"addresses.{name}": url for name, url in (several.items() if isinstance(several, dict) else ())
+    }
+    mistakes = []
+    for key, url in found.items():
+        if isinstance(url, str) and url:
+            try:
+                parse_address(url)
+            except InstrumentError as error:
+                mistakes.append(f"{tomlfile.dotted((*place, key))}: {error}")
+    return mistakes
 
 
 def _tables(value: Any) -> list[tuple[str | int, dict[str, Any]]]:

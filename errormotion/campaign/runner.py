@@ -283,6 +283,8 @@ class _Session:
                     if tell:
                         self.progress.note(tell(chunk))
         finally:
+            if recorder.committed == 0 and folder.raw.exists():  # made, and not one sample came to it
+                shutil.rmtree(folder.raw)
             folder.give_reserve()
             folder.data["samples"] = {
                 "dim": dim,

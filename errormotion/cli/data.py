@@ -9,7 +9,8 @@ from errormotion import datasets, plugins
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
-from errormotion.cli.summary import last_values
+from errormotion.cli.summary import last_values, notes_of
+from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 
 
@@ -21,14 +22,15 @@ def identify(
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method = plugins.get("methods", method_id)
     settings = read_settings(method.Settings, settings_file, assignments)
-    with Bars(as_json) as bars, datasets.load(raw_of(raw)) as dataset:
+    with Bars(as_json) as bars, reading(raw_of(raw)), datasets.load(raw_of(raw)) as dataset:
         bars.stage("identifying")
         errors = method().identify(dataset, settings)
     datasets.validate(errors)
     datasets.save(errors, out)
-    results = last_values(errors)
+    results, notes = last_values(errors), notes_of(errors)
     if as_json:
-        show_json({"ok": True, "errors": str(out), "component": errors.attrs["component"], "results": results})
+        answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
+        show_json({"ok": True, **answer})
         return
     show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
     for result in results:
@@ -36,6 +38,8 @@ def identify(
             f"  {result['name']} after {result['time_min']:.1f} min: {result['value']:+.2f} {result['unit']} "
             f"(U = {result['expanded_uncertainty']:.2f}, k = 2)"
         )
+    for note in notes:
+        show(f"  note: {note}")
 
 
 def raw_of(path: Path) -> Path:
@@ -91,7 +95,7 @@ def validate(file: Path) -> list[str]:
     if (file / "run.json").exists():
         return _of_run(file)
     try:
-        with datasets.load(file) as dataset:
+        with reading(file), datasets.load(file) as dataset:
             return list(datasets.violations(dataset))
     except DatasetError as error:
         return [str(error)]

@@ -15,7 +15,7 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.progress import Bars
-from errormotion.cli.summary import last_values
+from errormotion.cli.summary import last_values, notes_of
 
 
 def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
@@ -63,6 +63,7 @@ def describe(folder: RunFolder) -> dict[str, Any]:
     """Return what a program wants to know of a run."""
     data = folder.data
     errors = folder.errors
+    result = datasets.load(errors) if errors else None
     return {
         "test": data["test"],
         "method": data["method"]["id"],
@@ -73,7 +74,8 @@ def describe(folder: RunFolder) -> dict[str, Any]:
         "errors": str(errors) if errors else None,
         "report": str(folder.path / data["report"]) if data["report"] else None,
         "report_error": report_error(folder),
-        "results": last_values(datasets.load(errors)) if errors else [],
+        "results": last_values(result) if result is not None else [],
+        "notes": notes_of(result) if result is not None else [],
     }
 
 
@@ -96,7 +98,11 @@ def _lines(folder: RunFolder) -> list[str]:
         ]
         lines.append(f"after {end:.1f} min:")
         lines += table(["", "error", "U (k=2)", ""], rows).splitlines()
-    return lines
+    samples = found["samples"] or {}
+    lost = {"dropped": samples.get("dropped", 0)} | (samples.get("invalid") or {})
+    if any(lost.values()):
+        lines.append("lost samples: " + ", ".join(f"{count} {reason}" for reason, count in lost.items() if count))
+    return lines + [f"note: {note}" for note in found["notes"]]
 
 
 def _agree(message: str) -> None:

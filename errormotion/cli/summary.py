@@ -36,3 +36,8 @@ def last_values(errors: xr.Dataset) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def notes_of(errors: xr.Dataset) -> list[str]:
+    """Return what the method has to say of a result: what is missing, doubtful or assumed."""
+    return [str(note) for note in np.atleast_1d(errors.attrs.get("notes", [])) if str(note)]

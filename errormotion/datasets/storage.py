@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import traceback
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from errormotion.datasets.schemas import SCHEMA
 from errormotion.errors import DatasetError
 
 _NETCDF = (".nc", ".nc4", ".h5")
+_READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _CLASSIC_SIGNATURE = b"CDF"
 
@@ -162,11 +164,11 @@ def _engine_of(path: Path) -> str:
     if not head:
         raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Its writing was cut off: make it anew")
     if head.startswith(_CLASSIC_SIGNATURE):
-        raise DatasetError(f"{path}: is a NetCDF file of the classic format; convert it with 'nccopy -4 IN OUT'")
+        return "scipy"
     if _HDF5_SIGNATURE.startswith(head):
         raise DatasetError(f"{path}: is truncated; make it anew or fetch it again")
     raise DatasetError(
-        f"{path}: is no dataset; expected a NetCDF-4 file or a Zarr folder. For a text log use 'errormotion import'"
+        f"{path}: is no dataset; expected a NetCDF file or a Zarr folder. For a text log use 'errormotion import'"
     )
 
 
@@ -190,6 +192,22 @@ def _reading(path: Path) -> Iterator[None]:
         # What h5py, zarr and xarray raise on files that were cut off or are something else.
         what = "is truncated" if "truncated" in str(error) else "is damaged, or no dataset of ours"
         raise DatasetError(f"{path}: {what}; make it anew or fetch it again. (The reader says: {error})") from error
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Turn what a damaged file raises while its values are read, long after it was opened, into a DatasetError."""
+    try:
+        yield
+    except DatasetError:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        if not any(part in frame.filename for frame in frames for part in _READERS):
+            raise
+        raise DatasetError(
+            f"{path}: is damaged or was cut off; fetch it again, or measure again. (The reader says: {error})"
+        ) from error
 
 
 @contextmanager

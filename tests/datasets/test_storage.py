@@ -11,8 +11,10 @@ import zarr
 from xarray.indexes import RangeIndex
 
 from errormotion import datasets
-from errormotion.datasets import load, save
+from errormotion.datasets import load, save, validate
+from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError
+from errormotion.twin import VirtualMachine
 
 both = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 
@@ -214,9 +216,28 @@ def test_what_is_no_dataset_is_told(tmp_path) -> None:
         load(tmp_path / "none.nc")
     with pytest.raises(DatasetError, match=r"folder without zarr\.json"):
         load(tmp_path)
-    (tmp_path / "old.nc").write_bytes(b"CDF\x01" + bytes(100))
-    with pytest.raises(DatasetError, match="nccopy"):
+    (tmp_path / "old.nc").write_bytes(b"CDF\x01" + b"\xff" * 100)
+    with pytest.raises(DatasetError, match="is damaged"):
         load(tmp_path / "old.nc")
+
+
+def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
+    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift([0.0, 10.0], seed=0)
+    raw.drop_vars(["temperature", "spindle_speed", "sensor"]).to_netcdf(tmp_path / "raw.nc", engine="scipy")
+    with load(tmp_path / "raw.nc") as found:
+        validate(found)
+        np.testing.assert_array_equal(found["distance"], raw["distance"])
+
+
+def test_a_chunk_that_is_cut_off_shows_while_it_is_read(tmp_path) -> None:
+    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift(np.arange(5000.0), seed=0)
+    path = save(raw, tmp_path / "raw.zarr")
+    (chunk, *_) = [file for file in (path / "distance").rglob("*") if file.is_file() and file.name != "zarr.json"]
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(DatasetError, match=r"raw\.zarr: is damaged or was cut off"), reading(path):
+        load(path)["distance"].load()
+    with pytest.raises(RuntimeError, match="ours"), reading(path):
+        raise RuntimeError("ours")
 
 
 def test_a_folder_around_a_dataset_points_to_it(drift, tmp_path) -> None:

@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFrame, FrameSettings
 from errormotion.instruments.thermometer.dcon import DconTemperature
+from errormotion.plugins import Samples
 from errormotion.twin import Event
 
 SLOW = OptoSettings(rate=1500.0, timeout=10.0)
@@ -115,14 +117,19 @@ def test_a_pace_holds_the_clock_to_real_time() -> None:
 
 def test_sensors_that_are_not_synchronised_may_have_rates_of_their_own() -> None:
     fast, slow = OptoSettings(rate=5000.0, timeout=10.0), OptoSettings(rate=2500.0, timeout=10.0)
-    with OptoNCDT("sim://cframe/X1?seed=3", fast) as one, OptoNCDT("sim://cframe/X2?seed=3", slow) as two:
-        first, second = one.stream(block=1000), two.stream(block=500)
-        blocks = [(next(first), next(second)) for _ in range(50)]
-        first.close()
-        second.close()
-    for a, b in blocks:
-        assert not a.invalid
-        assert not b.invalid
+    with (
+        OptoNCDT("sim://cframe/X1?seed=3", fast) as one,
+        OptoNCDT("sim://cframe/X2?seed=3", slow) as two,
+        ThreadPoolExecutor() as pool,  # the clock waits for its slowest reader, so that each has a thread of its own
+    ):
+        read = [pool.submit(fifty_blocks, one, 1000), pool.submit(fifty_blocks, two, 500)]
+        blocks = [block for reading in read for block in reading.result()]
+    assert len(blocks) == 100
+    assert not any(block.invalid for block in blocks)
+
+
+def fifty_blocks(sensor: OptoNCDT, size: int) -> list[Samples]:
+    return list(itertools.islice(sensor.stream(block=size), 50))
 
 
 def test_temperatures_belong_to_the_last_sample_that_was_read() -> None:

@@ -138,7 +138,7 @@ def test_more_noise_than_stated_is_noticed_and_raises_the_uncertainty(machine, m
     sigma = [np.sqrt(e["covariance"].sel(dof="EX", dof_="EX").values[-1]) for e in (auto, stated, honest)]
     assert sigma[0] == pytest.approx(sigma[2], rel=0.15)  # 400 differences: 6 %, and two channels
     assert sigma[1] == pytest.approx(sigma[2] / 3, rel=0.01)
-    assert any("times as much as the stated noise" in note for note in auto.attrs["notes"])
+    assert any("the stated noise is 0.001 um" in note for note in auto.attrs["notes"])
     assert not any("stated noise" in note for note in honest.attrs["notes"])
 
 
@@ -325,3 +325,49 @@ def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, met
         stated.append(np.sqrt(np.asarray(change[1])[1, 1]))
     # The readings' noise is the same in all seeds; of the spread of 40 draws 11 % is chance.
     assert np.std(found) == pytest.approx(np.mean(stated), rel=0.4)
+
+
+# ------------------------------------------------------------------ what a lab does wrong
+
+
+def test_beams_given_from_the_bar_to_the_sensor_are_refused(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw["beam_direction"] = -raw["beam_direction"]
+    with pytest.raises(MethodError, match="the other way round"):
+        method.identify(raw)
+
+
+@pytest.mark.parametrize("channel", [0, 3, 4])
+def test_one_reversed_beam_is_noticed(machine, method, channel):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    # Reversed about the point that it sees, so that all five still meet the bar.
+    seen = raw["beam_origin"].values[channel] + raw["beam_direction"].values[channel] * 1e-3
+    raw["beam_direction"][channel] *= -1.0
+    raw["beam_origin"][channel] = seen - raw["beam_direction"].values[channel] * 1e-3
+    with pytest.raises(MethodError, match="would leave the bar"):
+        method.identify(raw)
+
+
+def test_levels_that_are_one_are_refused(machine, method):
+    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw["level"] = ("height", [0.01, 0.01])
+    with pytest.raises(MethodError, match="expected two heights"):
+        method.identify(raw)
+
+
+def test_a_record_of_one_mean_is_no_drift(machine, method):
+    raw = machine.raw_spindle_drift(np.arange(0, 2, 1 / 500), seed=0)
+    with pytest.raises(MethodError, match=r"gives 1 mean of 1\.5 s"):
+        method.identify(raw, Settings(average=1.5))
+
+
+def test_a_stated_noise_of_zero_is_not_believed(machine, method):
+    raw = machine.raw_spindle_drift(np.arange(0, 200, 0.5), seed=6)
+    honest = method.identify(raw)
+    raw["distance_noise"] = 0.0
+    doubted = method.identify(raw)
+    np.testing.assert_allclose(
+        np.sqrt(doubted["covariance"].sel(dof="EZ", dof_="EZ").values[1:]),
+        np.sqrt(honest["covariance"].sel(dof="EZ", dof_="EZ").values[1:]),
+        rtol=0.15,
+    )

@@ -33,6 +33,7 @@ def results(t, errors=None, **options):
         "running_end": None,
         "sensor": None,
         "average": 30.0,
+        "reference": np.array([0]),
     }
     return evaluate(series, t, **(settings | options))
 

@@ -69,12 +69,17 @@ def record_drift(
         while pending.end < due:
             pending.fill_gap(due)
             yield pending.hand_over()
-    for samples in frame.stream():
-        pending.add(samples, total)
-        if pending.due or pending.end >= total:
+    try:
+        for samples in frame.stream():
+            pending.add(samples, total)
+            if pending.due or pending.end >= total:
+                yield pending.hand_over()
+            if pending.end >= total:
+                return
+    except InstrumentError:
+        if pending.samples:  # what came before it went wrong is not lost
             yield pending.hand_over()
-        if pending.end >= total:
-            return
+        raise
     raise MethodError(f"The stream ended at {pending.end / rate:.1f} s of {settings.duration:g} s.")
 
 

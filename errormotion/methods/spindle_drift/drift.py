@@ -14,7 +14,12 @@ from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift import iso230_3
 from errormotion.methods.spindle_drift.bar import SIDE, end_point, fit_axis
-from errormotion.methods.spindle_drift.frame_expansion import frame_warming, readings_per_kelvin, smoothing_sources
+from errormotion.methods.spindle_drift.frame_expansion import (
+    frame_warming,
+    hats,
+    readings_per_kelvin,
+    smoothing_sources,
+)
 from errormotion.methods.spindle_drift.record import (
     average_record,
     count_unknown,
@@ -44,6 +49,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_UNSEEN_KNOTS = 8
+
 
 def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
     """Return the spindle's error dataset over ``time``; see the method's page for its equations.
@@ -58,6 +65,12 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     measured, raw = raw, raw.drop_vars("distance").sel(channel=list(CHANNELS))
     averages = record.averages
     count_unknown(averages, notes)
+    if averages.time.size < 2:
+        span = float(averages.time.size * settings.average)
+        raise MethodError(
+            f"The record gives {averages.time.size} mean of {settings.average:g} s; a drift needs at least two. Is the "
+            f"record shorter than {2 * span:g} s, or 'average' too long?"
+        )
     bar = _bar(raw, settings, notes)
     coming_up = settling(record, settings.spin_up)
     reference = reference_windows(averages, settings, coming_up, notes)
@@ -68,6 +81,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
             "No cylinder of the stated radius touches the five readings of the reference state. Check bar_radius "
             f"({bar.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
         )
+    _check_senses(then, bar)
     point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
     errors = twist(state, then, point)
     sigma = noise(raw, averages, settings, notes)
@@ -98,12 +112,15 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         running_end=None if settings.running_end is None else settings.running_end - zero,
         sensor=settings.iso_temperature,
         average=settings.iso_average,
+        reference=reference,
     )
     names = [(s.name, s.group) for s in sources] + [(name, group) for name, group, _ in effects]
     unseen = np.cross(then.a[0], point - then.E[0]) * settings.unseen_rotation
     if np.linalg.norm(unseen) > 0:
-        influence = np.concatenate([influence, _unseen(unseen, len(errors), reference)])
-        names.append(("rotation about the spindle axis", "rotation about the spindle axis"))
+        rows = _unseen(unseen, averages.time, reference)
+        influence = np.concatenate([influence, rows])
+        group = "rotation about the spindle axis"
+        names += [(f"{group}, part {k + 1}", group) for k in range(len(rows))]
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -138,6 +155,22 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     )
 
 
+def _check_senses(then: State, bar: Bar) -> None:
+    """Refuse beams that leave the bar where they should meet it: directions given from the bar to the sensor."""
+    S = bar.origin + bar.direction * then.distance
+    level = np.array([*then.q[0, :2], bar.levels[0]])
+    w = S - level
+    outward = w - (w @ then.a[0])[:, None] * then.a[0]
+    outward[4] = then.E[0] - np.array([*then.q[0].reshape(2, 2).mean(axis=0), bar.levels.mean()])
+    leaving = [c for c, n, u in zip(CHANNELS, outward, bar.direction, strict=True) if n @ u > 0]
+    if leaving:
+        raise MethodError(
+            f"With these beams, that of {', '.join(leaving)} would leave the bar where it should meet it. "
+            "beam_direction is the unit vector from the sensor to the bar, and a reading grows as the bar goes away: is the sign of a "
+            "direction the other way round?"
+        )
+
+
 def _compensated(
     raw: xr.Dataset, record: Record, bar: Bar, reference: NDArray[np.int64], settings: Settings, notes: list[str]
 ) -> tuple[Array, list[tuple[str, str, Array]]]:
@@ -159,13 +192,19 @@ def _compensated(
     return mean + change, effects
 
 
-def _unseen(effect: Array, instants: int, reference: NDArray[np.int64]) -> Array:
-    """Return the influence (1, instant, 6) of the rotation about the axis; EC itself stays unknown."""
-    row = np.zeros((1, instants, 6))
-    row[..., :3] = effect
-    row[:, reference] = 0.0
-    row[..., 5] = np.nan
-    return row
+def _unseen(effect: Array, time: Array, reference: NDArray[np.int64]) -> Array:
+    """Return the influence (source, instant, 6) of the rotation about the axis, zero in the reference state.
+
+    It grows and turns as the head warms: knots over the record, each one draw, so that instants far apart share little
+    of it. EC itself stays unknown.
+    """
+    weights = hats(time, _UNSEEN_KNOTS)
+    weights = (weights - weights[:, reference].mean(axis=1, keepdims=True)) / np.sqrt(2.0)
+    rows = np.full((len(weights), time.size, 6), np.nan)
+    rows[..., :3] = weights[..., None] * effect
+    rows[..., 3:5] = 0.0
+    rows[:, reference, :5] = 0.0
+    return rows
 
 
 @dataclass(frozen=True)
@@ -182,6 +221,11 @@ class Bar:
 
 def _bar(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Bar:
     levels = np.asarray(raw["level"].values, np.float64)
+    if not abs(levels[1] - levels[0]) > 1e-3:
+        raise MethodError(
+            f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights, at "
+            "least 1 mm apart."
+        )
     return Bar(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
 
 

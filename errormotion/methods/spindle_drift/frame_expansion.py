@@ -112,15 +112,15 @@ def smoothing_sources(warming: FrameWarming, time: Array, length: float, referen
     not: knots at that distance (at most ``_MOST_KNOTS`` of them), each one draw, with weights whose squares add up to
     one between them. All is relative to the reference state.
     """
-    span = float(np.ptp(time))
-    knots = int(np.clip(np.ceil(span / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
-    place = (time - time[0]) / max(span, 1e-9) * (knots - 1)
-    known = np.nan_to_num(warming.uncertainty)
-    found = []
-    for k in range(knots):
-        effect = np.sqrt(np.maximum(1.0 - np.abs(place - k), 0.0)) * known
-        found.append(effect - effect[reference].mean())
-    return found
+    knots = int(np.clip(np.ceil(np.ptp(time) / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
+    effects = hats(time, knots) * np.nan_to_num(warming.uncertainty)
+    return list(effects - effects[:, reference].mean(axis=1, keepdims=True))
+
+
+def hats(time: Array, knots: int) -> Array:
+    """Return weights (knot, instant) about evenly spaced knots over a record; their squares add up to one."""
+    place = (time - time[0]) / max(float(np.ptp(time)), 1e-9) * (knots - 1)
+    return np.asarray(np.sqrt(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0)))
 
 
 def readings_per_kelvin(warming: FrameWarming, state: State, origin: Array, direction: Array, levels: Array) -> Array:

@@ -125,10 +125,12 @@ def evaluate(
     running_end: float | None,
     sensor: str | None,
     average: float,
+    reference: Index,
 ) -> Results:
     """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state.
 
-    ``average`` (s) is the length of the means over which ranges and end values are taken.
+    ``average`` (s) is the length of the means over which ranges and end values are taken. The reference state, the
+    instants ``reference``, counts as one more mean: its value is zero.
     """
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
     uncertainty = np.full_like(value, np.nan)
@@ -143,7 +145,7 @@ def evaluate(
             inside = np.flatnonzero(known & (time <= until + 1e-6))
             if inside.size < 2 or time[-1] < until - 1.5 * step:
                 continue
-            blocks = _blocks(inside, time, average)
+            blocks = [reference, *_blocks(inside, time, average)]
             means = np.array([series.value[k, block].mean() for block in blocks])
             top, bottom = blocks[means.argmax()], blocks[means.argmin()]
             value[k, column], uncertainty[k, column] = (
@@ -169,7 +171,10 @@ def evaluate(
 def _blocks(index: Index, time: Array, length: float) -> list[Index]:
     """Cut instants into blocks of ``length`` seconds, counted back from the last one, which is whole."""
     age = np.floor((time[index[-1]] - time[index]) / length + 1e-9)
-    return list(np.split(index, np.flatnonzero(np.diff(age)) + 1))
+    blocks = list(np.split(index, np.flatnonzero(np.diff(age)) + 1))
+    if len(blocks) > 1 and np.ptp(time[blocks[0]]) < 0.5 * length < np.ptp(time[blocks[1]]):
+        blocks[:2] = [np.concatenate(blocks[:2])]  # a short rest at the beginning would be a mean of little
+    return blocks
 
 
 def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:

@@ -151,18 +151,19 @@ def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[s
         return np.asarray(sigma)
     for i, channel in enumerate(CHANNELS):
         # Second differences take out the drift itself; the median takes out steps.
-        second = np.diff(averages.mean[i] / sigma[i], 2) / np.sqrt(6.0)
+        root = np.sqrt(np.maximum(averages.count[i], 1))
+        second = np.diff(averages.mean[i] * root, 2) / np.sqrt(6.0)
         second = second[np.isfinite(second)]
         if second.size < _ENOUGH:
             continue
         seen = float(np.median(np.abs(second)) / 0.674490)
         # Spread of a median-based deviation of overlapping second differences, from simulation: 1.7 / sqrt(2 n).
-        if seen > 1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size):
+        if seen > stated * (1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size)):
             notes.append(
-                f"{channel}: the means scatter {seen:.2f} times as much as the stated noise of {stated * 1e6:.3g} um a "
-                "sample explains; the uncertainty is raised to what is seen."
+                f"{channel}: the means scatter as from a noise of {seen * 1e6:.3g} um a sample, the stated noise is "
+                f"{stated * 1e6:.3g} um; the uncertainty is raised to what is seen."
             )
-            sigma[i] *= seen
+            sigma[i] = seen / root
     return np.asarray(sigma)
 
 

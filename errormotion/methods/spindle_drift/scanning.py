@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets.schemas import CHANNELS
-from errormotion.errors import MethodError
+from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift.acquisition import HAND_OVER_SECONDS, SCHEMA
 from errormotion.methods.spindle_drift.beams import across
 from errormotion.methods.spindle_drift.segmentation import scan_seconds
@@ -119,19 +119,29 @@ def _record_scan(
     name = CHANNELS[channel]
     taken, since = 0, time.monotonic()
     waiting: list[Array] = []
-    for samples in frame.stream([name]):
-        waiting.append(samples.values[0, : length - taken])
-        taken += waiting[-1].size
-        if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
-            record = np.concatenate(waiting)
-            chunk = static.assign(
-                record=("sample", record, {"units": "m"}),
-                scan=("sample", np.full(record.size, scan, np.int16)),
-                attempt=("sample", np.full(record.size, attempt, np.int16)),
-            )
-            chunk["record"].encoding = dict(frame.encoding)
-            yield chunk
-            waiting, since = [], time.monotonic()
-        if taken == length:
-            return
+
+    def chunk() -> xr.Dataset:
+        record = np.concatenate(waiting)
+        found = static.assign(
+            record=("sample", record, {"units": "m"}),
+            scan=("sample", np.full(record.size, scan, np.int16)),
+            attempt=("sample", np.full(record.size, attempt, np.int16)),
+        )
+        found["record"].encoding = dict(frame.encoding)
+        waiting.clear()
+        return found
+
+    try:
+        for samples in frame.stream([name]):
+            waiting.append(samples.values[0, : length - taken])
+            taken += waiting[-1].size
+            if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
+                yield chunk()
+                since = time.monotonic()
+            if taken == length:
+                return
+    except InstrumentError:
+        if waiting:  # what came before it went wrong is not lost
+            yield chunk()
+        raise
     raise MethodError(f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.")
