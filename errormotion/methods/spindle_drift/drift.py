@@ -166,8 +166,8 @@ def _check_senses(then: State, bar: Bar) -> None:
     if leaving:
         raise MethodError(
             f"With these beams, that of {', '.join(leaving)} would leave the bar where it should meet it. "
-            "beam_direction is the unit vector from the sensor to the bar, and a reading grows as the bar goes away: is the sign of a "
-            "direction the other way round?"
+            "beam_direction is the unit vector from the sensor to the bar, and a reading grows as the bar goes away: "
+            "is the sign of a direction the other way round?"
         )
 
 
