@@ -30,17 +30,20 @@ class Chunk:
 
     Attributes
     ----------
-    values : ndarray, float64, (n,)
-        NaN where there is none.
+    values : ndarray, (n, ...)
+        Distances (float64, NaN where there is none), or whole profiles as they were sent.
     reasons : ndarray, uint8, (n,)
         Why not; 0 where there is one.
     text : bytes
         What came between the values.
+    end : InstrumentError, optional
+        Why nothing comes behind these samples.
     """
 
     values: Array
     reasons: Array
     text: bytes = b""
+    end: InstrumentError | None = None
 
 
 class Decoder(Protocol):
@@ -65,11 +68,11 @@ class Reader:
     overrun : int
         Reason code of samples that were thrown away.
     prompt : bytes
-        What ends an answer of the device.
+        What ends an answer of the device; empty where answers come on another line.
     """
 
     def __init__(
-        self, transport: Transport, decode: Decoder, *, name: str, limit: int, overrun: int, prompt: bytes
+        self, transport: Transport, decode: Decoder, *, name: str, limit: int, overrun: int, prompt: bytes = b""
     ) -> None:
         self._transport = transport
         self._decode = decode
@@ -104,7 +107,7 @@ class Reader:
         InstrumentError
             Whatever ended the thread.
         """
-        done, size = 0, values.size
+        done, size = 0, len(values)
         while done < size:
             with self._change:
                 self._await_samples(timeout)
@@ -178,6 +181,31 @@ class Reader:
         finally:
             self.abandon()
 
+    def finish(self, quiet: float, timeout: float) -> InstrumentError | None:
+        """Throw away what still comes, until the stream ends or nothing has come for ``quiet`` s; end the thread.
+
+        Returns what ended the thread, None where the device just fell quiet.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            It was still sending after ``timeout`` s.
+        """
+        self.drain()
+        start = time.monotonic()
+        try:
+            with self._change:
+                while self._error is None:
+                    now = time.monotonic()
+                    if now - max(self._heard, start) >= quiet:
+                        break
+                    if now - start >= timeout:
+                        raise InstrumentTimeoutError(f"{self._name}: still sending {timeout:g} s after it was stopped")
+                    self._change.wait(POLL)
+        finally:
+            self.abandon()
+        return self._error
+
     def abandon(self) -> None:
         """End the thread whatever the device does; idempotent."""
         with self._change:
@@ -193,7 +221,10 @@ class Reader:
                 except InstrumentTimeoutError:
                     continue
                 now = time.monotonic()
-                self._accept(self._decode(data), now)
+                chunk = self._decode(data)
+                self._accept(chunk, now)
+                if chunk.end is not None:
+                    raise chunk.end
         except InstrumentError as error:
             self._fail(type(error)(f"{self._name}: {error}"))
         except Exception as error:  # noqa: BLE001 - whatever it is, the caller must hear of it and not wait
@@ -210,7 +241,7 @@ class Reader:
                 self._heard = now
             if chunk.text:
                 self._accept_text(chunk.text)
-            size = chunk.values.size
+            size = len(chunk.values)
             if self._draining or not size:
                 return
             if self._queued >= self._limit:

@@ -18,6 +18,7 @@ from errormotion.errors import PluginError
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "point_lds": (-0.05, 0.5),
     "spindle_frame": (-0.05, 0.5),
+    "line_profiler": (-0.5, 0.5),
     "thermometer": (-60.0, 400.0),
 }
 

@@ -1,6 +1,8 @@
 """The reader thread and its bounded queue."""
 
 import threading
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +55,8 @@ class Tap(Transport):
 
 
 def decode(data: bytes) -> Chunk:
+    if data.endswith(b"$"):
+        return replace(decode(data[:-1]), end=ProtocolError("this was the last one"))
     if data == b"?":
         raise ProtocolError("these are no samples")
     numbers = np.frombuffer(bytes(byte for byte in data if byte < 32), dtype=np.uint8)
@@ -143,4 +147,54 @@ def test_stopping_ends_the_thread_even_when_nobody_takes_the_samples(tap: Tap, r
     for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
         tap.put(piece)
     assert reader.stop(b"stop", 2.0) == b"OK>"
+    assert not any(thread.name == "reader-tap" for thread in threading.enumerate())
+
+
+def test_samples_may_have_any_shape(tap: Tap) -> None:
+    def pairs(data: bytes) -> Chunk:
+        rows = np.frombuffer(data, dtype=np.uint8).reshape(-1, 2).astype(np.uint32)
+        return Chunk(rows, np.zeros(len(rows), dtype=np.uint8))
+
+    reader = Reader(tap, pairs, name="tap", limit=4, overrun=OVERRUN)
+    tap.put(b"\1\2\3\4")
+    tap.put(b"\5\6")
+    values, reasons = np.empty((3, 2), dtype=np.uint32), np.empty(3, dtype=np.uint8)
+    reader.fill(values, reasons, 1.0)
+    reader.abandon()
+    assert values.tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert tap.told == [3]
+
+
+def test_a_stream_that_ends_by_itself_gives_its_last_samples_first(tap: Tap, reader: Reader) -> None:
+    tap.put(b"\1\2$")
+    assert fill(reader, 2)[0] == [1, 2]
+    with pytest.raises(ProtocolError, match="tap: this was the last one"):
+        fill(reader, 1)
+
+
+def test_finishing_waits_for_the_end_of_the_stream_and_tells_why_it_ended(tap: Tap, reader: Reader) -> None:
+    tap.put(b"\1\2")
+    threading.Timer(0.1, tap.put, [b"\3$"]).start()
+    ended = reader.finish(quiet=5.0, timeout=5.0)
+    assert isinstance(ended, ProtocolError)
+    assert "the last one" in str(ended)
+
+
+def test_finishing_takes_silence_for_the_end(tap: Tap, reader: Reader) -> None:
+    tap.put(b"\1\2")
+    start = time.monotonic()
+    assert reader.finish(quiet=0.1, timeout=5.0) is None
+    assert time.monotonic() - start < 4.0
+    assert not any(thread.name == "reader-tap" for thread in threading.enumerate())
+
+
+def test_a_device_that_does_not_stop_is_a_timeout_error(tap: Tap, reader: Reader) -> None:
+    def never_silent(max_bytes: int, timeout: float) -> bytes:
+        time.sleep(0.01)
+        return b"\1"
+
+    tap._receive = never_silent  # type: ignore[method-assign]
+    tap.put(b"\1")
+    with pytest.raises(InstrumentTimeoutError, match=r"tap: still sending 0\.3 s after it was stopped"):
+        reader.finish(quiet=0.2, timeout=0.3)
     assert not any(thread.name == "reader-tap" for thread in threading.enumerate())

@@ -7,7 +7,7 @@ import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.transports import Transport, open_transport, parse_address
-from errormotion.instruments.transports.serving import Server, make_server
+from errormotion.instruments.transports.serving import Server, TcpServer, make_server
 
 
 class Echo:
@@ -94,6 +94,15 @@ def test_silence_becomes_a_timeout_error_that_shows_what_came(line: Transport) -
         line.read(timeout=0.05)
 
 
+def test_a_number_of_bytes_is_read_whatever_the_pieces(line: Transport) -> None:
+    line.write(b"one;two")
+    assert line.read_until(b";") == b"ONE;"
+    assert line.read_exactly(2) == b"TW"
+    with pytest.raises(InstrumentTimeoutError, match=r"expected 4 bytes within 0\.2 s; 1 came"):
+        line.read_exactly(4, timeout=0.2)
+    assert line.read_exactly(0) == b""
+
+
 def test_an_endless_line_becomes_a_protocol_error(line: Transport) -> None:
     line.write(b"x" * 100)
     with pytest.raises(ProtocolError, match="bytes without b';'"):
@@ -141,6 +150,19 @@ def test_nobody_at_an_address_is_an_instrument_error(tmp_path: Path) -> None:
 def test_a_simulator_that_is_not_there_is_named(simulator: str | None, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):
         open_transport("sim://cframe/X1", simulator=simulator)
+
+
+def test_a_server_knows_whether_somebody_is_connected() -> None:
+    server = TcpServer("quiet", lambda data: None)
+    server.start()
+    assert not server.await_connection(0.01)
+    assert not server.send(b"lost")
+    line = open_transport(server.url)
+    assert server.await_connection(1.0)
+    assert server.send(b"heard")
+    assert line.read_exactly(5) == b"heard"
+    line.close()
+    server.close()
 
 
 def test_an_unknown_wire_is_refused() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from errormotion.errors import InstrumentError
@@ -48,6 +48,19 @@ class Address:
             return float(text)
         except ValueError:
             raise InstrumentError(f"'{name}' in '{self.url}': expected a number; found '{text}'") from None
+
+    def line(self, name: str, default: int) -> Address:
+        """Return the address of a further TCP line of the same device, at the port that the parameter ``name`` gives.
+
+        Raises
+        ------
+        InstrumentError
+            The parameter is no port number.
+        """
+        port = float(self.number(name, default))
+        if not (port.is_integer() and 0 < port < 1 << 16):
+            raise InstrumentError(f"'{name}' in '{self.url}': expected a port from 1 to 65535; found {port:g}")
+        return replace(self, url=f"tcp://{self.host}:{port:.0f}", port=int(port), params={})
 
     def with_path(self, path: str) -> str:
         """Return the URL with another path, its parameters kept."""

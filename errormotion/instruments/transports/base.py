@@ -80,6 +80,25 @@ class Transport(ABC):
         self._rest = tail + self._rest
         return head + found
 
+    def read_exactly(self, size: int, timeout: float | None = None) -> bytes:
+        """Return exactly ``size`` bytes.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Fewer within the time limit; the message says how many came.
+        """
+        allowed = self.timeout if timeout is None else timeout
+        end, data = time.monotonic() + allowed, b""
+        while len(data) < size:
+            try:
+                data += self.read(size - len(data), timeout=max(end - time.monotonic(), 0.0))
+            except InstrumentTimeoutError:
+                raise InstrumentTimeoutError(
+                    f"{self.url}: expected {size} bytes within {allowed:g} s; {len(data)} came"
+                ) from None
+        return data
+
     def handed_over(self, samples: int) -> None:  # noqa: B027 - most transports do not care
         """Told how many samples of the running stream the caller has had by now.
 

@@ -75,7 +75,15 @@ class TcpServer(Server):
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._line: socket.socket | None = None
+        self._connected = threading.Event()
         self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+
+    def await_connection(self, timeout: float) -> bool:
+        """Wait until somebody is connected; False when nobody is within ``timeout`` s.
+
+        Who has just connected may not be let in yet: on a line where he says nothing himself, only this tells.
+        """
+        return self._connected.wait(timeout)
 
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
@@ -107,6 +115,7 @@ class TcpServer(Server):
                 line, _ = self._listener.accept()
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._line = line
+                self._connected.set()
                 continue
             try:
                 data = self._line.recv(4096)
@@ -122,6 +131,7 @@ class TcpServer(Server):
         self.hang_up()
         with self.lock:
             self._line = None
+            self._connected.clear()
         if line is not None:
             line.close()
 

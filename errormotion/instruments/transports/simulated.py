@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
+from errormotion.errors import InstrumentError
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.base import Transport
 from errormotion.instruments.transports.serial_line import SerialTransport
@@ -17,7 +19,8 @@ class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
     ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine), ``close()`` and ``handed_over(samples)``.
+    machine), ``close()`` and ``handed_over(samples)``. A device with several lines has ``urls`` of the further ones,
+    by name.
     """
 
     simulated = True
@@ -25,17 +28,30 @@ class SimulatedTransport(Transport):
     def __init__(self, address: Address, simulator: Any, *, timeout: float = 1.0) -> None:
         super().__init__(address.url, timeout)
         self._device = simulator(address)
-        inner = parse_address(self._device.url)
+        self._inner = self._connect(self._device.url)
+
+    def further(self, name: str) -> Transport:
+        """Open a further line of the same device; InstrumentError where it has none of this name."""
+        urls = getattr(self._device, "urls", {})
+        if name not in urls:
+            raise InstrumentError(f"The simulated device at {self.url} has no line '{name}'; it has: {', '.join(urls)}")
+        line = copy(self)
+        line._inner = self._connect(urls[name])
+        return line
+
+    def _connect(self, url: str) -> Transport:
+        inner = parse_address(url)
         try:
-            self._inner: Transport = (
-                TcpTransport(inner, timeout=timeout, receive_buffer=RECEIVE_BUFFER)
+            line: Transport = (
+                TcpTransport(inner, timeout=self.timeout, receive_buffer=RECEIVE_BUFFER)
                 if inner.scheme == "tcp"
-                else SerialTransport(inner, timeout=timeout)
+                else SerialTransport(inner, timeout=self.timeout)
             )
         except BaseException:
             self._device.close()
             raise
-        self._inner.url = self.url  # messages name the address that a person knows
+        line.url = self.url  # messages name the address that a person knows
+        return line
 
     def _send(self, data: bytes) -> None:
         self._inner.write(data)

@@ -1,0 +1,256 @@
+"""What an LJ-X8000A says: requests, replies, and the layout of its high-speed stream. Little-endian throughout.
+
+Facts marked (m) are from memory; each is one line to correct. A request is a 16-byte head and a payload that begins
+with its opcode; a reply has its return code at byte 17, the active program at 24 and its data from 28 on.
+
+A profile of the stream is a header of six words (reserved, trigger count, encoder count, three reserved), the heights
+with 20 bits each from the least significant bit on, padded to a word, where switched on the intensities with 10 bits
+each, padded to a word, and the sum of all words before it. The bulk of it is done by the compiled functions of
+`kernels`; this module holds the facts and the small cases.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, ProtocolError
+
+COMMAND_PORT, STREAM_PORT = 24691, 24692
+
+# ------------------------------------------------------------------ requests and replies
+
+#: The byte by which the controllers' generations differ.
+GENERATIONS: Mapping[str, int] = {"LJ-X8000": 0x03, "LJ-V7000": 0x01}
+
+GET_ERROR, CLEAR_ERROR, DESCRIBE = 0x04, 0x05, 0x06
+TRIGGER, START_MEASURING, STOP_MEASURING, CLEAR_MEMORY, LASER = 0x21, 0x22, 0x23, 0x27, 0x2A
+SET_X_PITCH, GET_X_PITCH, CHANGE_PROGRAM = 0x36, 0x37, 0x39
+PREPARE_STREAM, STOP_STREAM, START_STREAM = 0x47, 0x48, 0xA0
+GET_COUNTS, GET_TEMPERATURE, GET_STATUS = 0x4B, 0x4C, 0x65
+
+REQUEST_HEAD = 16
+REPLY_HEAD = 28
+RETURN_CODE, PROGRAM = 17, 24  # places in a reply
+LARGEST_REPLY = 3 << 20  # (m)
+FROM_NEXT = 2  # argument of PREPARE_STREAM: begin with the next profile
+PROGRAMS = 16
+
+LENGTH = 1e-8  # m: unit of the Z unit, of X start and of the X pitch
+TEMPERATURE = 0.01  # degC
+
+RETURN_CODES: Mapping[int, str] = {  # (m)
+    0x80: "not possible in this mode",
+    0x81: "not possible while its settings are being written",
+    0xA0: "no connection for the stream",
+    0xA1: "the stream is running already, or was not prepared",
+    0xA3: "another start code was expected",
+    0xA4: "the profiles to be sent were deleted meanwhile",
+}
+
+
+def request(opcode: int, arguments: bytes = b"", *, generation: str = "LJ-X8000") -> bytes:
+    """Return the bytes of a request.
+
+    The one for the errors is published byte by byte:
+
+    >>> request(GET_ERROR).hex(" ")
+    '10 00 00 00 03 00 f0 00 00 00 00 00 04 00 00 00 04 00 00 00'
+    """
+    payload = bytes((opcode, 0, 0, 0)) + arguments
+    variant = bytes((GENERATIONS[generation], 0, 0xF0, 0))
+    return struct.pack("<I4sII", REQUEST_HEAD + len(payload) - 4, variant, 0, len(payload)) + payload
+
+
+def parse_request(frame: bytes) -> tuple[int, bytes, str]:
+    """Return opcode, arguments and generation of a request; ProtocolError where it is none."""
+    if len(frame) < REQUEST_HEAD + 4:
+        raise ProtocolError(f"A request has at least {REQUEST_HEAD + 4} bytes; found {frame.hex(' ')}")
+    length, variant, _, size = struct.unpack_from("<I4sII", frame)
+    names = [name for name, number in GENERATIONS.items() if variant == bytes((number, 0, 0xF0, 0))]
+    if not names or length + 4 != len(frame) or size != len(frame) - REQUEST_HEAD:
+        raise ProtocolError(f"This is no request: {frame[:32].hex(' ')}")
+    return frame[REQUEST_HEAD], frame[REQUEST_HEAD + 4 :], names[0]
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A reply: return code (0 = done), active program, data."""
+
+    code: int
+    program: int
+    data: bytes
+
+    def unpack(self, layout: str, place: int = 0) -> tuple[Any, ...]:
+        """Return what ``struct`` reads from the data; ProtocolError where they are too short."""
+        try:
+            return struct.unpack_from("<" + layout, self.data, place)
+        except struct.error:
+            raise ProtocolError(
+                f"Expected a reply with {place + struct.calcsize('<' + layout)} bytes of data; {len(self.data)} came"
+            ) from None
+
+
+def reply_length(head: bytes) -> int:
+    """Return the length of a reply from its first four bytes; ProtocolError where it cannot be."""
+    length: int = struct.unpack("<I", head)[0] + 4
+    if not REPLY_HEAD <= length <= LARGEST_REPLY:
+        raise ProtocolError(
+            f"A reply has {REPLY_HEAD} to {LARGEST_REPLY} bytes; found {length} (its first bytes are {head.hex(' ')})"
+        )
+    return length
+
+
+def parse_reply(frame: bytes) -> Reply:
+    """Return a reply taken apart; ProtocolError where its length is wrong."""
+    if len(frame) < REPLY_HEAD or reply_length(frame[:4]) != len(frame):
+        raise ProtocolError(f"This is no reply: {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")
+    return Reply(frame[RETURN_CODE], frame[PROGRAM], frame[REPLY_HEAD:])
+
+
+def reply(data: bytes = b"", *, code: int = 0, program: int = 0) -> bytes:
+    """Return the bytes of a reply."""
+    head = bytearray(REPLY_HEAD)
+    struct.pack_into("<I", head, 0, REPLY_HEAD + len(data) - 4)
+    head[RETURN_CODE], head[PROGRAM] = code, program
+    return bytes(head) + data
+
+
+def refusal(opcode: int, code: int) -> InstrumentError:
+    """Return the error for a return code."""
+    return InstrumentError(
+        f"The profiler refuses request {opcode:02X}: error {0x8000 + code:04X} ({RETURN_CODES.get(code, 'unknown')})"
+    )
+
+
+_UNITS, _UNIT_SIZE, _MODEL_SIZE, _SERIAL_SIZE = 16, 52, 32, 16  # places in the data of DESCRIBE
+
+
+def parse_description(reply: Reply) -> list[tuple[str, str]]:
+    """Return model and serial number of the controller and, where there is one, the head."""
+    count = min(reply.unpack("B")[0], 2)
+    fields = [reply.unpack(f"{_MODEL_SIZE}s{_SERIAL_SIZE}s", _UNITS + i * _UNIT_SIZE) for i in range(count)]
+    return [(_text(model), _text(serial)) for model, serial in fields]
+
+
+def description(units: list[tuple[str, str]]) -> bytes:
+    """Return the data of a reply to DESCRIBE."""
+    records = [
+        model.encode().ljust(_MODEL_SIZE, b"\0") + serial.encode().ljust(_SERIAL_SIZE, b"\0") for model, serial in units
+    ]
+    return bytes((len(units),)).ljust(_UNITS, b"\0") + b"".join(record.ljust(_UNIT_SIZE, b"\0") for record in records)
+
+
+def _text(field: bytes) -> str:
+    return field.partition(b"\0")[0].decode("ascii", errors="replace").strip()
+
+
+def parse_errors(reply: Reply) -> list[int]:
+    """Return the codes in a reply to GET_ERROR."""
+    count = reply.unpack("B")[0]
+    return list(reply.unpack(f"{count}H", 4)) if count else []
+
+
+# ------------------------------------------------------------------ the stream
+
+HEADER_WORDS = 6
+TRIGGER_WORD, ENCODER_WORD = 1, 2
+INTENSITY = 0x40  # bit of the kind
+HEIGHT_BITS, INTENSITY_BITS, WORD_BITS = 20, 10, 32
+SMALLEST_HEIGHT = -(1 << 19) + 4  # below lie the codes of points without height
+MOST_POINTS = 3200
+
+NOTIFY = 0xFFFFFFFF
+NOTIFY_WORDS = 2
+STOPPED = 0xFFFF  # bits of a notice that say the stream has ended
+
+# Why a point has no height. The place in this list is the code that the compiled functions use; the first four are the
+# raw values 0x80000 to 0x80003.
+REASONS: tuple[str, ...] = ("alarm", "invalid", "blind spot", "unprocessed", "lost", "garbled")
+SENTINELS = 4
+LOST, GARBLED = 4, 5
+
+
+@dataclass(frozen=True)
+class StreamLayout:
+    """What the profiles of a stream look like, as the reply to PREPARE_STREAM says.
+
+    Attributes
+    ----------
+    start_code : int
+        To be given back with START_STREAM.
+    kind : int
+        Bits; ``INTENSITY`` among them.
+    points : int
+    z_unit : float
+        Height of one step, m.
+    x_start, x_pitch : float
+        m.
+    """
+
+    start_code: int
+    kind: int
+    points: int
+    z_unit: float
+    x_start: float
+    x_pitch: float
+
+    @property
+    def with_intensity(self) -> bool:
+        """Whether the profiles bring intensities."""
+        return bool(self.kind & INTENSITY)
+
+    @property
+    def height_words(self) -> int:
+        """Words that the heights of a profile take."""
+        return -(-self.points * HEIGHT_BITS // WORD_BITS)
+
+    @property
+    def intensity_words(self) -> int:
+        """Words that the intensities of a profile take."""
+        return -(-self.points * INTENSITY_BITS // WORD_BITS) if self.with_intensity else 0
+
+    @property
+    def words(self) -> int:
+        """Words of a whole profile, header and checksum included."""
+        return HEADER_WORDS + self.height_words + self.intensity_words + 1
+
+    @property
+    def x(self) -> np.ndarray[Any, Any]:
+        """Where on the line the points are, m."""
+        return self.x_start + self.x_pitch * np.arange(self.points)
+
+
+_LAYOUT = "iIBBHHHii"  # from byte 32 of the reply on: start code, -, kind, -, -, points, Z unit, X start, X pitch
+
+
+def parse_layout(reply: Reply) -> StreamLayout:
+    """Return what a reply to PREPARE_STREAM says.
+
+    Raises
+    ------
+    ProtocolError
+        No points, more than there can be, or a unit of 0.
+    """
+    code, _, kind, _, _, points, z_unit, x_start, x_pitch = reply.unpack(_LAYOUT, 4)
+    if not 0 < points <= MOST_POINTS or z_unit == 0:
+        raise ProtocolError(
+            f"Expected profiles of 1 to {MOST_POINTS} points with a Z unit; the profiler announces {points} points "
+            f"and the unit {z_unit}"
+        )
+    return StreamLayout(code, kind, points, z_unit * LENGTH, x_start * LENGTH, x_pitch * LENGTH)
+
+
+def layout_data(layout: StreamLayout) -> bytes:
+    """Return the data of a reply to PREPARE_STREAM."""
+    lengths = (round(length / LENGTH) for length in (layout.z_unit, layout.x_start, layout.x_pitch))
+    return bytes(4) + struct.pack("<" + _LAYOUT, layout.start_code, 0, layout.kind, 0, 0, layout.points, *lengths)
+
+
+def notice(bits: int) -> bytes:
+    """Return a notify packet."""
+    return struct.pack("<II", NOTIFY, bits)

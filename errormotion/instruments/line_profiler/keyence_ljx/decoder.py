@@ -1,0 +1,180 @@
+"""A stream's decoder: keeps what a split left over, checks, follows the trigger count, fills gaps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.line_profiler.keyence_ljx import kernels
+from errormotion.instruments.line_profiler.keyence_ljx.codec import (
+    GARBLED,
+    LOST,
+    NOTIFY_WORDS,
+    REASONS,
+    STOPPED,
+    TRIGGER_WORD,
+    StreamLayout,
+    notice,
+)
+from errormotion.instruments.streaming import Chunk
+
+Array = np.ndarray[Any, Any]
+WORD = 4
+PATIENCE = 8
+"""Profiles' worth of bytes without a sound one among them after which the stream is given up."""
+
+
+class StreamEndedError(InstrumentError):
+    """The profiler says that it has ended the stream."""
+
+
+class StreamDecoder:
+    """Turns the bytes of one stream, however they are split, into profiles without gaps, still packed.
+
+    A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. Which it is:
+    lost where the trigger count leaps between sound profiles, garbled where damaged bytes lie between them. After
+    damaged bytes the next place is searched at which checksum and trigger count are right.
+    """
+
+    def __init__(self, layout: StreamLayout) -> None:
+        self._size = layout.words
+        self._rest = b""
+        self._trigger = -1  # count to be expected next; -1: any
+        self._searching = False
+        self.first_trigger = 0
+        self.stray_bytes = 0
+
+    def __call__(self, data: bytes) -> Chunk:
+        """Return the profiles that the next bytes complete; the chunk's ``end`` says why nothing follows.
+
+        Its ``end`` is a ProtocolError where no profile is found in many bytes, or the trigger count is no
+        continuation; a StreamEndedError where the profiler ends the stream.
+        """
+        self._rest += data
+        values: list[Array] = []
+        reasons: list[Array] = []
+        end: InstrumentError | None = None
+        while True:
+            if self._searching and not self._found():
+                if len(self._rest) > PATIENCE * self._size * WORD:
+                    end = ProtocolError(
+                        f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: did its "
+                        "settings change while it streams? Start the stream again"
+                    )
+                break
+            words = np.frombuffer(self._rest, dtype="<u4", count=len(self._rest) // WORD)
+            aheads = np.empty(words.size // self._size, dtype=np.int64)
+            n, why = kernels.follow(words, self._size, self._trigger, aheads)
+            if n:
+                self._take(words[: n * self._size].reshape(n, self._size), aheads[:n], values, reasons)
+                self._rest = self._rest[n * self._size * WORD :]
+            if why == kernels.DAMAGED:
+                self._searching = True
+            elif why == kernels.LEAP:
+                count = int(words[n * self._size + TRIGGER_WORD])
+                end = ProtocolError(
+                    f"The trigger count goes from {self._trigger - 1} to {count}: was it reset, or the profiler "
+                    "restarted? Start the stream again"
+                )
+            if why == kernels.NOTICE:
+                if len(self._rest) < NOTIFY_WORDS * WORD:
+                    break
+                end = self._notice()
+            if end is not None or why == kernels.MORE:
+                break
+        return self._chunk(values, reasons, end)
+
+    def _found(self) -> bool:
+        """Go on to the next sound profile; False where there is none yet."""
+        places = []
+        for shift in range(WORD):
+            rest = self._rest[shift:]
+            words = np.frombuffer(rest, dtype="<u4", count=len(rest) // WORD)
+            place = kernels.search(words, self._size, self._trigger)
+            if place >= 0:
+                places.append(place * WORD + shift)
+        if not places:
+            return False
+        self.stray_bytes += min(places)
+        self._rest = self._rest[min(places) :]
+        return True
+
+    def _take(self, profiles: Array, aheads: Array, values: list[Array], reasons: list[Array]) -> None:
+        if self._trigger < 0:
+            self.first_trigger = int(profiles[0, TRIGGER_WORD])
+        self._trigger = (int(profiles[-1, TRIGGER_WORD]) + 1) & 0xFFFFFFFF
+        why = GARBLED if self._searching else LOST
+        self._searching = False
+        if not aheads.any():
+            values.append(profiles)
+            reasons.append(np.zeros(len(profiles), dtype=np.uint8))
+            return
+        places = np.arange(len(profiles)) + np.cumsum(aheads)
+        filled = np.zeros((places[-1] + 1, self._size), dtype=np.uint32)
+        filled[places] = profiles
+        missing = np.full(len(filled), LOST, dtype=np.uint8)
+        missing[: places[0]] = why
+        missing[places] = 0
+        values.append(filled)
+        reasons.append(missing)
+
+    def _notice(self) -> StreamEndedError | None:
+        bits = int.from_bytes(self._rest[WORD : NOTIFY_WORDS * WORD], "little")
+        self._rest = self._rest[NOTIFY_WORDS * WORD :]
+        if bits & STOPPED:
+            return StreamEndedError(f"the profiler has ended the stream (notice {bits:08X})")
+        return None
+
+    def _chunk(self, values: list[Array], reasons: list[Array], end: InstrumentError | None) -> Chunk:
+        if len(values) == 1:
+            return Chunk(values[0], reasons[0], end=end)
+        if not values:
+            return Chunk(np.empty((0, self._size), dtype=np.uint32), np.empty(0, dtype=np.uint8), end=end)
+        return Chunk(np.concatenate(values), np.concatenate(reasons), end=end)
+
+
+class HeightDecoder:
+    """Unpacks profiles: heights, intensities, counts."""
+
+    def __init__(self, layout: StreamLayout) -> None:
+        self._layout = layout
+        self._encoder: int | None = None  # the last one, its overflow undone
+
+    def heights(self, profiles: Array, reasons: Array, heights: Array, counts: Array) -> None:
+        """Unpack the heights (m) of profiles into (n, point); ``counts`` by `codec.REASONS` grow."""
+        kernels.unpack_heights(profiles, self._layout.z_unit, reasons, heights, counts)
+
+    def intensities(self, profiles: Array, reasons: Array, intensities: Array) -> None:
+        """Unpack the intensities of profiles into (n, point)."""
+        first = self._layout.words - 1 - self._layout.intensity_words
+        kernels.unpack_intensities(profiles, first, reasons, intensities)
+
+    def encoder(self, readings: Array, reasons: Array) -> Array:
+        """Return encoder counts of the next profiles (n,), float64, with the overflow of their 32 bits undone.
+
+        NaN where the profile was lost. Between two profiles that came, the encoder must have moved by less than half
+        of its 2**32.
+        """
+        there = reasons == 0
+        counts = np.full(len(reasons), np.nan)
+        raw = readings[there].astype(np.uint32).view(np.int32).astype(np.int64)
+        if raw.size:
+            last = int(raw[0]) if self._encoder is None else self._encoder
+            steps = (np.diff(raw, prepend=last) + (1 << 31)) % (1 << 32) - (1 << 31)
+            counts[there] = last + np.cumsum(steps)
+            self._encoder = int(last + steps.sum())
+        return counts
+
+    def warm_up(self) -> None:
+        """Compile everything now, so that the first profiles find it ready."""
+        blank = bytes(4 * self._layout.words)  # its checksum is right
+        trial = StreamDecoder(self._layout)
+        chunk = trial(blank + notice(STOPPED))
+        trial._searching = True
+        trial(blank)
+        heights = np.empty((len(chunk.values), self._layout.points))
+        self.heights(chunk.values, chunk.reasons, heights, np.zeros(len(REASONS), dtype=np.int64))
+        if self._layout.with_intensity:
+            self.intensities(chunk.values, chunk.reasons, heights.astype(np.uint16))

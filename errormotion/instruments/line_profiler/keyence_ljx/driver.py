@@ -1,0 +1,314 @@
+"""Driver of one LJ-X8000A."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.line_profiler.keyence_ljx import codec
+from errormotion.instruments.line_profiler.keyence_ljx.codec import (
+    ENCODER_WORD,
+    LENGTH,
+    LOST,
+    REASONS,
+    STREAM_PORT,
+    TEMPERATURE,
+    Reply,
+    StreamLayout,
+)
+from errormotion.instruments.line_profiler.keyence_ljx.settings import LJXSettings
+from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.transports import Transport
+from errormotion.plugins import Identity, InstrumentInfo
+
+if TYPE_CHECKING:
+    from errormotion.instruments.streaming import Reader
+    from errormotion.instruments.transports.lines import ManyLines
+
+STREAM = "stream"
+BLOCK_SECONDS = 0.1
+QUEUE_SECONDS = 0.5
+SMALLEST_QUEUE = 64
+AT_ONCE = 64
+"""Profiles unpacked at once: their packed form stays in the processor's cache."""
+QUIET = 0.3
+"""Seconds of silence after which a stopped stream is over, where no notice says so."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Triggers and encoder pulses that a profiler has counted; the encoder's count overflows at 32 bits."""
+
+    trigger: int
+    encoder: int
+
+
+class KeyenceLJX(Driver):
+    """A Keyence LJ-X8000A line profiler over Ethernet: one connection for commands, one for the stream.
+
+    Heights and places on the line are in m; heights are NaN where the profiler has none.
+
+    Parameters
+    ----------
+    address : str
+        ``tcp://192.168.0.1:24691?stream=24692``, ``sim://cframe/profiler?seed=3``, ``replay://file``.
+    settings : LJXSettings, optional
+    record : Path, optional
+        List of the recordings of both connections.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="keyence_ljx",
+        kind="line_profiler",
+        summary="Keyence LJ-X8000A laser line profiler, Ethernet, commands and high-speed stream",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.keyence_ljx:SimulatedLJX",
+    )
+    Settings: ClassVar[type[LJXSettings]] = LJXSettings
+    settings: LJXSettings
+    name = "keyence_ljx"
+    _reader: Reader | None = None
+    _lost: InstrumentError | None = None
+
+    @property
+    def rate(self) -> float:
+        """Profiles per second, as set."""
+        return self.settings.rate
+
+    # ------------------------------------------------------------------ commands
+
+    def identify(self) -> Identity:
+        """Ask the controller for the models and serial numbers of itself and its head."""
+        units = codec.parse_description(self.command(codec.DESCRIBE))
+        if not units:
+            raise InstrumentError(f"The controller at {self.address} names no unit, not even itself")
+        model, serial = zip(*units, strict=True)
+        return Identity(
+            manufacturer="Keyence",
+            model=" with head ".join(model),
+            serial_number=", head ".join(serial),
+            simulated=self.transport.simulated,
+            details={"address": self.address},
+        )
+
+    def configure(self, settings: LJXSettings) -> None:
+        """Change program and X pitch, where the settings name them.
+
+        Raises
+        ------
+        InstrumentError
+            The profiler refuses; it is streaming.
+        """
+        self._refuse_while_streaming()
+        if settings.program is not None:
+            self.change_program(settings.program)
+        if settings.x_pitch is not None:
+            self.set_x_pitch(settings.x_pitch)
+        self.settings = settings
+
+    def program(self) -> int:
+        """Ask for the active program."""
+        return self.command(codec.GET_STATUS).program
+
+    def change_program(self, number: int) -> None:
+        """Make another program the active one."""
+        self._refuse_while_streaming()
+        if not 0 <= number < codec.PROGRAMS:
+            raise InstrumentError(f"The programs have the numbers 0 to {codec.PROGRAMS - 1}; found {number}")
+        self.command(codec.CHANGE_PROGRAM, bytes((number, 0, 0, 0)))
+        if (active := self.program()) != number:
+            raise InstrumentError(f"Program {number} was asked for, but {active} is active")
+
+    def x_pitch(self) -> float:
+        """Ask for the distance of the points on the line, m."""
+        return float(self.command(codec.GET_X_PITCH).unpack("I")[0] * LENGTH)
+
+    def set_x_pitch(self, pitch: float) -> None:
+        """Set the distance of the points on the line, m, to the next 0.01 um."""
+        self._refuse_while_streaming()
+        self.command(codec.SET_X_PITCH, struct.pack("<I", round(pitch / LENGTH)))
+
+    def counts(self) -> Counts:
+        """Ask for the trigger and encoder counts; works while profiles are streaming."""
+        return Counts(*self.command(codec.GET_COUNTS).unpack("Ii"))
+
+    def temperature(self) -> dict[str, float]:
+        """Ask for the head's temperatures, degC: its sensor, processor and case."""
+        values = self.command(codec.GET_TEMPERATURE).unpack("3h")
+        return {name: value * TEMPERATURE for name, value in zip(("sensor", "processor", "case"), values, strict=True)}
+
+    def errors(self) -> list[int]:
+        """Ask for the codes of the errors that it shows."""
+        return codec.parse_errors(self.command(codec.GET_ERROR))
+
+    def clear_error(self, code: int) -> None:
+        """Clear one error."""
+        self.command(codec.CLEAR_ERROR, struct.pack("<HH", code, 0))
+
+    def trigger(self) -> None:
+        """Take one profile, where the program waits for triggers from outside."""
+        self.command(codec.TRIGGER)
+
+    def command(self, opcode: int, arguments: bytes = b"") -> Reply:
+        """Send a request and return the reply; works while profiles are streaming.
+
+        Raises
+        ------
+        InstrumentError
+            The profiler refuses; an earlier reply went wrong, so that this one could be its.
+        InstrumentTimeoutError
+            It does not answer.
+        ProtocolError
+            What came is no reply.
+        """
+        transport = self.transport
+        if self._lost is not None:
+            raise InstrumentError(f"{self.name} is lost ({self._lost}); close and open it again")
+        try:
+            transport.write(codec.request(opcode, arguments, generation=self.settings.generation))
+            head = transport.read_exactly(4, self.settings.timeout)
+            rest = transport.read_exactly(codec.reply_length(head) - len(head), self.settings.timeout)
+            reply = codec.parse_reply(head + rest)
+        except InstrumentError as error:
+            self._lost = error
+            raise
+        if reply.code:
+            raise codec.refusal(opcode, reply.code)
+        return reply
+
+    # ------------------------------------------------------------------ measuring
+
+    def read(self) -> np.ndarray[Any, Any]:
+        """Return the heights of one profile, m, (point,); NaN where there is none."""
+        for profiles in self.stream(block=1):
+            return np.asarray(profiles.heights[0])
+        raise InstrumentError(f"{self.name}: the stream ended before its first profile")
+
+    def stream(self, block: int | None = None) -> Iterator[Profiles]:
+        """Yield blocks of profiles until the caller stops; leaving the loop stops the stream.
+
+        Parameters
+        ----------
+        block : int, optional
+            Profiles in a block; default: a tenth of a second.
+
+        Yields
+        ------
+        Profiles
+            ``values`` (point, block) in m. Profiles that the trigger count shows missing are NaN and counted.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Silence.
+        ProtocolError
+            No profile can be found in what comes, or the trigger count makes no sense.
+        InstrumentError
+            The profiler ends the stream.
+        """
+        from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder, StreamDecoder
+        from errormotion.instruments.streaming import Reader
+
+        self._refuse_while_streaming()
+        size = block or max(1, round(BLOCK_SECONDS * self.rate))
+        layout = codec.parse_layout(self.command(codec.PREPARE_STREAM, bytes((codec.FROM_NEXT, 0, 0, 0))))
+        unpack = HeightDecoder(layout)
+        unpack.warm_up()
+        follow = StreamDecoder(layout)
+        limit = max(SMALLEST_QUEUE, 2 * size, round(QUEUE_SECONDS * self.rate))
+        lines: ManyLines = self.transport  # type: ignore[assignment]
+        self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)
+        try:
+            self.command(codec.START_STREAM, struct.pack("<Ii", codec.PREPARE_STREAM, layout.start_code))
+            first = 0
+            while True:
+                if self._reader is not reader:
+                    raise InstrumentError(f"{self.name}: this stream is over, it was closed; begin another one")
+                parts = self._block(reader, unpack, layout, size)
+                yield Profiles(
+                    first=first,
+                    rate=self.rate,
+                    host_time=reader.host_time,
+                    x=layout.x,
+                    trigger=follow.first_trigger + first + np.arange(size),
+                    **parts,
+                )
+                first += size
+        finally:
+            self._stop()
+
+    def _block(self, reader: Reader, unpack: Any, layout: StreamLayout, size: int) -> dict[str, Any]:
+        heights = np.empty((size, layout.points))
+        intensity = np.empty((size, layout.points), dtype=np.uint16) if layout.with_intensity else None
+        encoder = np.empty(size)
+        counts = np.zeros(len(REASONS), dtype=np.int64)
+        packed = np.empty((min(size, AT_ONCE), layout.words), dtype=np.uint32)
+        reasons = np.empty(len(packed), dtype=np.uint8)
+        for start in range(0, size, AT_ONCE):
+            part = slice(start, min(start + AT_ONCE, size))
+            n = part.stop - part.start
+            reader.fill(packed[:n], reasons[:n], self.settings.timeout)
+            unpack.heights(packed[:n], reasons[:n], heights[part], counts)
+            encoder[part] = unpack.encoder(packed[:n, ENCODER_WORD], reasons[:n])
+            if intensity is not None:
+                unpack.intensities(packed[:n], reasons[:n], intensity[part])
+        return {
+            "values": heights.T,
+            "intensity": intensity,
+            "encoder": encoder,
+            "dropped": int(counts[LOST]) // layout.points,
+            "invalid": {name: int(count) for name, count in zip(REASONS, counts, strict=True) if count},
+        }
+
+    def _stop(self) -> None:
+        """Stop the stream and its thread; a profiler that does not confirm it has to be opened again."""
+        from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamEndedError
+
+        reader, self._reader = self._reader, None
+        if reader is None:
+            return
+        reader.drain()
+        try:
+            self.command(codec.STOP_STREAM)
+            ended = reader.finish(QUIET, self.settings.timeout)
+            if ended is not None and not isinstance(ended, StreamEndedError):
+                self._lost = ended
+        except InstrumentError as error:
+            self._lost = error
+        finally:
+            reader.abandon()
+
+    # ------------------------------------------------------------------ opening and closing
+
+    def _connect(self) -> Transport:
+        from errormotion.instruments.transports.lines import open_lines
+
+        return open_lines(
+            self.address,
+            {STREAM: STREAM_PORT},
+            simulator=self.info.simulator,
+            record=self._record,
+            timeout=self.settings.timeout,
+        )
+
+    def _begin(self) -> None:
+        self._lost = None
+        try:
+            self.command(codec.STOP_STREAM)  # somebody may have left it streaming
+        except InstrumentError:
+            if self._lost is not None:  # else it only says that there was nothing to stop
+                raise
+        self.configure(self.settings)
+
+    def _end(self) -> None:
+        self._stop()
+
+    def _refuse_while_streaming(self) -> None:
+        if self._reader is not None:
+            raise InstrumentError(f"{self.name} is streaming; leave the stream first")

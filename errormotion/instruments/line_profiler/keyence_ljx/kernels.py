@@ -1,0 +1,216 @@
+"""Compiled loops of the codec: finding profiles in a stream of words, unpacking and packing them, without the GIL."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from errormotion.instruments.line_profiler.keyence_ljx.codec import (
+    HEADER_WORDS,
+    NOTIFY,
+    SENTINELS,
+    SMALLEST_HEIGHT,
+    TRIGGER_WORD,
+)
+
+Array = np.ndarray[Any, Any]
+
+LOWEST = SMALLEST_HEIGHT - SENTINELS
+LARGEST_GAP = 1 << 16
+"""Profiles: a trigger count that leaps further did not come from lost profiles."""
+
+MORE, NOTICE, DAMAGED, LEAP = range(4)  # why `follow` stops
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def _sum(words: Array, first: int, n: int) -> np.uint32:
+    total = np.uint32(0)
+    for i in range(first, first + n):
+        total = np.uint32(total + words[i])
+    return total
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, int]:
+    """Follow profiles that lie behind one another.
+
+    Parameters
+    ----------
+    words : ndarray, uint32
+        Begin with a profile or a notify packet.
+    size : int
+        Words of a profile.
+    trigger : int
+        Trigger count to be expected of the first; negative: any.
+    aheads : ndarray, int64
+        Receives, for each profile, how many are missing before it; room for ``words.size // size``.
+
+    Returns
+    -------
+    n : int
+        Profiles found.
+    why : int
+        MORE: there are too few words; NOTICE: a notify packet comes; DAMAGED: what comes has a wrong checksum; LEAP:
+        its trigger count is no continuation.
+    """
+    n = first = 0
+    while first < words.size:
+        if words[first] == NOTIFY:
+            return n, NOTICE
+        if first + size > words.size:
+            break
+        if _sum(words, first, size - 1) != words[first + size - 1]:
+            return n, DAMAGED
+        count = np.int64(words[first + TRIGGER_WORD])
+        ahead = (count - trigger) & 0xFFFFFFFF if trigger >= 0 else 0
+        if ahead > LARGEST_GAP:
+            return n, LEAP
+        aheads[n] = ahead
+        trigger = (count + 1) & 0xFFFFFFFF
+        n += 1
+        first += size
+    return n, MORE
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def search(words: Array, size: int, trigger: int) -> int:
+    """Return where in words the next profile with a right checksum and a fitting trigger count begins; -1: nowhere."""
+    if words.size < size:
+        return -1
+    total = _sum(words, 0, size - 1)
+    for first in range(words.size - size + 1):
+        if total == words[first + size - 1] and words[first] != NOTIFY:
+            count = np.int64(words[first + TRIGGER_WORD])
+            if trigger < 0 or (count - trigger) & 0xFFFFFFFF <= LARGEST_GAP:
+                return first
+        total = np.uint32(total + words[first + size - 1] - words[first])
+    return -1
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def unpack_heights(profiles: Array, unit: float, reasons: Array, heights: Array, counts: Array) -> None:
+    """Unpack heights: 20 bits each, two's complement, from the least significant bit on.
+
+    Parameters
+    ----------
+    profiles : ndarray, uint32, (n, words)
+        Whole profiles.
+    unit : float
+        Height of one step.
+    reasons : ndarray, uint8, (n,)
+        Not 0 where there is no profile.
+    heights : ndarray, float64, (n, point)
+        Receives the heights; NaN where there is none.
+    counts : ndarray, int64, (len(REASONS),)
+        Counts why not, on top of what it holds.
+    """
+    n, points = heights.shape
+    for row in range(n):
+        if reasons[row]:
+            heights[row] = np.nan
+            counts[reasons[row]] += points
+            continue
+        words, out = profiles[row, HEADER_WORDS:], heights[row]
+        lowest = np.int32(0)
+        for group in range(points // 8):
+            k, i = 5 * group, 8 * group
+            a, b, c, d, e = words[k], words[k + 1], words[k + 2], words[k + 3], words[k + 4]
+            # Each value is shifted to the top of 32 bits and back, which repeats its sign.
+            v0 = np.int32(a << np.uint32(12)) >> 12
+            v1 = np.int32((b << np.uint32(24)) | ((a >> np.uint32(20)) << np.uint32(12))) >> 12
+            v2 = np.int32(b << np.uint32(4)) >> 12
+            v3 = np.int32((c << np.uint32(16)) | ((b >> np.uint32(28)) << np.uint32(12))) >> 12
+            v4 = np.int32((d << np.uint32(28)) | ((c >> np.uint32(16)) << np.uint32(12))) >> 12
+            v5 = np.int32(d << np.uint32(8)) >> 12
+            v6 = np.int32((e << np.uint32(20)) | ((d >> np.uint32(24)) << np.uint32(12))) >> 12
+            v7 = np.int32(e) >> 12
+            out[i], out[i + 1], out[i + 2], out[i + 3] = v0 * unit, v1 * unit, v2 * unit, v3 * unit
+            out[i + 4], out[i + 5], out[i + 6], out[i + 7] = v4 * unit, v5 * unit, v6 * unit, v7 * unit
+            lowest = min(lowest, v0, v1, v2, v3, v4, v5, v6, v7)
+        for i in range(points // 8 * 8, points):
+            value = _field(words, 20 * i, 20)
+            value = (value ^ 0x80000) - 0x80000
+            out[i] = value * unit
+            lowest = min(lowest, np.int32(value))
+        if lowest < SMALLEST_HEIGHT:
+            for i in range(points):
+                value = np.int64(np.rint(out[i] / unit))
+                if value < SMALLEST_HEIGHT:
+                    out[i] = np.nan
+                    counts[value - LOWEST] += 1
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def _field(words: Array, bit: int, width: int) -> Any:
+    place, shift = bit // 32, bit % 32
+    value = np.int64(words[place]) >> shift
+    if shift + width > 32:
+        value |= np.int64(words[place + 1]) << (32 - shift)
+    return value & ((1 << width) - 1)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def unpack_intensities(profiles: Array, first: int, reasons: Array, intensities: Array) -> None:
+    """Unpack intensities: two in 20 bits, the first of them in the upper half.
+
+    Parameters
+    ----------
+    profiles : ndarray, uint32, (n, words)
+    first : int
+        Word at which they begin.
+    reasons : ndarray, uint8, (n,)
+        Not 0 where there is no profile.
+    intensities : ndarray, uint16, (n, point)
+        Receives them; 0 where there is no profile.
+    """
+    n, points = intensities.shape
+    for row in range(n):
+        if reasons[row]:
+            intensities[row] = 0
+            continue
+        words = profiles[row, first:]
+        for i in range(points):
+            intensities[row, i] = _field(words, _intensity_bit(i, points), 10)
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def _intensity_bit(i: int, points: int) -> int:
+    if i % 2 == 1:
+        return 10 * (i - 1)
+    return 10 * (i + 1) if i + 1 < points else 10 * i
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def _put(words: Array, bit: int, value: int) -> None:
+    place, shift = bit // 32, bit % 32
+    shifted = np.uint64(value) << np.uint64(shift)
+    words[place] |= np.uint32(shifted & np.uint64(0xFFFFFFFF))
+    if shifted >> np.uint64(32):
+        words[place + 1] |= np.uint32(shifted >> np.uint64(32))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def pack(raws: Array, intensities: Array, trigger: int, encoder: int, words: Array) -> None:
+    """Write one profile.
+
+    Parameters
+    ----------
+    raws : ndarray, int32, (point,)
+        Heights in steps; the codes of points without height lie below ``SMALLEST_HEIGHT``.
+    intensities : ndarray, uint16, (point,) or (0,)
+    trigger, encoder : int
+        Counts; their lower 32 bits are written.
+    words : ndarray, uint32
+        Receives the profile.
+    """
+    words[:] = 0
+    words[TRIGGER_WORD] = np.uint32(trigger & 0xFFFFFFFF)
+    words[TRIGGER_WORD + 1] = np.uint32(encoder & 0xFFFFFFFF)
+    for i in range(raws.size):
+        _put(words[HEADER_WORDS:], 20 * i, raws[i] & 0xFFFFF)
+    first = HEADER_WORDS + (20 * raws.size + 31) // 32
+    for i in range(intensities.size):
+        _put(words[first:], _intensity_bit(i, intensities.size), intensities[i] & 0x3FF)
+    words[-1] = _sum(words, 0, words.size - 1)
