@@ -3,7 +3,7 @@
 ``open_transport(url)`` returns a `Transport`:
 
 * ``serial:///dev/ttyUSB0?baudrate=921600`` a serial line, 8N1
-* ``tcp://host:port`` a TCP connection
+* ``tcp://host:port`` a TCP connection; `transports.lines` opens several to one device
 * ``sim://machine/device?seed=3`` a simulated device, behind a real TCP connection or pty of its own
 * ``replay://session.rec`` a recorded session, played back strictly
 """
