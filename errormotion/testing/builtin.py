@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import math
+import shutil
+import tempfile
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +15,7 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.plugins import Group
-from errormotion.testing.subjects import MethodSubject
+from errormotion.testing.subjects import InstrumentSubject, MethodSubject
 from errormotion.twin import Event, VirtualMachine
 
 #: 100 minutes at 15000 /min, one instant every 250 s: enough for the thermal drift to build up.
@@ -21,11 +25,31 @@ SCHEDULE = (Event(0.0, 15000.0, None),)
 BEAM_SIGMA = np.array([0.5e-6] * 3 + [0.4e-3] * 3)
 
 
-def builtin_subjects(group: Group, plugin_id: str, cls: Any) -> tuple[MethodSubject, ...]:
+def builtin_subjects(
+    group: Group, plugin_id: str, cls: Any
+) -> tuple[MethodSubject, ...] | tuple[InstrumentSubject, ...]:
     """Return the subjects of a built-in plugin; none where the kit needs no help, or knows none."""
     if (group, plugin_id) == ("methods", "spindle_drift"):
         return spindle_drift(cls)
+    if (group, plugin_id) == ("instruments", "profile_files"):
+        return (InstrumentSubject(cls, str(scan_file())),)
     return ()
+
+
+@cache
+def scan_file() -> Path:
+    """Return a scan of 350 profiles as a file that lasts as long as this process; three heights are unknown."""
+    folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    x, y = 12.5e-6 * np.arange(60), 25e-6 * np.arange(350)
+    heights = 1e-3 * np.sin(np.add.outer(700.0 * y, 5000.0 * x))
+    heights[10:13, 7] = np.nan
+    scan = xr.Dataset(
+        {"height": (("profile", "point"), heights, {"units": "m"})},
+        {"x": ("point", x, {"units": "m"}), "y": ("profile", y, {"units": "m"})},
+    )
+    scan.to_netcdf(folder / "scan.nc", engine="h5netcdf")
+    return folder / "scan.nc"
 
 
 def spindle_drift(cls: Any) -> tuple[MethodSubject, ...]:

@@ -28,12 +28,15 @@ class Profiles(Samples):
         The device's count of encoder pulses, its overflow undone; NaN where the profile was lost.
     intensity : ndarray, uint16, (n, point), or None
         Brightness of the points, 0 to 1023, where the device sends it; 0 where the profile was lost.
+    y : ndarray, float64, (n,), or None
+        Where along the feed the profiles lie, m, where that is known.
     """
 
     x: Array
     trigger: Array
     encoder: Array
     intensity: Array | None = None
+    y: Array | None = None
 
     @property
     def heights(self) -> Array:

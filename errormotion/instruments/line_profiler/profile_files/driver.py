@@ -1,0 +1,174 @@
+"""Scans in files, as if a profiler took them now."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Iterator
+from glob import glob
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, ReplayError
+from errormotion.instruments.line_profiler.profile_files.readers import READERS, Scan, read_scan
+from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
+from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.plugins import Identity, InstrumentInfo
+
+FORMAT = "errormotion-scans/1"
+BLOCK = 100
+
+
+class ProfileFiles:
+    """Scans that exist already, each a file: PLY, PCD, XYZ (with Open3D), CSV height maps, NetCDF.
+
+    Parameters
+    ----------
+    address : str
+        A file, or a pattern such as ``scans/*.ply``, whose files come in the order of their names. ``replay://file``
+        is a recording: a list of files with their hashes, all of which must still be the same.
+    settings : ProfileFileSettings, optional
+    record : Path, optional
+        List that is written.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="profile_files",
+        kind="line_profiler",
+        summary="Scans in files: PLY, PCD, XYZ point clouds, CSV height maps, NetCDF",
+        status="simulated_only",
+    )
+    Settings: ClassVar[type[ProfileFileSettings]] = ProfileFileSettings
+
+    def __init__(
+        self, address: str, settings: ProfileFileSettings | None = None, *, record: Path | None = None
+    ) -> None:
+        self.address = address
+        self.settings = ProfileFileSettings() if settings is None else settings
+        self._record = record
+        self._files: dict[Path, str] | None = None  # with their hashes
+
+    @property
+    def rate(self) -> float:
+        """Profiles per second, as set."""
+        return self.settings.rate
+
+    def open(self) -> None:
+        """Find the files and read their hashes; idempotent.
+
+        Raises
+        ------
+        InstrumentError
+            No such file, or of an unknown kind; a file of a recording has changed.
+        """
+        if self._files is not None:
+            return
+        scheme, mark, rest = self.address.rpartition("://")
+        if scheme == "replay":
+            self._files = _read_list(Path(rest))
+            return
+        if mark and scheme != "file":
+            raise InstrumentError(f"Expected a file or a pattern such as scans/*.ply; found '{self.address}'")
+        paths = [Path(rest)] if Path(rest).is_file() else [Path(name) for name in sorted(glob(rest))]
+        if not paths:
+            raise InstrumentError(f"There is no file '{rest}'; expected scans of {', '.join(sorted(READERS))}")
+        files = {path: _hash(path) for path in paths}
+        if self._record is not None:
+            _write_list(self._record, files)
+        self._files = files
+
+    def close(self) -> None:
+        """Forget the files; idempotent."""
+        self._files = None
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def identify(self) -> Identity:
+        """Tell the files by their kind and hash."""
+        files = self._opened()
+        together = hashlib.sha256("".join(files.values()).encode()).hexdigest()
+        return Identity(
+            manufacturer="files",
+            model=", ".join(sorted({path.suffix.lower().lstrip(".") for path in files})),
+            serial_number=(together if len(files) > 1 else next(iter(files.values())))[:16],
+            details={"address": self.address, "files": {path.name: digest for path, digest in files.items()}},
+        )
+
+    def scans(self) -> Iterator[Scan]:
+        """Yield the scans as height maps, in the order of their files' names; InstrumentError where one is wrong."""
+        for path in self._opened():
+            yield read_scan(path, self.settings)
+
+    def read(self) -> np.ndarray[Any, Any]:
+        """Return the heights of the first profile, m, (point,); NaN where there is none."""
+        return np.asarray(next(self.scans()).heights[0])
+
+    def stream(self, block: int | None = None) -> Iterator[Profiles]:
+        """Yield the profiles of all scans in blocks of at most ``block`` (100); a block holds profiles of one scan."""
+        first, size = 0, block or BLOCK
+        for scan in self.scans():
+            for start in range(0, len(scan.y), size):
+                heights, y = scan.heights[start : start + size], scan.y[start : start + size]
+                unknown = int(np.isnan(heights).sum())
+                yield Profiles(
+                    values=heights.T,
+                    first=first,
+                    rate=self.rate,
+                    host_time=time.monotonic(),
+                    invalid={"no value": unknown} if unknown else {},
+                    x=scan.x,
+                    y=y,
+                    trigger=first + np.arange(len(y)),
+                    encoder=np.full(len(y), np.nan),
+                )
+                first += len(y)
+
+    def _opened(self) -> dict[Path, str]:
+        if self._files is None:
+            raise InstrumentError(
+                f"The profile_files at {self.address} are not open: use it in a 'with' block, or call open() first"
+            )
+        return self._files
+
+
+def _hash(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def _write_list(path: Path, files: dict[Path, str]) -> None:
+    lines = [FORMAT, *(f"{digest} {os.path.relpath(file, path.parent)}" for file, digest in files.items())]
+    try:
+        with path.open("x", encoding="utf-8") as out:
+            out.write("\n".join(lines) + "\n")
+    except OSError as error:
+        raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+
+
+def _read_list(path: Path) -> dict[Path, str]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReplayError(f"The recording {path} cannot be read: {error}") from None
+    pairs = [line.partition(" ") for line in lines[1:]]
+    if not pairs or lines[0] != FORMAT or not all(name for _, _, name in pairs):
+        raise ReplayError(f"{path} is no list of scans: expected a first line '{FORMAT}' and at least one file")
+    files = {path.parent / name: digest for digest, _, name in pairs}
+    for file, digest in files.items():
+        if _hash(file) != digest:
+            raise ReplayError(f"{file} has changed since it was recorded in {path}")
+    return files

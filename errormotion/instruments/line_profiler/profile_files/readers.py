@@ -1,0 +1,260 @@
+"""Files of scans to height maps in m: point clouds (PLY, PCD, XYZ) through Open3D, CSV, NetCDF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from errormotion.datasets.units import convert
+from errormotion.errors import DatasetError, InstrumentError
+from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
+
+Array = np.ndarray[Any, Any]
+
+LARGEST_HEIGHT = 0.5  # m; a larger one is a mistaken unit
+FULL = 0.25
+"""Share of the cells of a height map that a point cloud must fill to be one."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A height map.
+
+    Attributes
+    ----------
+    path : Path
+        Where it came from.
+    heights : ndarray, float64, (n, point)
+        m; NaN where there is none.
+    x : ndarray, float64, (point,)
+        Where on the line the points are, m.
+    y : ndarray, float64, (n,)
+        Where along the feed the profiles are, m; increasing or decreasing.
+    """
+
+    path: Path
+    heights: Array
+    x: Array
+    y: Array
+
+
+def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
+    """Return the scan in a file.
+
+    Raises
+    ------
+    InstrumentError
+        Unknown kind of file, not readable, cut off, no unit, no height map, heights of more than half a metre, profiles
+        that lie not one behind the other.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in READERS:
+        raise InstrumentError(f"{path}: expected a file of one of {', '.join(sorted(READERS))}")
+    if not path.is_file():
+        raise InstrumentError(f"{path}: there is no such file")
+    heights, x, y = READERS[suffix](path, settings)
+    if not np.isfinite(heights).any():
+        raise InstrumentError(f"{path}: not a single height in it; is it the whole file?")
+    highest = float(np.nanmax(np.abs(heights)))
+    if highest > LARGEST_HEIGHT:
+        raise InstrumentError(f"{path}: a height of {highest:.4g} m; is its unit really '{settings.unit or 'm'}'?")
+    for name, places in (("y", y), ("x", x)):
+        steps = np.diff(places)
+        if not (np.isfinite(places).all() and ((steps > 0).all() or (steps < 0).all())):
+            raise InstrumentError(
+                f"{path}: {name} does not go one way only: expected one profile behind the other, and each point "
+                "beside the last; cut the file where the feed turns"
+            )
+    return Scan(path, np.ascontiguousarray(heights), x, y)
+
+
+def _unit(path: Path, settings: ProfileFileSettings) -> str:
+    if settings.unit is None:
+        raise InstrumentError(f"{path} does not name the unit of its lengths: give 'unit', one of m, mm, um, inch")
+    return settings.unit
+
+
+def _cleared(values: Array, settings: ProfileFileSettings) -> Array:
+    return values if settings.no_value is None else np.where(values == settings.no_value, np.nan, values)
+
+
+def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
+    """Read rows of heights, a profile each; an empty cell is no height. Lines that begin with # are passed over."""
+    unit = _unit(path, settings)
+    if settings.x_pitch is None or settings.y_pitch is None:
+        raise InstrumentError(
+            f"{path} has heights only: give 'x_pitch' and 'y_pitch', the distances of its columns and rows"
+        )
+    rows: list[list[float]] = []
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            for number, line in enumerate(file, 1):
+                text = line.strip("\r\n")
+                if not text.strip() or text.startswith("#"):
+                    continue
+                row = [float(cell) if cell.strip() else np.nan for cell in text.split(settings.delimiter)]
+                if rows and len(row) != len(rows[0]):
+                    raise InstrumentError(
+                        f"{path}, line {number}: expected {len(rows[0])} cells as in the lines before; found {len(row)}"
+                    )
+                rows.append(row)
+    except ValueError as error:
+        raise InstrumentError(f"{path}, line {len(rows) + 1} of heights: {error}") from None
+    except OSError as error:
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+    if not rows:
+        raise InstrumentError(f"{path}: no heights in it")
+    heights = _in_metres(_cleared(np.array(rows), settings), unit)
+    n, points = heights.shape
+    return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
+
+
+def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
+    """Read ``height(profile, point)``, ``x(point)`` and ``y(profile)``, each with its attribute ``units``."""
+    import xarray as xr
+
+    try:
+        dataset = xr.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError) as error:
+        raise InstrumentError(f"{path} cannot be read as NetCDF: {error}") from None
+    found = []
+    for name, dims in (("height", ("profile", "point")), ("x", ("point",)), ("y", ("profile",))):
+        if name not in dataset.variables or set(dataset[name].dims) != set(dims):
+            raise InstrumentError(f"{path}: expected a variable {name}({', '.join(dims)})")
+        variable = dataset[name].transpose(*dims)
+        unit = str(variable.attrs.get("units", ""))
+        if not unit:
+            raise InstrumentError(f"{path}: the variable {name} names no 'units'")
+        values = np.asarray(variable.values, dtype=np.float64)
+        found.append(_in_metres(_cleared(values, settings) if name == "height" else values, unit))
+    heights, x, y = found
+    return heights, x, y
+
+
+def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
+    """Read a point cloud whose points lie on lines of equal y, with the same x on each."""
+    unit = _unit(path, settings)
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InstrumentError(f"Reading {path} takes Open3D, which does not load: {error}") from None
+    if path.suffix.lower() != ".xyz":
+        check_complete(path)
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        cloud = open3d.t.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+    if "positions" not in cloud.point or not len(cloud.point.positions):
+        raise InstrumentError(f"{path} cannot be read: Open3D finds no points in it; is it the whole file?")
+    points = cloud.point.positions.numpy().astype(np.float64)
+    points[:, 2] = _cleared(points[:, 2], settings)
+    return height_map(_in_metres(points, unit), path)
+
+
+_PLY_SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+
+
+def check_complete(path: Path) -> None:
+    """Refuse a PLY or PCD file that holds fewer points than its head announces: Open3D makes up the others.
+
+    Raises
+    ------
+    InstrumentError
+        Cut off, or without a head.
+    """
+    announced, width, text = -1, 0, False
+    with path.open("rb") as file:
+        for line in file:
+            match line.decode("ascii", errors="replace").split():
+                case ["format", kind, *_]:
+                    text = kind == "ascii"
+                case ["element", "vertex", number] | ["POINTS", number] if number.isdigit():
+                    announced, width = int(number), 0
+                case ["element", *_]:
+                    break  # the points come first
+                case ["property", kind, _]:
+                    width += _PLY_SIZES.get(kind, 0)
+                case ["SIZE", *sizes]:
+                    width = sum(int(size) for size in sizes if size.isdigit())
+                case ["end_header"]:
+                    break
+                case ["DATA", kind]:
+                    text, width = kind == "ascii", width if kind == "binary" else 0
+                    break
+        else:
+            raise InstrumentError(f"{path} cannot be read: its head has no end; is it the whole file?")
+        there = announced
+        if text:
+            there = _whole_lines(file)
+        elif width:
+            there = (path.stat().st_size - file.tell()) // width
+    if there < announced:
+        raise InstrumentError(f"{path} cannot be read: it announces {announced} points and is cut off after {there}")
+
+
+def _whole_lines(file: Iterable[bytes]) -> int:
+    """Count lines with text; the last only when it has as many cells as the one before it."""
+    count, cells, before = 0, 0, 0
+    for line in file:
+        if found := len(line.split()):
+            count, before, cells = count + 1, cells, found
+    return count - (count > 1 and cells < before)
+
+
+def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
+    """Return points (n, 3) on a grid as heights (n, point), x and y.
+
+    Raises
+    ------
+    InstrumentError
+        They do not lie on lines of equal x and equal y, or two lie at one place.
+    """
+    points = points[np.isfinite(points[:, :2]).all(axis=1)]
+    (x, column), (y, row) = (_lines(points[:, axis]) for axis in (0, 1))
+    if x.size * y.size * FULL > len(points):
+        raise InstrumentError(
+            f"{path} is no height map: {len(points)} points have {x.size} different x and {y.size} different y; "
+            "expected profiles of equal y, with the same x on each"
+        )
+    cells = row * x.size + column
+    if np.unique(cells).size < cells.size:
+        raise InstrumentError(f"{path} is no height map: several points have the same x and y")
+    heights = np.full(x.size * y.size, np.nan)
+    heights[cells] = points[:, 2]
+    return heights.reshape(y.size, x.size), x, y
+
+
+def _lines(places: Array) -> tuple[Array, Array]:
+    """Return the different places, but for the rounding of the file, and which of them each is."""
+    order = np.argsort(places, kind="stable")
+    ordered = places[order]
+    tolerance = 0.01 * np.ptp(ordered) / np.sqrt(ordered.size)  # 1 % of the pitch of a square grid
+    starts = np.concatenate([[True], np.diff(ordered) > tolerance])
+    line = np.empty(places.size, dtype=np.int64)
+    line[order] = np.cumsum(starts) - 1
+    first = np.flatnonzero(starts)
+    return np.add.reduceat(ordered, first) / np.diff(np.append(first, ordered.size)), line
+
+
+def _in_metres(values: Array, unit: str) -> Array:
+    try:
+        return np.asarray(convert(values, unit, "m"))
+    except DatasetError as error:
+        raise InstrumentError(f"Expected lengths: {error}") from None
+
+
+Reader = Callable[[Path, ProfileFileSettings], tuple[Array, Array, Array]]
+READERS: Mapping[str, Reader] = {
+    ".ply": _read_cloud,
+    ".pcd": _read_cloud,
+    ".xyz": _read_cloud,
+    ".csv": _read_csv,
+    ".nc": _read_netcdf,
+}

@@ -1,0 +1,242 @@
+"""Scans in files: what is read from each kind, and what is refused with which words."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from errormotion.datasets.units import EDGE
+from errormotion.errors import InstrumentError, ReplayError
+from errormotion.instruments.line_profiler.profile_files import ProfileFiles, ProfileFileSettings
+from errormotion.instruments.line_profiler.profile_files.readers import Scan, height_map
+
+X = -0.5e-3 + 12.5e-6 * np.arange(40)
+Y = 70e-6 * np.arange(25)
+HEIGHTS = 1e-3 * np.sin(np.add.outer(900 * Y, 4000 * X))
+HEIGHTS[3, 5] = HEIGHTS[20, 30:33] = np.nan
+MM = ProfileFileSettings(unit="mm")
+GRID = ProfileFileSettings(unit="um", x_pitch=12.5e-6, y_pitch=70e-6)
+
+
+def points() -> np.ndarray:
+    """The scan as points (n, 3), m, without those that have no height, in no order."""
+    grid = np.stack([np.broadcast_to(X, HEIGHTS.shape), np.broadcast_to(Y[:, None], HEIGHTS.shape), HEIGHTS], axis=-1)
+    flat = grid.reshape(-1, 3)
+    return np.random.default_rng(1).permutation(flat[np.isfinite(flat[:, 2])])
+
+
+def write_cloud(path: Path, positions: np.ndarray, ascii: bool = False) -> Path:
+    if path.suffix == ".xyz":
+        np.savetxt(path, positions, fmt="%.10g")
+        return path
+    open3d = pytest.importorskip("open3d")
+    cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(positions))
+    assert open3d.t.io.write_point_cloud(str(path), cloud, write_ascii=ascii)
+    return path
+
+
+def write_netcdf(path: Path, unit: str = "mm", y: np.ndarray = Y) -> Path:
+    factor = {"m": 1.0, "mm": 1e3}[unit]
+    xr.Dataset(
+        {"height": (("profile", "point"), HEIGHTS * factor, {"units": unit})},
+        {"x": ("point", X * 1e6, {"units": "um"}), "y": ("profile", y, {"units": "m"})},
+    ).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def write_csv(path: Path, rows: np.ndarray = HEIGHTS) -> Path:
+    lines = [",".join("" if np.isnan(z) else f"{z * 1e6:.6f}" for z in row) for row in rows]
+    path.write_text("# heights in um\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def scan(path: Path, chosen: ProfileFileSettings | None = None) -> Scan:
+    with ProfileFiles(str(path), chosen) as files:
+        (found,) = files.scans()
+        return found
+
+
+@pytest.mark.parametrize(("suffix", "dtype"), [(".ply", "f8"), (".ply", "f4"), (".pcd", "f4"), (".xyz", "f8")])
+def test_a_point_cloud_becomes_a_height_map_to_the_rounding_of_its_file(
+    tmp_path: Path, suffix: str, dtype: str
+) -> None:
+    found = scan(write_cloud(tmp_path / f"scan{suffix}", (1e3 * points()).astype(dtype)), MM)
+    rounding = 1e-9 if suffix == ".xyz" or dtype == "f4" else 1e-12  # 2 mm in 24 bits: 0.1 nm; xyz: ten digits
+    assert found.heights == pytest.approx(HEIGHTS, abs=rounding, nan_ok=True)
+    assert found.x == pytest.approx(X, abs=rounding)
+    assert found.y == pytest.approx(Y, abs=rounding)
+
+
+def test_a_csv_height_map_takes_its_pitches_from_the_settings(tmp_path: Path) -> None:
+    found = scan(write_csv(tmp_path / "scan.csv"), GRID)
+    assert found.heights == pytest.approx(HEIGHTS, abs=1e-12, nan_ok=True)
+    assert found.x == pytest.approx(12.5e-6 * np.arange(40))
+    assert found.y == pytest.approx(Y)
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_a_netcdf_file_names_its_own_units(tmp_path: Path, unit: str) -> None:
+    found = scan(write_netcdf(tmp_path / "scan.nc", unit))
+    assert found.heights == pytest.approx(HEIGHTS, rel=1e-12, nan_ok=True)
+    assert found.x == pytest.approx(X, rel=1e-12, abs=1e-18)
+
+
+def test_a_number_may_stand_for_no_height(tmp_path: Path) -> None:
+    (tmp_path / "scan.csv").write_text("1;-9999;3\n4;5;-9999\n")
+    chosen = GRID.model_copy(update={"no_value": -9999.0, "delimiter": ";"})
+    found = scan(tmp_path / "scan.csv", chosen)
+    assert found.heights == pytest.approx(1e-6 * np.array([[1, np.nan, 3], [4, 5, np.nan]]), nan_ok=True)
+
+
+def test_several_files_stream_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        write_netcdf(tmp_path / f"{name}.nc")
+    with ProfileFiles(f"file://{tmp_path}/*.nc") as files:
+        assert [found.path.name for found in files.scans()] == ["a.nc", "b.nc"]
+        blocks = list(files.stream(block=10))
+        assert len(files.identify().details["files"]) == 2
+        assert files.read() == pytest.approx(HEIGHTS[0], rel=1e-12)
+    assert [block.first for block in blocks] == [0, 10, 20, 25, 35, 45]
+    assert np.concatenate([block.y for block in blocks]) == pytest.approx(np.tile(Y, 2))
+    assert np.concatenate([block.heights for block in blocks])[:25] == pytest.approx(HEIGHTS, rel=1e-12, nan_ok=True)
+    assert sum(block.invalid.get("no value", 0) for block in blocks) == 2 * 4
+    assert np.isnan(blocks[0].encoder).all()
+
+
+@settings(max_examples=30)
+@given(
+    shape=st.tuples(st.integers(2, 30), st.integers(2, 30)),
+    ratio=st.floats(0.2, 5.0),
+    seed=st.integers(0, 1000),
+)
+def test_any_grid_with_a_few_holes_is_found_again(shape: tuple[int, int], ratio: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = rng.normal(size=shape)
+    truth.ravel()[rng.permutation(truth.size)[: truth.size // 10]] = np.nan
+    truth[0, :], truth[:, 0] = 1.0, 1.0  # every line has a point
+    x, y = np.arange(shape[1], dtype=float), ratio * np.arange(shape[0])
+    grid = np.stack([*np.meshgrid(x, y), truth], axis=-1).reshape(-1, 3)
+    heights, columns, rows = height_map(rng.permutation(grid[np.isfinite(grid[:, 2])]), Path("x"))
+    assert heights.tobytes() == truth.tobytes()
+    assert columns == pytest.approx(x)
+    assert rows == pytest.approx(y)
+
+
+# ------------------------------------------------------------------ what is refused
+
+
+def test_without_a_unit_a_file_that_names_none_is_refused(tmp_path: Path) -> None:
+    for path in (write_csv(tmp_path / "scan.csv"), write_cloud(tmp_path / "scan.ply", points())):
+        with pytest.raises(InstrumentError, match="give 'unit', one of m, mm, um, inch"):
+            scan(path)
+
+
+def test_millimetres_taken_for_metres_are_found(tmp_path: Path) -> None:
+    path = write_cloud(tmp_path / "scan.ply", 1e3 * points())
+    with pytest.raises(InstrumentError, match=r"a height of 1 m; is its unit really 'm'\?"):
+        scan(path, ProfileFileSettings(unit="m"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2,3\n4,5\n", "line 2: expected 3 cells as in the lines before; found 2"),
+        ("1,2,3\n4,five,6\n", "line 2 of heights: could not convert string to float: 'five'"),
+        ("# nothing\n", "no heights in it"),
+        (",,\n,,\n", "not a single height"),
+    ],
+)
+def test_a_csv_file_that_is_none_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "scan.csv").write_text(text)
+    with pytest.raises(InstrumentError, match=message):
+        scan(tmp_path / "scan.csv", GRID)
+
+
+def test_heights_without_pitches_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InstrumentError, match="give 'x_pitch' and 'y_pitch'"):
+        scan(write_csv(tmp_path / "scan.csv"), ProfileFileSettings(unit="um"))
+
+
+def test_a_feed_that_turns_is_refused(tmp_path: Path) -> None:
+    there_and_back = np.concatenate([Y[:13], Y[11::-1]])
+    with pytest.raises(InstrumentError, match="y does not go one way only"):
+        scan(write_netcdf(tmp_path / "scan.nc", y=there_and_back))
+
+
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.999])
+@pytest.mark.parametrize(
+    ("suffix", "ascii"), [(".ply", False), (".ply", True), (".pcd", False), (".pcd", True), (".nc", False)]
+)
+def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, ascii: bool, part: float) -> None:
+    path = tmp_path / f"scan{suffix}"
+    if suffix == ".nc":
+        write_netcdf(path)
+    else:
+        write_cloud(path, (1e3 * points()).astype("f4"), ascii)
+        assert np.isfinite(scan(path, MM).heights).sum() == len(points())
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * part)])
+    with pytest.raises(InstrumentError, match="cannot be read"):
+        scan(path, MM)
+
+
+def test_a_netcdf_file_without_units_or_variables_is_refused(tmp_path: Path) -> None:
+    xr.Dataset({"z": ("profile", np.zeros(3))}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(InstrumentError, match=r"expected a variable height\(profile, point\)"):
+        scan(tmp_path / "a.nc")
+    xr.Dataset({"height": (("profile", "point"), HEIGHTS)}).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    with pytest.raises(InstrumentError, match="height names no 'units'"):
+        scan(tmp_path / "b.nc")
+
+
+def test_a_cloud_that_is_no_height_map_is_refused(tmp_path: Path) -> None:
+    anywhere = np.random.default_rng(2).uniform(0, 1e-2, (500, 3))
+    with pytest.raises(InstrumentError, match="is no height map: 500 points have"):
+        height_map(anywhere, tmp_path)
+    with pytest.raises(InstrumentError, match="several points have the same x and y"):
+        height_map(np.concatenate([points(), points()[:1]]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "There is no file")],
+)
+def test_an_address_without_files_is_refused(address: str, message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        ProfileFiles(address).open()
+
+
+def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scan.stl").write_text("solid")
+    with pytest.raises(InstrumentError, match=r"expected a file of one of \.csv, \.nc, \.pcd, \.ply, \.xyz"):
+        scan(tmp_path / "scan.stl", MM)
+
+
+def test_settings_name_their_units() -> None:
+    read = ProfileFileSettings.model_validate({"unit": "um", "x_pitch": "12.5 um", "y_pitch": "0.07 mm"}, context=EDGE)
+    assert (read.x_pitch, read.y_pitch) == pytest.approx((12.5e-6, 70e-6))
+    for wrong in ({"unit": "furlong"}, {"x_pitch": 12.5}, {"y_pitch": "-1 mm"}):
+        with pytest.raises(ValidationError):
+            ProfileFileSettings.model_validate(wrong, context=EDGE)
+
+
+# ------------------------------------------------------------------ recordings
+
+
+def test_a_recording_holds_to_the_files_as_they_were(tmp_path: Path) -> None:
+    path, recording = write_netcdf(tmp_path / "scan.nc"), tmp_path / "session.rec"
+    with ProfileFiles(str(path), record=recording) as files:
+        heights = files.read()
+    with ProfileFiles(f"replay://{recording}") as files:
+        assert (files.read() == heights).all()
+    write_netcdf(path, "m")
+    with pytest.raises(ReplayError, match=r"scan\.nc has changed since it was recorded"):
+        ProfileFiles(f"replay://{recording}").open()
+    with pytest.raises(InstrumentError, match="cannot be made"):
+        ProfileFiles(str(path), record=recording).open()
+    (tmp_path / "other.rec").write_text("something\n")
+    with pytest.raises(ReplayError, match="is no list of scans"):
+        ProfileFiles(f"replay://{tmp_path / 'other.rec'}").open()
