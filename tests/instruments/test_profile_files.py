@@ -1,5 +1,7 @@
 """Scans in files: what is read from each kind, and what is refused with which words."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +126,27 @@ def test_any_grid_with_a_few_holes_is_found_again(shape: tuple[int, int], ratio:
     assert heights.tobytes() == truth.tobytes()
     assert columns == pytest.approx(x)
     assert rows == pytest.approx(y)
+
+
+def test_parallel_kernels_start_without_a_warning_after_a_cloud_was_read(tmp_path: Path) -> None:
+    path = write_cloud(tmp_path / "scan.ply", (1e3 * points()).astype("f4"))
+    program = f"""
+import warnings
+from errormotion.instruments.line_profiler.profile_files import ProfileFiles, ProfileFileSettings
+with ProfileFiles({str(path)!r}, ProfileFileSettings(unit="mm")) as files:
+    files.read()
+import numba
+@numba.njit(parallel=True)
+def total(n):
+    s = 0
+    for i in numba.prange(n):
+        s += i
+    return s
+warnings.simplefilter("error")
+assert total(10) == 45
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 # ------------------------------------------------------------------ what is refused

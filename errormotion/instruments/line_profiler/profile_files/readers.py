@@ -138,10 +138,7 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
 def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
     """Read a point cloud whose points lie on lines of equal y, with the same x on each."""
     unit = _unit(path, settings)
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InstrumentError(f"Reading {path} takes Open3D, which does not load: {error}") from None
+    open3d = _open3d(path)
     if path.suffix.lower() != ".xyz":
         check_complete(path)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
@@ -151,6 +148,18 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     points = cloud.point.positions.numpy().astype(np.float64)
     points[:, 2] = _cleared(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
+
+
+def _open3d(path: Path) -> Any:
+    """Return the package; it brings a TBB of its own, too old for numba, which is therefore told to try it last."""
+    import numba
+
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined, unused-ignore]
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InstrumentError(f"Reading {path} takes Open3D, which does not load: {error}") from None
+    return open3d
 
 
 _PLY_SIZES = {
