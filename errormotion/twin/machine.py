@@ -12,10 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.errors import BenchError
 from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
+from errormotion.twin import crossbeam as crossbeams
 from errormotion.twin import frame as frames
 from errormotion.twin import rawdata, truth
+from errormotion.twin.artefacts import Artefact, swept
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
+from errormotion.twin.profiler import Profiler
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
 from errormotion.twin.state import ThermalState, seeded_state
@@ -27,7 +30,7 @@ SPIN_UP_TIME = 0.75
 #: sensors count as warm when they have been on for this time, s
 WARM_AFTER = 4 * 3600.0
 
-_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry"))}
+_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "crossbeam"))}
 
 
 class VirtualMachine:
@@ -63,6 +66,8 @@ class VirtualMachine:
         Temperatures and thermal errors under the present schedule.
     geometry : GeometricErrors
         The 21 geometric errors.
+    crossbeam : Crossbeam
+        Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -80,6 +85,7 @@ class VirtualMachine:
         self.bar = bars.seeded_bar(self._rng("bar"), len(self.frame.channels))
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
         self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
+        self.crossbeam: crossbeams.Crossbeam = crossbeams.seeded_crossbeam(self._rng("crossbeam"), self.travel["Y"])
         self._sensing = self._sense()
 
     def __repr__(self) -> str:
@@ -177,6 +183,35 @@ class VirtualMachine:
         coords = {name: ("target", places[:, i], {"units": "m"}) for i, name in enumerate("xyz")}
         twist = self.geometry.twist(places)
         return truth.dataset(twist, "target", coords, "tool", np.zeros(3), "commanded point", self._origin())
+
+    def truth_crossbeam(self, times: ArrayLike, positions: ArrayLike) -> xr.Dataset:
+        """Return the thermal errors of the gantry's Y axis as an error dataset over ``time`` and ``position``.
+
+        The axis goes to and fro without end from time 0 on. The errors are those of the carriage at its own origin,
+        relative to the cold state.
+
+        Parameters
+        ----------
+        times : (n,)
+            s, increasing.
+        positions : (m,)
+            Of the axis, m.
+
+        Raises
+        ------
+        BenchError
+            The machine has no crossbeam.
+        """
+        self._need_crossbeam()
+        t, y = _times(times), _times(positions)
+        coords = {"time": t, "y": ("position", y, {"units": "m"})}
+        twist = self.crossbeam.twist(t[:, None], y)
+        where = ("time", "position"), coords, "Y", np.zeros(3), "cold state at time 0", self._origin()
+        return truth.dataset(twist, *where, frame="carriage")
+
+    def _need_crossbeam(self) -> None:
+        if self.kind != "gantry":
+            raise BenchError(f"Only the virtual machine 'gantry' has a crossbeam; this one is '{self.kind}'.")
 
     def _origin(self) -> truth.Origin:
         return truth.Origin(self.name, self.kind, self.seed, self.state.schedule.events)
@@ -309,6 +344,58 @@ class VirtualMachine:
             np.random.default_rng(seed),
             {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
         )
+
+    def raw_crossbeam_scan(
+        self,
+        times: ArrayLike,
+        positions: ArrayLike,
+        *,
+        seed: int,
+        artefact: Artefact | None = None,
+        profiler: Profiler | None = None,
+        profiles: int = 800,
+        feed: float = 70e-6,
+        motion: str = "axis",
+        pose: ArrayLike | None = None,
+    ) -> xr.Dataset:
+        """Return a raw dataset of scans of artefacts along the crossbeam.
+
+        Parameters
+        ----------
+        times : (cycle,)
+            When each cycle is scanned, s; the first is the cold one and the reference. A cycle takes no time.
+        positions : (artefact,)
+            Of the Y axis over the middle of each artefact, m.
+        seed : int
+            Of noise and sampling phase alone; machine and artefacts stay as they are.
+        artefact : Artefact, optional
+            What stands at every position, a little crooked; the swept free form where not given.
+        profiler : Profiler, optional
+            LJ-X8000A with all its disturbances where not given.
+        profiles : int
+            Lines of a scan.
+        feed : float
+            Distance of two lines, m.
+        motion : {"axis", "rigid"}
+            Whether the carriage has at each line the error that the axis has there, as in truth, or all along the
+            scan moves as one rigid body by the error at its middle, which a registration can find exactly.
+        pose : (4, 4), optional
+            Profiler pose that the dataset states; the true one where not given.
+
+        Returns
+        -------
+        Dataset
+            Heights as float32.
+
+        Raises
+        ------
+        BenchError
+            The machine has no crossbeam, a position is out of travel, or ``motion`` is none of those.
+        """
+        self._need_crossbeam()
+        scans = crossbeams.Scans(artefact or swept(), profiler or Profiler(), profiles, feed, motion)
+        labels = {"machine": self.name, "instruments": crossbeams.instrument_note(self.seed)}
+        return self.crossbeam.raw(_times(times), _times(positions), scans, (self.seed, seed), pose, labels)
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)

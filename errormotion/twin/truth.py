@@ -26,23 +26,24 @@ class Origin:
 
 def dataset(
     twist: NDArray[np.float64],
-    dim: str,
+    dims: str | tuple[str, ...],
     coords: Mapping[str, Any],
     component: str,
     functional_point: NDArray[np.float64],
     reference: str,
     origin: Origin,
+    frame: str = "machine",
 ) -> xr.Dataset:
-    """Return an error dataset of true twists (n, 6), m and rad, over one dimension."""
+    """Return an error dataset of true twists (..., 6), m and rad, over these dimensions."""
     settings = {"kind": origin.kind, "schedule": [asdict(event) for event in origin.events]}
     return build_errors(
         twist,
         np.zeros((*twist.shape, 6)),
-        dims=(dim,),
+        dims=(dims,) if isinstance(dims, str) else dims,
         coords=coords,
         component=component,
         machine=origin.name,
-        frame="machine",
+        frame=frame,
         functional_point=functional_point,
         reference=reference,
         method="twin",

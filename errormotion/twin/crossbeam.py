@@ -1,0 +1,198 @@
+"""The crossbeam of the gantry as it warms up, and scans of artefacts by the line profiler in its spindle.
+
+The carriage O20 rides on the crossbeam along Y. The tool frame O30 hangs from it by the ``lever`` (x_y, 0, z_y), the
+profiler frame O40 stands in O30 at the ``pose`` H. With the carriage at y and its error E (a displacement of its origin
+and a rotation), a point (x, 0, z) of a profile lies in the machine at
+
+    (0, y, 0) + E (lever + H (x, 0, z)).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+from numpy.polynomial import polynomial
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.errors import BenchError
+from errormotion.kinematics.poses import displaced
+from errormotion.twin.artefacts import Artefact
+from errormotion.twin.profiler import Profiler
+
+Array = NDArray[np.float64]
+
+SCHEMA = "errormotion.raw.crossbeam_scan/1"
+#: time constants of screw, beam and columns, s
+LAGS = (900.0, 2700.0, 7200.0)
+#: steady errors: per lag a polynomial in u = y / half of the travel, lowest power first; um and urad
+_STEADY = {
+    "EX": ((0.0,), (0.5, 3.0, -4.0, 1.0), (1.5, 0.5)),
+    "EY": ((16.0, 18.0, 1.0), (6.0, 8.0, 0.0, 1.5), (2.0, 1.0)),
+    "EZ": ((0.0,), (7.0, 3.0, -12.0, 0.8), (-9.0, 1.0)),
+    "EB": ((1.0,), (5.0, 4.0, 1.5), (4.0, 1.0)),
+}
+#: from the carriage to the tool frame, m (Zhao et al., section 4.3)
+LEVER = (-0.9, 0.0, -2.051)
+#: pose of the profiler in the tool frame before the seed turns it: lift, m
+LIFT = -0.174
+#: how far off an artefact stands, m, and how crooked, rad (one sigma)
+PLACE, TURN = 0.2e-3, 3e-3
+
+_SCAN, _PHASE, _ARTEFACT = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Scans:
+    """How artefacts are scanned: see `VirtualMachine.raw_crossbeam_scan`."""
+
+    artefact: Artefact
+    profiler: Profiler
+    profiles: int
+    feed: float
+    motion: str
+
+    def __post_init__(self) -> None:
+        if self.motion not in ("axis", "rigid"):
+            raise BenchError(f"The motion of a scan is 'axis' or 'rigid'; found {self.motion!r}.")
+        if self.profiles < 2 or not self.feed > 0:
+            raise BenchError(f"A scan has two lines at least and a feed above 0; found {self.profiles}, {self.feed} m.")
+
+
+@dataclass(frozen=True)
+class Crossbeam:
+    """One crossbeam with a profiler in its spindle.
+
+    The carriage follows its guide: where the guide bends, the carriage turns, so EA = dEZ/dy and EC = -dEX/dy. ``own``
+    adds what the carriage does by itself.
+
+    Attributes
+    ----------
+    travel : (float, float)
+        Lowest and highest position, m.
+    steady : ndarray, (lag, 4, power)
+        Steady EX, EY, EZ (m) and EB (rad) as polynomials in the position over half of the travel.
+    pose : ndarray, (4, 4)
+        True pose of the profiler in the tool frame, m.
+    lever : ndarray, (3,)
+        From the carriage to the tool frame, m.
+    own : ndarray, (6,)
+        Steady error of the carriage beside that of the guide, m and rad, with the time constant of the screw.
+    """
+
+    travel: tuple[float, float]
+    steady: Array
+    pose: Array
+    lever: Array = field(default_factory=lambda: np.array(LEVER))
+    own: Array = field(default_factory=lambda: np.zeros(6))
+
+    def twist(self, t: ArrayLike, y: ArrayLike) -> Array:
+        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t (s) and places y (m).
+
+        Times and places broadcast. Before time 0 all is cold.
+        """
+        t, y = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(y, dtype=float))
+        half = (self.travel[1] - self.travel[0]) / 2
+        u = (y - sum(self.travel) / 2) / half
+        grown = -np.expm1(-np.maximum(t, 0.0)[..., None] / np.array(LAGS))  # of each lag
+        powers = u[..., None] ** np.arange(self.steady.shape[2])
+        slopes = polynomial.polyder(np.eye(self.steady.shape[2])).T / half  # of each power: coefficients of d/dy
+        EX, EY, EZ, EB = np.moveaxis(np.einsum("...l,ldk,...k->...d", grown, self.steady, powers), -1, 0)
+        steep = np.einsum("...l,ldk,kj,...j->...d", grown, self.steady, slopes, powers[..., :-1])
+        twist = np.stack([EX, EY, EZ, steep[..., 2], EB, -steep[..., 0]], axis=-1)
+        return np.asarray(twist + grown[..., :1] * self.own)
+
+    def carriage(self, t: float, y: Array, middle: float, motion: str) -> Array:
+        """Return where the carriage is at commanded places y (n,), poses (n, 4, 4) in the machine, m."""
+        going = np.tile(np.eye(4), (y.size, 1, 1))
+        going[:, 1, 3] = y
+        if motion == "axis":
+            return going @ displaced(self.twist(t, y)).as_matrix()
+        going[:, 1, 3] -= middle
+        there = np.eye(4)
+        there[1, 3] = middle
+        return there @ displaced(self.twist(t, middle)).as_matrix() @ going
+
+    def artefact_pose(self, seed: int, position: float) -> Array:
+        """Return where the artefact of a position stands, (4, 4) in the machine, m: under the profiler, crooked."""
+        bits = int(np.float64(position).view(np.int64))
+        rng = np.random.default_rng([abs(seed), int(seed < 0), _ARTEFACT, bits & 0x7FFFFFFFFFFFFFFF, int(bits < 0)])
+        off = rng.normal(0, [PLACE] * 3 + [TURN] * 3)
+        off[:3] += [0.0, position, 0.0] + self.lever + self.pose[:3, 3]
+        return np.asarray(displaced(off).as_matrix())
+
+    def lines(self, carriage: Array, artefact: Array) -> Array:
+        """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage."""
+        to_profiler = self.pose.copy()
+        to_profiler[:3, 3] += self.lever
+        return np.asarray(np.linalg.inv(artefact) @ carriage @ to_profiler)
+
+    def raw(
+        self,
+        times: Array,
+        positions: Array,
+        scans: Scans,
+        seeds: tuple[int, int],
+        pose: ArrayLike | None,
+        labels: Mapping[str, str],
+    ) -> xr.Dataset:
+        """Return the raw dataset: see `VirtualMachine.raw_crossbeam_scan`; ``seeds`` are the machine's and the noise's.
+
+        The sampling phase of each scan is random: y of its middle is off by up to half a feed.
+        """
+        reach = scans.profiles * scans.feed / 2
+        if positions.min() - reach < self.travel[0] or positions.max() + reach > self.travel[1]:
+            raise BenchError(
+                f"The axis travels from {self.travel[0]} to {self.travel[1]} m; the scans reach from "
+                f"{positions.min() - reach:.3f} to {positions.max() + reach:.3f} m."
+            )
+        profiler = scans.profiler
+        shape = (times.size, positions.size, scans.profiles)
+        height = np.empty((*shape, profiler.points), dtype=np.float32)
+        y = np.empty(shape)
+        places = [self.artefact_pose(seeds[0], position) for position in positions]
+        phase = np.random.default_rng([abs(seeds[1]), int(seeds[1] < 0), _PHASE]).uniform(-0.5, 0.5, shape[:2])
+        for cycle, artefact in np.ndindex(shape[:2]):
+            middle = float(positions[artefact])
+            index = np.arange(scans.profiles) - (scans.profiles - 1) / 2
+            y[cycle, artefact] = (index + phase[cycle, artefact]) * scans.feed
+            carriage = self.carriage(float(times[cycle]), middle + y[cycle, artefact], middle, scans.motion)
+            poses = self.lines(carriage, places[artefact])
+            key = (*seeds, _SCAN, cycle, artefact)
+            height[cycle, artefact] = profiler.scan(scans.artefact, poses, key=key)
+        metres = {"units": "m"}
+        return xr.Dataset(
+            {
+                "height": (("cycle", "artefact", "profile", "point"), height, metres),
+                "x": ("point", profiler.x, metres),
+                "y": (("cycle", "artefact", "profile"), y, metres),
+                "time": ("cycle", times, {"units": "s"}),
+                "position": ("artefact", positions, metres),
+                "profiler_pose": (("row", "column"), self.pose if pose is None else np.asarray(pose, dtype=float)),
+                "lever": ("direction", self.lever, metres),
+                "height_noise": ((), profiler.disturbances.noise, metres),
+            },
+            {"direction": list("xyz")},
+            {"schema": SCHEMA, **labels},
+        )
+
+
+def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
+    """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a profiler set up by hand."""
+    steady = np.zeros((len(LAGS), len(_STEADY), 4))
+    for k, terms in enumerate(_STEADY.values()):
+        for lag, coefficients in enumerate(terms):
+            steady[lag, k, : len(coefficients)] = np.array(coefficients) * 1e-6
+    steady *= rng.uniform(0.85, 1.15, (len(LAGS), len(_STEADY), 1))
+    set_up = rng.normal(0, [2e-3, 2e-3, 2e-3, 3e-3, 3e-3, 6e-3])
+    set_up[2] += LIFT
+    return Crossbeam(travel, steady, np.asarray(displaced(set_up).as_matrix()))
+
+
+def instrument_note(seed: int) -> str:
+    """Return the attribute ``instruments``: that all of this is simulated."""
+    note = {"id": "virtual line profiler", "address": f"twin://gantry?seed={seed}", "simulated": True}
+    return json.dumps([note])
