@@ -130,6 +130,32 @@ class Crossbeam:
         to_profiler[:3, 3] += self.lever
         return np.asarray(np.linalg.inv(artefact) @ carriage @ to_profiler)
 
+    def pocket_scans(
+        self, pocket: Artefact, profiler: Profiler, along: Array, lifts: Array, key: tuple[int, ...]
+    ) -> tuple[Array, Array, Array]:
+        """Return scans of a pocket that the cold machine has cut itself, one per lift.
+
+        Parameters
+        ----------
+        along, lifts : (profile,), (scan,)
+            Y and Z of the tool frame at each line and scan, off its place over the pocket when it was cut, m.
+
+        Returns
+        -------
+        height : ndarray, (scan, profile, point)
+            m.
+        stage : ndarray, (scan, profile, 3)
+            Where the tool frame was, m.
+        centre : ndarray, (3,)
+            Of the rim in the tool frame when that is at 0, m: straight below the profiler's lift.
+        """
+        stage = np.zeros((lifts.size, along.size, 3))
+        stage[..., 1], stage[..., 2] = along, lifts[:, None]
+        poses = np.tile(self.pose, (*stage.shape[:2], 1, 1))
+        poses[..., :3, 3] += stage
+        scans = [profiler.scan(pocket, poses[k], key=(*key, k)) for k in range(lifts.size)]
+        return np.array(scans), stage, np.zeros(3)
+
     def raw(
         self,
         times: Array,

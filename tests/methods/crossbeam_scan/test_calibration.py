@@ -1,0 +1,162 @@
+"""Pose of the profiler: the published figures, edges below the point pitch, and the truth within what is stated."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan import calibration, edges
+from errormotion.methods.crossbeam_scan.calibration import Pocket, calibrate
+from errormotion.twin.profiler import Disturbances
+
+RADIUS = 12.496e-3
+POCKET = Pocket(RADIUS)
+PITCH = 12.5e-6
+
+
+@pytest.fixture
+def truth(gantry):
+    """The true pose of the twin's profiler: (a, b, g, dx, dy, dz)."""
+    return calibration.parameters(RigidTransform.from_matrix(gantry.crossbeam.pose))
+
+
+def test_published_parameters_give_the_published_matrix():
+    # Zhao et al., section 4.2 and eq. (11); the spindle was lifted by 178.152 mm
+    H = calibration.pose(0.0029, -0.0013, -0.0091, 2.771e-3, -0.876e-3, 4.219e-3 - 178.152e-3).as_matrix()
+    published = [
+        [0.9999579, 0.0090741, -0.001301],
+        [-0.009074, 0.9999546, -0.002897],
+        [0.0012751, 0.0028967, 0.9999949],
+    ]
+    # angles are printed to 1e-4 rad, so to half of that
+    assert H[:3, :3] == pytest.approx(np.array(published), abs=5e-5)
+    assert H[:3, 3] * 1e3 == pytest.approx([2.7710384, -0.876047, -173.9324], abs=1e-3)
+
+
+def test_parameters_are_the_inverse_of_the_pose():
+    p = [0.02, -0.03, 0.4, 1e-3, -2e-3, -0.17]
+    assert calibration.parameters(calibration.pose(*p)) == pytest.approx(p, abs=1e-15)
+
+
+def radii(scan, truth):
+    """Radii of the edges (line, 2), in the tool frame by the true pose, and |cos| of the places."""
+    x, height, stage = scan
+    _, rim = edges.pocket(x, height[0])
+    places = np.stack([rim.x, np.zeros_like(rim.x), rim.z], axis=-1)
+    P = calibration.pose(*truth).apply(places.reshape(-1, 3)).reshape(places.shape) + stage[0][rim.line, None]
+    R = np.hypot(P[..., 0], P[..., 1])
+    return R, np.abs(P[..., 0] / R).min(axis=1)
+
+
+def test_edges_are_found_to_a_thousandth_of_the_pitch_under_white_noise(scan_pocket, truth):
+    R, cos = radii(scan_pocket(1, Disturbances.white()), truth)
+    across = R[cos > 0.5]
+    assert len(across) > 50
+    assert np.std(across[:, 1] - across[:, 0]) < 1e-3 * PITCH
+    assert across.mean() == pytest.approx(RADIUS, abs=1e-3 * PITCH)
+
+
+def test_edges_are_found_below_the_pitch_with_a_third_of_their_points_lost(scan_pocket, truth):
+    R, cos = radii(scan_pocket(1), truth)
+    # the difference of both radii holds no jitter of the line
+    assert np.std(R[cos > 0.5][:, 1] - R[cos > 0.5][:, 0]) / np.sqrt(2) < PITCH / 4
+
+
+def test_tilt_of_a_plane_and_its_uncertainty():
+    # 80 lines of 3000 points as in section 4.2
+    rng = np.random.default_rng(1)
+    x = (np.arange(3000) - 1500) * PITCH
+    misses = []
+    for _ in range(20):
+        z = 0.0013 * x + rng.normal(0, 0.5e-6, (80, 1)) + rng.normal(0, 0.5e-6, (80, 3000))
+        z[rng.uniform(size=z.shape) < 0.002] += 1e-3
+        z[rng.uniform(size=z.shape) < 0.01] = np.nan
+        seen = edges.tilt(x, z)
+        misses.append((seen.slope - 0.0013) / seen.uncertainty)
+    # white noise over 240 000 points: 0.5 um / (10.8 mm sqrt(240 000)) = 94 nrad
+    assert seen.uncertainty == pytest.approx(94e-9, rel=0.3)
+    assert np.sqrt(np.mean(np.square(misses))) == pytest.approx(1, abs=0.5)
+
+
+def test_perfect_scans_give_the_pose(scan_pocket, truth):
+    found = calibrate(*scan_pocket(1, Disturbances.none()), POCKET)
+    # the spot of 12 um bends the half-way line inwards by spot^2 / 2 r = 6 nm
+    assert found.values[:3] == pytest.approx(truth[:3], abs=1e-6)
+    assert found.values[3:] == pytest.approx(truth[3:], abs=2e-8)
+    assert found.matrix == pytest.approx(calibration.pose(*truth).as_matrix(), abs=1e-6)
+
+
+def test_truth_lies_within_the_stated_uncertainty(scan_pocket, truth):
+    misses, squares = [], []
+    for seed in range(40):
+        found = calibrate(*scan_pocket(seed), POCKET)
+        miss = found.values - truth
+        misses.append(miss / np.sqrt(np.diag(found.covariance)))
+        squares.append(miss @ np.linalg.solve(found.covariance, miss))
+    # 240 numbers, some of them correlated: 95 % within 1.96 sigma, and a mean square of 1 +/- 0.09 (one sigma)
+    assert np.mean(np.abs(misses) < 1.96) > 0.9
+    assert np.mean(squares) / 6 == pytest.approx(1, abs=0.3)
+    assert np.abs(np.mean(misses, axis=0)).max() < 3.5 / np.sqrt(40)
+
+
+def test_uncertainty_is_as_small_as_the_sensor_allows(scan_pocket):
+    size = np.sqrt(np.diag(calibrate(*scan_pocket(1), POCKET).covariance))
+    assert (size[:3] < [5e-5, 1e-6, 5e-5]).all()
+    assert (size[3:] < 0.5e-6).all()
+
+
+def test_uncertainty_of_the_centre_is_carried_on(scan_pocket):
+    scan = scan_pocket(1)
+    plain = calibrate(*scan, POCKET).covariance
+    more = calibrate(*scan, Pocket(RADIUS, centre_uncertainty=(3e-6, 4e-6, 5e-6))).covariance
+    assert np.diag(more - plain)[3:] == pytest.approx(np.square([3e-6, 4e-6, 5e-6]))
+
+
+def test_a_place_of_the_pocket_shifts_the_pose(scan_pocket):
+    scan, centre = scan_pocket(1), np.array([1e-3, -2e-3, 3e-3])
+    plain, moved = calibrate(*scan, POCKET), calibrate(*scan, Pocket(RADIUS, centre=centre))
+    assert moved.values[3:] - plain.values[3:] == pytest.approx(centre, abs=1e-9)
+
+
+def test_one_height_leaves_the_angle_a_open(scan_pocket, truth):
+    scan = scan_pocket(1, lifts=(0.174,))
+    with pytest.raises(MethodError, match=r"do not determine a.*two heights"):
+        calibrate(*scan, POCKET)
+    found = calibrate(*scan, POCKET, angle_prior=5e-3)
+    size = np.sqrt(np.diag(found.covariance))
+    assert size[0] == pytest.approx(5e-3, rel=0.01)
+    assert (np.abs(found.values - truth) < 4 * size).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x, z, s: (x, z[:, :, :-1], s), "found .*3199"),
+        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep is needed"),
+        (lambda x, z, s: (x, z * 1e-3, s), "Check the unit"),
+        (lambda x, z, s: (x, z[:, :6], s[:, :6]), "ten lines"),
+        (lambda x, z, s: (x, z, s + np.linspace(0, 1e-3, s.shape[1])[:, None]), "one height of the spindle"),
+    ],
+)
+def test_what_is_no_scan_of_a_pocket_is_refused_in_words(scan_pocket, change, message):
+    with pytest.raises(MethodError, match=message):
+        calibrate(*change(*scan_pocket(1, Disturbances.white(), lines=40)), POCKET)
+
+
+@pytest.mark.parametrize(("along_machine", "rank"), [(True, 5), (False, 4)])
+def test_a_circle_shows_the_angle_g_only_because_the_feed_is_along_the_machine(along_machine, rank):
+    # the rim in the profiler's frame, b = 0: unknown are g, dx, dy, dz and r
+    angle = np.linspace(0, 2 * np.pi, 50, endpoint=False)
+    X, Y = RADIUS * np.cos(angle), RADIUS * np.sin(angle)
+
+    def miss(p):
+        g, dx, dy, dz, r = p * [1e-3, 1e-6, 1e-6, 1e-6, 1e-6]
+        H = calibration.pose(0, 0, g, dx, dy, dz)
+        if along_machine:
+            P = H.apply(np.stack([X, 0 * X, 0 * X], axis=-1)) + np.stack([0 * Y, Y, 0 * Y], axis=-1)
+        else:  # eq. (7)
+            P = H.apply(np.stack([X, Y, 0 * X], axis=-1))
+        return np.concatenate([np.hypot(P[:, 0], P[:, 1]) - RADIUS - r, P[:, 2]]) * 1e6
+
+    J = np.transpose([(miss(step) - miss(-step)) / 2 for step in np.eye(5)])
+    assert np.linalg.matrix_rank(J, tol=1e-6) == rank
