@@ -230,8 +230,8 @@ RAW_SCHEMAS = (
     ),
     RawSchema(
         "errormotion.raw.crossbeam_scan/1",
-        "",
-        "height",
+        "scans",
+        "artefact",
         (
             Row(
                 "height",
@@ -250,6 +250,43 @@ RAW_SCHEMAS = (
             Row("height_noise", (), "m", *_NOISE, "standard deviation of one height"),
         ),
         sizes={**_DIRECTION, "row": 4, "column": 4},
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.crossbeam_scan/1",
+        "profiler pose",
+        "pocket_radius",
+        (
+            Row(
+                "height",
+                ("scan", "profile", "point"),
+                "m",
+                -1.0,
+                1.0,
+                "plate and pocket in the profiler frame, float32 allowed; NaN = no value",
+            ),
+            Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
+            Row("stage", ("scan", "profile", "direction"), "m", *_PLACE, "tool frame, off its place over the pocket"),
+            Row("pocket_centre", ("direction",), "m", *_PLACE, "centre of the rim in the tool frame at that place"),
+            Row("pocket_radius", (), "m", *_RADIUS, "radius of the pocket"),
+            Row(
+                "pocket_centre_uncertainty",
+                ("direction",),
+                "m",
+                *_NOISE,
+                "standard uncertainty of `pocket_centre`",
+                required=False,
+            ),
+            Row(
+                "pocket_radius_uncertainty",
+                (),
+                "m",
+                *_NOISE,
+                "standard uncertainty of `pocket_radius`; 1 um where not given",
+                required=False,
+            ),
+        ),
+        sizes=_DIRECTION,
         labels=_XYZ,
     ),
     RawSchema(

@@ -206,6 +206,24 @@ class Crossbeam:
         )
 
 
+def pocket_dataset(
+    x: Array, height: Array, stage: Array, centre: Array, radius: float, labels: Mapping[str, str]
+) -> xr.Dataset:
+    """Return scans of a pocket as a raw dataset, heights as float32: see `VirtualMachine.raw_pocket_scan`."""
+    metres = {"units": "m"}
+    return xr.Dataset(
+        {
+            "height": (("scan", "profile", "point"), height.astype(np.float32), metres),
+            "x": ("point", x, metres),
+            "stage": (("scan", "profile", "direction"), stage, metres),
+            "pocket_centre": ("direction", centre, metres),
+            "pocket_radius": ((), radius, metres),
+        },
+        {"direction": list("xyz")},
+        {"schema": SCHEMA, **labels},
+    )
+
+
 def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
     """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a profiler set up by hand."""
     steady = np.zeros((len(LAGS), len(_STEADY), 4))

@@ -15,7 +15,7 @@ from errormotion.twin import bar as bars
 from errormotion.twin import crossbeam as crossbeams
 from errormotion.twin import frame as frames
 from errormotion.twin import rawdata, truth
-from errormotion.twin.artefacts import Artefact, swept
+from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.profiler import Profiler
@@ -396,6 +396,37 @@ class VirtualMachine:
         scans = crossbeams.Scans(artefact or swept(), profiler or Profiler(), profiles, feed, motion)
         labels = {"machine": self.name, "instruments": crossbeams.instrument_note(self.seed)}
         return self.crossbeam.raw(_times(times), _times(positions), scans, (self.seed, seed), pose, labels)
+
+    def raw_pocket_scan(
+        self,
+        *,
+        seed: int,
+        lifts: ArrayLike = (0.166, 0.182),
+        profiler: Profiler | None = None,
+        profiles: int = 400,
+        feed: float = 70e-6,
+    ) -> xr.Dataset:
+        """Return a raw dataset of scans of a circular pocket that the cold gantry has cut: for the profiler's pose.
+
+        Parameters
+        ----------
+        seed : int
+            Of the noise alone.
+        lifts : (scan,)
+            How far the spindle is lifted from where it was when the pocket was cut, m.
+        profiler : Profiler, optional
+            LJ-X8000A with all its disturbances where not given.
+        profiles : int
+            Lines of a scan.
+        feed : float
+            Distance of two lines, m.
+        """
+        self._need_crossbeam()
+        profiler, pocket = profiler or Profiler(), circular_pocket()
+        along = np.asarray((np.arange(profiles) - (profiles - 1) / 2) * feed, dtype=float)
+        scans = self.crossbeam.pocket_scans(pocket, profiler, along, _times(lifts), (self.seed, seed))
+        labels = {"machine": self.name, "instruments": crossbeams.instrument_note(self.seed)}
+        return crossbeams.pocket_dataset(profiler.x, *scans, float(pocket.parameters[2]), labels)
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)

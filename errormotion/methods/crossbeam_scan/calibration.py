@@ -15,12 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan import edges
 from errormotion.methods.crossbeam_scan.edges import Tilt
@@ -147,6 +150,36 @@ def calibrate(
         )
     fit = _Fit([_scan(points, *pair) for pair in zip(z, s, strict=True)], pocket, angle_prior)
     return fit.solve()
+
+
+def calibrate_dataset(raw: xr.Dataset, *, angle_prior: float | None = None) -> ProfilerPose:
+    """Return the pose of the profiler from a raw dataset, variant "profiler pose" of the crossbeam scan.
+
+    Parameters
+    ----------
+    raw : Dataset
+        Schema ``errormotion.raw.crossbeam_scan/1`` with ``pocket_radius``.
+    angle_prior : float, optional
+        As in `calibrate`, rad.
+
+    Raises
+    ------
+    DatasetError
+        The dataset breaks its schema.
+    MethodError
+        It holds no scans of a pocket, or as in `calibrate`.
+    """
+    validate(raw)
+    if "pocket_radius" not in raw:
+        raise MethodError(
+            "The calibration needs scans of a pocket (a raw dataset of crossbeam_scan with pocket_radius); found "
+            f"{raw.attrs['schema']} with {', '.join(map(str, raw.data_vars))}."
+        )
+    names = ("radius", "radius_uncertainty", "centre", "centre_uncertainty")
+    known: dict[str, Any] = {name: raw[f"pocket_{name}"].values for name in names if f"pocket_{name}" in raw}
+    place = ("scan", "profile")
+    height, stage = raw.height.transpose(*place, "point"), raw.stage.transpose(*place, "direction")
+    return calibrate(raw.x.values, height.values, stage.values, Pocket(**known), angle_prior=angle_prior)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.datasets import load, save, validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan import calibration, edges
 from errormotion.methods.crossbeam_scan.calibration import Pocket, calibrate
-from errormotion.twin.profiler import Disturbances
+from errormotion.twin.profiler import Disturbances, Profiler
 
 RADIUS = 12.496e-3
 POCKET = Pocket(RADIUS)
@@ -141,6 +142,26 @@ def test_one_height_leaves_the_angle_a_open(scan_pocket, truth):
 def test_what_is_no_scan_of_a_pocket_is_refused_in_words(scan_pocket, change, message):
     with pytest.raises(MethodError, match=message):
         calibrate(*change(*scan_pocket(1, Disturbances.white(), lines=40)), POCKET)
+
+
+def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
+    raw = gantry.raw_pocket_scan(seed=1, profiles=80, feed=350e-6)
+    save(raw, tmp_path / "pocket.nc")
+    stored = load(tmp_path / "pocket.nc")
+    validate(stored)
+    found = calibration.calibrate_dataset(stored.transpose("point", ...))
+    miss = (found.values - truth) / np.sqrt(np.diag(found.covariance))
+    assert np.abs(miss).max() < 4
+    more = raw.assign(pocket_centre_uncertainty=("direction", [1e-5] * 3, {"units": "m"}))
+    wider = calibration.calibrate_dataset(more).covariance - found.covariance
+    assert np.diag(wider)[3:] == pytest.approx(1e-10, rel=1e-3)
+
+
+def test_scans_of_artefacts_are_no_calibration(gantry):
+    profiler = Profiler(80, 0.4e-3, disturbances=Disturbances.white())
+    raw = gantry.raw_crossbeam_scan([0], [0], seed=1, profiler=profiler, profiles=3, feed=1e-3)
+    with pytest.raises(MethodError, match="needs scans of a pocket"):
+        calibration.calibrate_dataset(raw)
 
 
 @pytest.mark.parametrize(("along_machine", "rank"), [(True, 5), (False, 4)])
