@@ -160,8 +160,8 @@ def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: 
     Returns
     -------
     ndarray, (..., 6)
-        What to add to the errors; of the size of change times error. The effect on how the scans are put together, of
-        the same order, is no part of it: see `feed_direction`.
+        What to add to the errors; of the size of change times error. Scans that are put together along the
+        `feed_direction` of a wrong pose add an effect of the same order, which depends on artefact and registration.
     """
     return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
 

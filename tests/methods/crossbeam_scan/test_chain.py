@@ -39,16 +39,18 @@ def motions(errors, H, lever):
     return np.reshape([displacement(SH.inv() * displaced(E) * SH) for E in flat], np.shape(errors))
 
 
-def registered(gantry, raw, cycle, by_line=False):
+def registered(gantry, raw, cycle, by_line=False, assumed=None):
     """Return M (6,) that best lays a scan onto the artefact as the cold profiler sees it: plain Gauss-Newton.
 
-    By line, the motion is that of each line's frame, with a drift (3,) in proportion to the way along the feed.
+    By line, the motion is that of each line's frame, with a drift (3,) in proportion to the way along the feed. Both
+    scans are put together by the true pose, or by an assumed one.
     """
     beam, artefact = gantry.crossbeam, swept()
     position = float(raw.position[0])
     place = beam.artefact_pose(gantry.seed, position)
     pose = beam.lines(beam.carriage(0.0, np.array([position]), position, "axis"), place)[0]
-    along = chain.feed_direction(RigidTransform.from_matrix(raw.profiler_pose.values))
+    true = chain.feed_direction(RigidTransform.from_matrix(beam.pose))
+    along = true if assumed is None else chain.feed_direction(assumed)
     y, z = raw.y.values[cycle, 0][:, None, None], raw.height.values[cycle, 0].astype(float)
     seen = np.isfinite(z)
     points = np.stack(np.broadcast_arrays(raw.x.values, 0.0, z), axis=-1)[seen]
@@ -57,6 +59,7 @@ def registered(gantry, raw, cycle, by_line=False):
     def miss(p):
         motion, drift = displaced(p[:6] * 1e-6), p[6:] * 1e-5
         moved = motion.apply(points) + way * (along + drift) if by_line else motion.apply(points + way * along)
+        moved = moved + moved[:, 1:2] / along[1] * (true - along)  # the cold scan is off as well
         there = moved @ pose[:3, :3].T + pose[:3, 3]
         return (there[:, 2] - artefact.height(there[:, 0], there[:, 1])) * 1e6
 
@@ -131,6 +134,19 @@ def test_effect_of_a_wrong_pose_is_that_of_running_again(H, lever):
         effect = chain.calibration_effect(right, H, lever, change)
         # next order: the change, 0.01 rad, once more
         assert np.abs(again - right - effect).max(axis=0) / np.abs(effect).max(axis=0) == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("by_line", [False, True])
+def test_scans_put_together_by_a_wrong_pose_add_no_more_than_the_chain(gantry, H, lever, by_line):
+    # 10 mrad against errors of 33 um and 10 urad: products of the two, some of them on the lever of 2.2 m
+    raw = gantry.raw_crossbeam_scan([0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT, motion="rigid")
+    right = chain.carriage_errors(registered(gantry, raw, 1, by_line), np.zeros((6, 6)), H, lever).values
+    for change in 0.01 * np.eye(3, 6):
+        wrong = calibration.pose(*(calibration.parameters(H) + change))
+        motion = registered(gantry, raw, 1, by_line, wrong)
+        again = chain.carriage_errors(motion, np.zeros((6, 6)), wrong, lever).values
+        assert np.abs(again - right)[:3].max() < 0.01 * 33e-6
+        assert np.abs(again - right)[3:].max() < 0.01 * 12e-6
 
 
 def test_effect_of_a_wrong_pose_has_the_published_size(H):
