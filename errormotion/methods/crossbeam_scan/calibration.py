@@ -34,8 +34,9 @@ Array = NDArray[np.float64]
 PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")
 #: least |cos| of the angle at which a line crosses the rim, seen from the centre
 OBLIQUE = 0.35
-#: half differences and half sums of the edges' radii beyond this many standard deviations are left out. Edges scatter with
-#: long tails, as points at the rim are lost or not: a tighter limit cuts into them, and the covariance becomes too small
+#: half differences and half sums of the edges' radii beyond this many standard deviations are left out. Edges scatter
+#: with long tails, as points at the rim are lost or not: a tighter limit cuts into them and makes the covariance too
+#: small
 CLIP = 10.0
 #: a standard uncertainty beyond which a parameter counts as not determined: rad, m
 WORST_ANGLE, WORST_PLACE = 0.05, 2e-3
