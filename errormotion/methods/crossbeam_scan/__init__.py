@@ -1,5 +1,5 @@
-"""Crossbeam scan by a line profiler: six thermal errors of an axis from artefacts scanned cold and warm.
+"""Crossbeam scan: thermal errors of a carriage from a line profiler that scans the same artefacts again and again.
 
-Source: Zhao et al., On-machine measurement of thermal influence of the long-span crossbeam of gantry machine tools
-using a 3D laser profiler.
+Here so far: ``registration`` finds the pose of a warm scan on a cold one; ``edges`` and ``calibration`` find the
+profiler's own pose from a circular pocket; ``chain`` takes registered poses to the six errors of the carriage.
 """

@@ -1,0 +1,72 @@
+"""Where Gauss-Newton starts: at rest where that fits, else at the best of a coarse grid of shifts and yaws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.methods.crossbeam_scan.registration.solver import Noise, Problem, normal_equations, solve
+
+Array = NDArray[np.float64]
+
+SHIFTS = np.linspace(-2e-3, 2e-3, 5)
+YAWS = np.linspace(-0.05, 0.05, 5)
+_WHITE = Noise()
+_LEVEL = [2, 3, 4]
+_KEPT = 6
+_STEPS = 25
+
+
+@dataclass(frozen=True)
+class Start:
+    """A pose, the robust scale of the residuals there (m), and the steps it took."""
+
+    pose: RigidTransform
+    scale: float
+    steps: int
+
+
+def descend(problem: Problem, pose: RigidTransform, motions: Array, radius: float, steps: int = _STEPS) -> Start:
+    """Take Gauss-Newton steps with the blocks that fit until they no longer move the surface by a nanometre."""
+    gate = np.inf
+    done = 0
+    for done in range(1, steps + 1):
+        sums = problem.evaluate(pose, gate)
+        if 2 * sums.used < np.count_nonzero(np.isfinite(problem.stack[3])) * 0.5:
+            if gate < np.inf:
+                gate = np.inf
+                continue
+            return Start(pose, np.inf, done)
+        step = solve(*normal_equations(sums, _WHITE), motions, radius)
+        size = float(np.max(np.abs(step * [1, 1, 1, radius, radius, radius])))
+        # A step beyond the surface's features leads nowhere.
+        pose = problem.moved(pose, step * min(1.0, 2e-3 / max(size, 1e-12)))
+        gate = max(6 * sums.scale(), 1e-9)
+        if size < 1e-8:
+            break
+    return Start(pose, problem.evaluate(pose).scale(), done)
+
+
+def search(problem: Problem, motions: Array, radius: float) -> Start:
+    """Return the best descent from a grid of shifts and yaws about the centre."""
+    tried = []
+    for x in SHIFTS:
+        for y in SHIFTS:
+            for yaw in YAWS:
+                pose = problem.moved(RigidTransform.identity(), np.array([x, y, 0.0, 0.0, 0.0, yaw]))
+                for _ in range(2):
+                    sums = problem.evaluate(pose)
+                    if sums.used < 16:
+                        break
+                    H, h = normal_equations(sums, _WHITE)
+                    level = np.zeros(6)
+                    level[_LEVEL] = -np.linalg.solve(H[np.ix_(_LEVEL, _LEVEL)], h[_LEVEL])
+                    pose = problem.moved(pose, level)
+                else:
+                    tried.append(Start(pose, problem.evaluate(pose).scale(), 3))
+    tried.sort(key=lambda start: start.scale)
+    ends = [descend(problem, start.pose, motions, radius) for start in tried[:_KEPT]]
+    return min(ends, key=lambda start: start.scale)
