@@ -155,6 +155,34 @@ _STEPPED_SPHERE = (
     ),
 )
 
+_PROFILER = (
+    Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
+    Row("position", ("artefact",), "m", *_PLACE, "position of the axis at each artefact"),
+    Row("profiler_pose", ("row", "column"), "", *_PLACE, "homogeneous matrix, profiler to tool frame; m, 1"),
+    Row(
+        "pose_covariance",
+        ("p", "p_"),
+        "",
+        -1e-2,
+        1e-2,
+        "covariance of the pose's (a, b, g, dx, dy, dz), one draw for all scans; rad, m",
+        required=False,
+    ),
+    Row("lever", ("direction",), "m", *_PLACE, "(x_y, 0, z_y): carriage to tool frame"),
+    Row("lever_uncertainty", ("direction",), "m", 0.0, 1.0, "standard uncertainty of `lever`", required=False),
+    Row("height_noise", (), "m", *_NOISE, "standard deviation of one height"),
+    Row(
+        "warm_up",
+        ("cycle",),
+        "s",
+        0.0,
+        NO_LIMIT,
+        "warm-up time before each cycle; 0 = cold: cycle 0 is the reference, others repeat it",
+        required=False,
+    ),
+)
+_PROFILER_SIZES = {"row": 4, "column": 4, "p": 6, "p_": 6}
+
 RAW_SCHEMAS = (
     RawSchema(
         "errormotion.raw.spindle_drift/1",
@@ -231,7 +259,7 @@ RAW_SCHEMAS = (
     RawSchema(
         "errormotion.raw.crossbeam_scan/1",
         "scans",
-        "artefact",
+        "y",
         (
             Row(
                 "height",
@@ -241,15 +269,35 @@ RAW_SCHEMAS = (
                 1.0,
                 "surface in the profiler frame, float32 allowed; NaN = no value",
             ),
-            Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
-            Row("y", ("cycle", "artefact", "profile"), "m", *_PLACE, "along the feed, profiler frame"),
+            Row("y", ("cycle", "artefact", "profile"), "m", *_PLACE, "along the feed, from `position` of the axis"),
             Row("time", ("cycle",), "s", -NO_LIMIT, NO_LIMIT, "time of the scan; cycle 0 is the cold one"),
-            Row("position", ("artefact",), "m", *_PLACE, "position of the axis at each artefact"),
-            Row("profiler_pose", ("row", "column"), "", *_PLACE, "homogeneous matrix, profiler to tool frame; m, 1"),
-            Row("lever", ("direction",), "m", *_PLACE, "(x_y, 0, z_y): carriage to tool frame"),
-            Row("height_noise", (), "m", *_NOISE, "standard deviation of one height"),
+            *_PROFILER,
         ),
-        sizes={**_DIRECTION, "row": 4, "column": 4},
+        sizes={**_DIRECTION, **_PROFILER_SIZES},
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.crossbeam_scan/1",
+        "scans as recorded",
+        "record",
+        (
+            Row(
+                "record",
+                ("line", "point"),
+                "m",
+                -1.0,
+                1.0,
+                "surface in the profiler frame, line by line; float32 allowed; NaN = no value",
+            ),
+            Row("encoder", ("line",), "", -NO_LIMIT, NO_LIMIT, "count of the axis at each line; NaN = line lost"),
+            Row("cycle_of_line", ("line",), "", 0, 100000, "number of the measuring pass; pass 0 is the cold one"),
+            Row("line_time", ("line",), "s", -NO_LIMIT, NO_LIMIT, "since the warm-up began"),
+            Row("encoder_pitch", (), "m", -1e-2, 1e-2, "way of the axis per count"),
+            Row("encoder_zero", (), "m", *_PLACE, "position of the axis where the count is 0"),
+            Row("scan_length", (), "m", 0.0, 1.0, "length of a scan along the feed"),
+            *_PROFILER,
+        ),
+        sizes={**_DIRECTION, **_PROFILER_SIZES},
         labels=_XYZ,
     ),
     RawSchema(
