@@ -70,6 +70,7 @@ class Settings(PluginSettings):
 
     # Profiler pose: acquisition
     pocket_position: Length = Field(default=0.0, description="position of the axis over the pocket's middle")
+    pocket_z: Length = Field(default=0.0, description="Z of the spindle when it cut the pocket")
     pocket_radius: Length = Field(default=12.496e-3, gt=0, description="radius of the pocket")
     pocket_radius_uncertainty: Length = Field(default=1e-6, ge=0, description="standard uncertainty of the radius")
     pocket_lifts: tuple[Length, ...] = Field(

@@ -1,0 +1,203 @@
+"""NC programs of a campaign: moves of the axis in ISO 6983, what they do, and how long they take.
+
+A program is plain: absolute places in mm, feeds in mm/min, dwells in seconds. Its duration is that of constant feed;
+a real machine takes a little longer where it speeds up and slows down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+DWELL = 2.0
+"""Rest before the measuring move, s: the axis comes to a stop, and the profiler is ready."""
+MM, MINUTE = 1000.0, 60.0
+_SHORTEST = 1e-3
+"""Moves below this, m, are left out."""
+
+PASS = "pass.nc"
+
+
+@dataclass(frozen=True)
+class Move:
+    """A move of one axis to a place, m, with a feed, m/s."""
+
+    place: float
+    feed: float
+    axis: str = "Y"
+
+
+@dataclass(frozen=True)
+class Dwell:
+    """A rest, s."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Program:
+    """One NC program.
+
+    Attributes
+    ----------
+    name : str
+        Of its file.
+    purpose : str
+        What it does, in words.
+    steps : tuple of Move or Dwell
+    """
+
+    name: str
+    purpose: str
+    steps: tuple[Move | Dwell, ...]
+
+    def seconds(self, start: float | None = None) -> float:
+        """Return how long it takes from a place of Y, m; by default from where it ends, as when run in a circle.
+
+        Moves of other axes than Y count as nothing.
+        """
+        place = self.end if start is None else start
+        total = 0.0
+        for step in self.steps:
+            if isinstance(step, Dwell):
+                total += step.seconds
+            elif step.axis == "Y":
+                total += abs(step.place - place) / step.feed
+                place = step.place
+        return total
+
+    @property
+    def end(self) -> float:
+        """Place of Y behind the last move, m."""
+        return [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"][-1]
+
+    def text(self) -> str:
+        """Return the program as the control reads it."""
+        low, high = self.reach()
+        lines = [
+            "%",
+            f"({self.name}: {self.purpose})",
+            f"(Y{_mm(low)} to Y{_mm(high)}, {self.seconds():.0f} s at constant feed)",
+            "G90 G94 G21",
+        ]
+        for step in self.steps:
+            if isinstance(step, Dwell):
+                lines.append(f"G4 P{step.seconds:.1f}")
+            else:
+                lines.append(f"G1 {step.axis}{_mm(step.place)} F{step.feed * MM * MINUTE:.10g}")
+        return "\n".join([*lines, "M30", "%", ""])
+
+    def reach(self) -> tuple[float, float]:
+        """Return lowest and highest place of Y, m."""
+        places = [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"]
+        return min(places), max(places)
+
+    def check(self, travel: tuple[float, float] | None) -> None:
+        """Refuse to leave the travel of the axis (m), where that is known.
+
+        Raises
+        ------
+        MethodError
+            It names the program, the place and the end.
+        """
+        if travel is None:
+            return
+        low, high = self.reach()
+        if low < travel[0] - 1e-9 or high > travel[1] + 1e-9:
+            raise MethodError(
+                f"{self.name} would go from Y{_mm(low)} to Y{_mm(high)} and the axis travels from {_mm(travel[0])} to "
+                f"{_mm(travel[1])} mm (setting 'travel'): move the artefacts, or make 'margin' or 'warm_up_travel' "
+                "smaller. No program was written."
+            )
+
+
+def measuring_pass(settings: Settings) -> Program:
+    """Return the pass over all artefacts in +Y and back again."""
+    low, high = pass_ends(settings)
+    count = len(settings.positions)
+    return Program(
+        PASS,
+        f"measuring pass over {count} artefact{'s' if count > 1 else ''}",
+        _pass(low, high, settings),
+    )
+
+
+def pass_ends(settings: Settings) -> tuple[float, float]:
+    """Return where a measuring pass begins and where it turns, m."""
+    if not settings.positions:
+        raise MethodError(
+            "The scans need the places of the artefacts: give 'positions', where the axis is when the profiler stands "
+            "over the middle of each, such as ['350 mm', '550 mm']."
+        )
+    beyond = settings.scan_length / 2 + settings.margin
+    return settings.positions[0] - beyond, settings.positions[-1] + beyond
+
+
+def pocket_pass(settings: Settings, number: int) -> Program:
+    """Return the pass over the pocket for one lift of the spindle; ``number`` counts from 1."""
+    beyond = settings.pocket_scan_length / 2 + settings.margin
+    low, high = settings.pocket_position - beyond, settings.pocket_position + beyond
+    lift = settings.pocket_lifts[number - 1]
+    rise = Move(settings.pocket_z + lift, settings.warm_up_feed, "Z")
+    return Program(
+        f"pocket_{number}.nc",
+        f"pass over the pocket, spindle {lift * MM:g} mm above where it was cut",
+        (rise, *_pass(low, high, settings)),
+    )
+
+
+def _pass(low: float, high: float, settings: Settings) -> tuple[Move | Dwell, ...]:
+    return (
+        Move(low, settings.warm_up_feed),
+        Dwell(DWELL),
+        Move(high, settings.measuring_feed),
+        Move(low, settings.warm_up_feed),
+    )
+
+
+def warm_up_piece(settings: Settings, number: int, seconds: float, start: float) -> Program:
+    """Return warm-up moves back and forth that take so many seconds from a start (m), the last stroke a shorter one.
+
+    Raises
+    ------
+    MethodError
+        The ends of the moves are one place.
+    """
+    low, high = sorted(settings.warm_up_travel or pass_ends(settings))
+    feed = settings.warm_up_feed
+    if high - low < _SHORTEST:
+        raise MethodError(
+            f"warm_up_travel: expected two ends apart; found Y{_mm(low)} and Y{_mm(high)}, where the axis rests."
+        )
+    steps: list[Move] = [Move(low, feed)]
+    left = seconds - abs(start - low) / feed
+    stroke = (high - low) / feed
+    rounds = max(0, int(left / (2 * stroke)))
+    steps += [Move(high, feed), Move(low, feed)] * rounds
+    rest = (left - 2 * stroke * rounds) / 2 * feed
+    if rest >= _SHORTEST:
+        steps += [Move(low + rest, feed), Move(low, feed)]
+    return Program(f"warm_up_{number}.nc", f"warm-up moves, {seconds / MINUTE:.1f} min", tuple(steps))
+
+
+def texts(programs: Sequence[Program], settings: Settings) -> dict[str, str]:
+    """Return the text of each program by its file's name, once all of them stay within the travel.
+
+    Raises
+    ------
+    MethodError
+        One does not.
+    """
+    for program in programs:
+        program.check(settings.travel)
+    return {program.name: program.text() for program in programs}
+
+
+def _mm(metres: float) -> str:
+    return f"{round(metres * MM, 3) + 0.0:.3f}"  # + 0.0: no -0.000
