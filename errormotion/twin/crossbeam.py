@@ -116,6 +116,18 @@ class Crossbeam:
         there[1, 3] = middle
         return there @ displaced(self.twist(t, middle)).as_matrix() @ going
 
+    def carriage_at(self, t: Array, places: Array) -> Array:
+        """Return where the carriage is at times t (n,) since the warm-up began, s, and commanded places (n, 3), m.
+
+        Returns
+        -------
+        ndarray, (n, 4, 4)
+            Poses in the machine, m. Z moves the spindle in the carriage and not the carriage.
+        """
+        going = np.tile(np.eye(4), (len(places), 1, 1))
+        going[:, :2, 3] = places[:, :2]
+        return np.asarray(going @ displaced(self.twist(t, places[:, 1])).as_matrix())
+
     def artefact_pose(self, seed: int, position: float) -> Array:
         """Return where the artefact of a position stands, (4, 4) in the machine, m: under the profiler, crooked."""
         bits = int(np.float64(position).view(np.int64))
@@ -124,10 +136,23 @@ class Crossbeam:
         off[:3] += [0.0, position, 0.0] + self.lever + self.pose[:3, 3]
         return np.asarray(displaced(off).as_matrix())
 
-    def lines(self, carriage: Array, artefact: Array) -> Array:
-        """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage."""
-        to_profiler = self.pose.copy()
-        to_profiler[:3, 3] += self.lever
+    def pocket_pose(self, position: float) -> Array:
+        """Return where a pocket is that the cold machine has cut at a position of the axis, (4, 4) in the machine, m.
+
+        Its middle is where the tool frame was.
+        """
+        pose = np.eye(4)
+        pose[:3, 3] = self.lever + np.array([0.0, position, 0.0])
+        return pose
+
+    def lines(self, carriage: Array, artefact: Array, *, lift: ArrayLike = 0.0) -> Array:
+        """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage.
+
+        The spindle is lifted along Z, m, once or for each line.
+        """
+        to_profiler = np.tile(self.pose, (len(carriage), 1, 1))
+        to_profiler[:, :3, 3] += self.lever
+        to_profiler[:, 2, 3] += np.asarray(lift, dtype=float)
         return np.asarray(np.linalg.inv(artefact) @ carriage @ to_profiler)
 
     def pocket_scans(

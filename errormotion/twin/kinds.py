@@ -30,6 +30,8 @@ class MachineKind:
         Axis to (steady correction at top speed in m, time constant of the control's model in s).
     top_speed : float
         1/min.
+    rapid : float
+        Feed of moves as fast as the machine can, m/s.
     """
 
     name: str
@@ -44,6 +46,7 @@ class MachineKind:
     growth: Mapping[str, Table]
     compensation: Mapping[str, tuple[float, float]]
     top_speed: float = 15000.0
+    rapid: float = 20.0 / 60
 
 
 CFRAME = MachineKind(

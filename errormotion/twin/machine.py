@@ -54,6 +54,8 @@ class VirtualMachine:
         For people.
     travel : mapping
         Axis to (lowest, highest) position, m.
+    rapid : float
+        Feed of rapid moves, m/s.
     chain : str
         Bodies from workpiece to tool.
     frame : FrameGeometry
@@ -76,6 +78,7 @@ class VirtualMachine:
         self.seed = int(seed)
         self.name = tables.name
         self.travel = dict(tables.travel)
+        self.rapid = tables.rapid
         self.chain = tables.chain
         self.top_speed = tables.top_speed
         self.bar_radius = bars.RADIUS

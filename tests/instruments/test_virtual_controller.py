@@ -58,6 +58,7 @@ def test_the_state_follows_the_schedule() -> None:
             "spindle_speed": 15000.0,
             "compensation": {"X": True, "Y": True, "Z": True},
             "stepping": False,
+            "running": False,
             "position": [0.0, 0.0, 0.0],
             "tool": "bar",
             "alarms": [],

@@ -87,7 +87,7 @@ class VirtualController(Driver):
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="virtual_controller",
         kind="controller",
-        summary="Controller of the virtual machine: tool, spindle, compensation, step programs",
+        summary="Controller of the virtual machine: tool, spindle, compensation, step programs, NC programs",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.controller:SimulatedController",
     )
@@ -118,7 +118,8 @@ class VirtualController(Driver):
         """Return what the control shows.
 
         ``time`` (s since the start of the schedule), ``spindle_speed`` (1/min), ``compensation`` (axis to on or off),
-        ``position`` (m), ``tool``, ``stepping`` (whether a step program waits or runs), ``alarms`` (list of str).
+        ``position`` (X, Y, Z, m), ``tool``, ``stepping`` and ``running`` (whether a step program, or an NC program,
+        waits or runs), ``alarms`` (list of str).
         """
         return dict(self._call("state"))
 
@@ -185,6 +186,30 @@ class VirtualController(Driver):
                 travel=float(travel),
             )
         )
+
+    def run_program(self, text: str) -> dict[str, Any]:
+        """Run an NC program; returns at once.
+
+        The motion begins a short and unknown time after the order. ``state()["running"]`` says when it is over;
+        simulated time passes by samples or ``elapse`` only.
+
+        Parameters
+        ----------
+        text : str
+            ISO 6983: G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M30 or M2, and comments.
+
+        Returns
+        -------
+        dict
+            ``duration`` of the motion and ``longest_lead_in`` before it, s.
+
+        Raises
+        ------
+        InstrumentError
+            Another program runs; a word is not understood or a place out of travel: nothing moves, and the message
+            names the line.
+        """
+        return dict(self._call("run_program", text=str(text)))
 
     def _call(self, op: str, **arguments: Any) -> Any:
         self._number += 1

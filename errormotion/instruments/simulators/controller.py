@@ -50,6 +50,9 @@ class SimulatedController(SimulatedDevice):
             case "run_steps":
                 program = world.run_steps(**arguments)
                 return {"duration": program.duration, "longest_lead_in": LEAD_IN[1]}
+            case "run_program":
+                path = world.run_program(**arguments)
+                return {"duration": path.duration, "longest_lead_in": LEAD_IN[1]}
             case _:
                 raise ValueError(f"no such operation: {op}")
         return None

@@ -1,4 +1,4 @@
-"""An LJ-X8000A on its two wires: answers requests, streams what a surface shows it."""
+"""An LJ-X8000A on its two wires: answers requests, streams what lies before it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from errormotion.instruments.line_profiler.keyence_ljx import codec, kernels
 from errormotion.instruments.line_profiler.keyence_ljx.codec import INTENSITY, LENGTH, SMALLEST_HEIGHT, StreamLayout
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
-from errormotion.instruments.simulators.profile_sources import ProfileSource, make_source
+from errormotion.instruments.simulators.gantry_profiles import GantryProfiles
+from errormotion.instruments.simulators.profile_sources import Feed, FreeRunning, Lines, ProfileSource, make_source
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import TcpServer
 
 NO_HEIGHT = -(1 << 19) + 1  # raw 0x80001, invalid
 CONNECTING = 0.2  # s
 BATCH = 16  # profiles sent at once when running freely
+IDLE = 0.02  # s from look to look whether the machine moves
 TEMPERATURES = (3512, 4108, 2967)  # hundredths of a degC
-WRONG_START, NOT_PREPARED, NO_CONNECTION, IN_A_STREAM = 0xA3, 0xA1, 0xA0, 0x80
+WRONG_START, NOT_PREPARED, NO_CONNECTION, NOT_NOW = 0xA3, 0xA1, 0xA0, 0x80
 UNKNOWN_REQUEST, WRONG_ARGUMENT = 0x41, 0x42  # (m)
 
 Array = np.ndarray[Any, Any]
@@ -31,9 +33,10 @@ Array = np.ndarray[Any, Any]
 class SimulatedLJX(SimulatedDevice):
     """A profiler that looks at a surface.
 
-    Further parameters of the address: ``artefact`` (a name of `profile_sources.SOURCES`), ``points`` (3200), ``rate``
-    (profiles per second at ``pace=1``, 1000), ``intensity`` (0 or 1), ``encoder_start`` (0), ``encoder_step`` (pulses
-    from profile to profile, 25), ``trigger_start`` (0).
+    Parameters of the address: ``artefact`` (``twin``, what stands on the gantry's table, see `gantry_profiles`;
+    or a name of `profile_sources.SOURCES`, of which profiles are taken at a rate), ``points`` (3200), ``pitch`` (m,
+    12.5e-6), ``intensity`` (0 or 1), ``trigger_start`` (0); where nothing triggers profiles, ``encoder_start`` (0),
+    ``encoder_step`` (counts from profile to profile, 25) and ``rate`` (profiles per second at ``pace=1``, 1000).
 
     Parameters
     ----------
@@ -48,15 +51,14 @@ class SimulatedLJX(SimulatedDevice):
     def __init__(self, address: Address, source: ProfileSource | None = None) -> None:
         if address.params.get("wire", "tcp") != "tcp":
             raise InstrumentError(f"A line profiler has network connections only; found '{address.url}'")
-        self.source = source or make_source(address.params.get("artefact", "swept"), int(address.number("seed", 0)))
+        artefact = address.params.get("artefact", "twin" if address.host == "gantry" else "swept")
+        if source is None and artefact != "twin":
+            source = make_source(artefact, int(address.number("seed", 0)))
         self._points = int(address.number("points", codec.MOST_POINTS))
-        self._rate = address.number("rate", 1000.0)
-        self._pace = address.number("pace", 0.0)
         self._kind = INTENSITY if address.number("intensity", 0) else 0
-        self._encoder = int(address.number("encoder_start", 0)), int(address.number("encoder_step", 25))
         self._trigger_start = int(address.number("trigger_start", 0))
         self._program = 0
-        self._x_pitch = 1250  # in units of LENGTH
+        self._x_pitch = round(address.number("pitch", 12.5e-6) / LENGTH)
         self._errors: list[int] = []
         self._prepared: StreamLayout | None = None
         self._starts = 0
@@ -71,6 +73,7 @@ class SimulatedLJX(SimulatedDevice):
         super().__init__(address, line_end=b"", default_name="profiler", every=20)
         self._mute = self.fault.from_the_start
         try:
+            self._feed = self._make_feed(address, source)
             self._data = TcpServer(f"{self.name}-stream", _ignore)
         except BaseException:
             super().close()
@@ -78,11 +81,21 @@ class SimulatedLJX(SimulatedDevice):
         self._data.start()
         self.urls = {"stream": self._data.url}
 
+    def _make_feed(self, address: Address, source: ProfileSource | None) -> Feed:
+        if source is None:
+            return GantryProfiles(address, self.world, self.name)
+        start, step = (
+            int(address.number(name, default)) for name, default in (("encoder_start", 0), ("encoder_step", 25))
+        )
+        rate, pace = address.number("rate", 1000.0), self.world.pace
+        at_once = BATCH if pace is None else max(1, round(0.01 * rate * pace))
+        return FreeRunning(source, start=start, step=step, rate=rate, at_once=at_once)
+
     @property
     def layout(self) -> StreamLayout:
         """What the profiles of a stream would look like now."""
         pitch = self._x_pitch * LENGTH
-        return StreamLayout(0x5A00 + self._starts, self._kind, self._points, 1e-7, -self._points / 2 * pitch, pitch)
+        return StreamLayout(0x5A00 + self._starts, self._kind, self._points, 1e-7, -(self._points // 2) * pitch, pitch)
 
     def close(self) -> None:
         """End the device."""
@@ -95,6 +108,7 @@ class SimulatedLJX(SimulatedDevice):
     def handed_over(self, samples: int) -> None:
         """Take note of how many profiles of the running stream its reader has had."""
         self._taken = samples
+        self._feed.handed_over(samples)
 
     # ------------------------------------------------------------------ requests
 
@@ -139,13 +153,13 @@ class SimulatedLJX(SimulatedDevice):
                 return 0, bytes(4)
             case codec.GET_COUNTS:
                 number = self._position + self._sent
-                return 0, struct.pack("<Ii", self._trigger(number), _wrapped(self._encoder_at(number)))
+                return 0, struct.pack("<Ii", self._trigger(number), _wrapped(self._feed.count()))
             case codec.GET_TEMPERATURE:
                 return 0, struct.pack("<3h", *TEMPERATURES)
             case codec.GET_X_PITCH:
                 return 0, struct.pack("<I", self._x_pitch)
             case codec.SET_X_PITCH | codec.CHANGE_PROGRAM if self._streaming:
-                return IN_A_STREAM, b""
+                return NOT_NOW, b""
             case codec.SET_X_PITCH:
                 self._x_pitch = struct.unpack("<I", arguments)[0]
             case codec.CHANGE_PROGRAM if arguments[0] < codec.PROGRAMS:
@@ -158,6 +172,7 @@ class SimulatedLJX(SimulatedDevice):
                 return self._start(*struct.unpack("<Ii", arguments)), b""
             case codec.STOP_STREAM:
                 self._ended.set()
+                self._feed.end()
             case codec.TRIGGER | codec.START_MEASURING | codec.STOP_MEASURING | codec.CLEAR_MEMORY | codec.LASER:
                 pass
             case _:
@@ -174,6 +189,10 @@ class SimulatedLJX(SimulatedDevice):
             return NO_CONNECTION
         self._join()
         self._sent = self._taken = 0
+        try:
+            self._feed.begin()
+        except InstrumentError:
+            return NOT_NOW
         self._ended.clear()
         self._stream = threading.Thread(target=self._run, args=(layout,), name=f"sim-{self.name}-profiles", daemon=True)
         self._stream.start()
@@ -195,25 +214,37 @@ class SimulatedLJX(SimulatedDevice):
     def _trigger(self, number: int) -> int:
         return (self._trigger_start + number) % (1 << 32)
 
-    def _encoder_at(self, number: int) -> int:
-        start, step = self._encoder
-        return start + step * number
-
     def _run(self, layout: StreamLayout) -> None:
         """Send profiles until told to stop, then the notice."""
-        batch = BATCH if not self._pace else max(1, round(0.01 * self._rate * self._pace))
-        began = time.monotonic()
-        while not self._ended.is_set():
-            data = b"".join(self._profile(layout, self._sent + i) for i in range(batch))
-            self._sent += batch
+        try:
+            if self._send_all(layout):
+                self._data.send(codec.notice(1))
+        finally:
+            self._feed.end()
+
+    def _send_all(self, layout: StreamLayout) -> bool:
+        """Send profiles until told to stop; False where the stream breaks down."""
+        clock = None  # wall time and simulated time from which on a pace is kept
+        for lines in self._feed.lines(layout):
+            if lines is None:
+                clock = None
+                self._ended.wait(IDLE)
+            elif self.world.pace is not None:
+                clock = clock or (time.monotonic(), lines.begin)
+                due = clock[0] + (lines.times[-1] - clock[1]) / self.world.pace
+                self._ended.wait(max(0.0, due - time.monotonic()))
+            if self._ended.is_set():
+                break
+            if lines is None:
+                continue
+            data = self._encoded(layout, lines)
+            self._sent += lines.times.size
             if not all(self._data.send(piece) for piece in self.fault.pieces(data)):
-                return
+                return False
             if self.fault.kind in ("silence", "disconnect") and self._sent > self.fault.at:
                 self._break_down()
-                return
-            if self._pace:
-                self._ended.wait(max(0.0, began + self._sent / (self._rate * self._pace) - time.monotonic()))
-        self._data.send(codec.notice(1))
+                return False
+        return True
 
     def _break_down(self) -> None:
         if self.fault.kind == "silence":
@@ -222,20 +253,24 @@ class SimulatedLJX(SimulatedDevice):
             self._data.hang_up()
             self._server.hang_up()
 
-    def _profile(self, layout: StreamLayout, number: int) -> bytes:
-        """Return one profile as bytes, with whatever fault is due."""
+    def _encoded(self, layout: StreamLayout, lines: Lines) -> bytes:
+        """Return the next profiles as bytes, with whatever fault is due."""
+        fault, heights = self.fault, lines.heights
+        numbers = self._sent + np.arange(lines.times.size)
+        if fault.kind == "out_of_range" and heights is not None:
+            last = fault.at + fault.length if fault.length else np.inf
+            heights = np.where(((numbers >= fault.at) & (numbers < last))[:, None], np.nan, heights)
+        triggers = (self._trigger_start + self._position + numbers) % (1 << 32)
+        words = packed(layout, heights, triggers, lines.encoder % (1 << 32))
+        if not fault.kind:
+            return words.tobytes()
+        return b"".join(self._spoilt(row, int(number)) for row, number in zip(words, numbers, strict=True))
+
+    def _spoilt(self, words: Array, number: int) -> bytes:
+        """Return the bytes of one profile with the fault that is due at it."""
         fault = self.fault
         if (fault.kind in ("silence", "disconnect") and number >= fault.at) or fault.hits("drop", number):
             return b""
-        encoder = self._encoder_at(self._position + number)
-        heights = self.source.profile(encoder, layout.points, layout.x)
-        last = fault.at + fault.length if fault.length else np.inf
-        if fault.kind == "out_of_range" and fault.at <= number < last:
-            heights = np.full(layout.points, np.nan)
-        words = np.empty(layout.words, dtype=np.uint32)
-        intensities = _brightness(heights) if layout.with_intensity else np.empty(0, dtype=np.uint16)
-        trigger = self._trigger(self._position + number)
-        kernels.pack(quantised(heights, layout.z_unit), intensities, trigger, encoder % (1 << 32), words)
         if fault.hits("checksum", number):
             words[-1] ^= 1
         data = words.tobytes()
@@ -249,6 +284,32 @@ def _ignore(data: bytes) -> None:
     """Take no notice of what comes in on the stream's connection."""
 
 
+def packed(layout: StreamLayout, heights: Array | None, triggers: Array, encoder: Array) -> Array:
+    """Return profiles as they are sent, uint32, (n, words).
+
+    Parameters
+    ----------
+    layout : StreamLayout
+    heights : ndarray, (n, point), or None
+        m; NaN where there is none. None: nowhere.
+    triggers, encoder : ndarray, (n,)
+        Counts, from 0 to 2**32 - 1.
+    """
+    n = triggers.size
+    words = np.empty((n, layout.words), dtype=np.uint32)
+    if heights is None:  # one of them, and its counts put in
+        blank = packed(layout, np.full((1, layout.points), np.nan), np.zeros(1, np.int64), np.zeros(1, np.int64))
+        words[:] = blank
+        words[:, codec.TRIGGER_WORD], words[:, codec.ENCODER_WORD] = triggers, encoder
+        words[:, -1] = (int(blank[0, -1]) + triggers + encoder) % (1 << 32)
+        return words
+    raws = quantised(heights, layout.z_unit)
+    intensities = _brightness(heights) if layout.with_intensity else np.empty((n, 0), dtype=np.uint16)
+    for k in range(n):
+        kernels.pack(raws[k], intensities[k], int(triggers[k]), int(encoder[k]), words[k])
+    return words
+
+
 def quantised(heights: Array, unit: float) -> Array:
     """Return heights in steps of ``unit``, int32; the code for 'invalid' where there is none, or it is out of range."""
     steps = np.rint(heights / unit)
@@ -257,7 +318,7 @@ def quantised(heights: Array, unit: float) -> Array:
 
 
 def _brightness(heights: Array) -> Array:
-    return np.where(np.isfinite(heights), 100 + np.arange(heights.size) % 800, 0).astype(np.uint16)
+    return np.where(np.isfinite(heights), 100 + np.arange(heights.shape[-1]) % 800, 0).astype(np.uint16)
 
 
 def _wrapped(count: int) -> int:

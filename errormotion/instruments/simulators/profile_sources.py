@@ -1,15 +1,62 @@
-"""What lies before a simulated line profiler: anything that tells the heights along its line."""
+"""What lies before a simulated line profiler, and when it takes a profile of it.
+
+A `Feed` tells the profiles of a stream one after another. A `FreeRunning` one takes them at a rate from a surface:
+anything that tells the heights along its line. The feed of a machine's axis is in `gantry_profiles`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
 
 Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Profiles that follow one another.
+
+    Attributes
+    ----------
+    encoder : ndarray, int64, (n,)
+        Counts, without overflow.
+    heights : ndarray, float64, (n, point), or None
+        m; NaN where there is none. None: there is nothing at all.
+    begin : float
+        Simulated time from which on they were taken, s.
+    times : ndarray, float64, (n,)
+        When, s.
+    """
+
+    encoder: Array
+    heights: Array | None
+    begin: float
+    times: Array
+
+
+class Feed(Protocol):
+    """Where the profiles of a stream come from."""
+
+    def count(self) -> int:
+        """Return what the encoder shows now."""
+
+    def begin(self) -> None:
+        """Begin a stream; InstrumentError where that cannot be now."""
+
+    def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
+        """Yield the profiles of a stream; None where nothing is to come for now."""
+
+    def handed_over(self, profiles: int) -> None:
+        """Take note of how many profiles of the stream its reader has had."""
+
+    def end(self) -> None:
+        """End the stream. Idempotent."""
 
 
 class ProfileSource(Protocol):
@@ -31,6 +78,55 @@ class ProfileSource(Protocol):
         heights : ndarray, float64, (n_points,)
             m; NaN where the profiler has none.
         """
+
+
+class FreeRunning:
+    """A surface of which a profile is taken at a rate; whatever moves it moves it evenly.
+
+    Parameters
+    ----------
+    source : ProfileSource
+    start, step : int
+        Encoder count of the first profile, and from profile to profile.
+    rate : float
+        Profiles per simulated second.
+    at_once : int
+        Profiles in a block.
+    """
+
+    def __init__(self, source: ProfileSource, *, start: int, step: int, rate: float, at_once: int) -> None:
+        self._source = source
+        self._start, self._step = start, step
+        self._rate = rate
+        self._at_once = at_once
+        self._first = 0  # number of the stream's first profile
+        self._sent = self._taken = 0
+
+    def count(self) -> int:
+        """Return the encoder count of the next profile."""
+        return self._start + self._step * (self._first + self._sent)
+
+    def begin(self) -> None:
+        """Go on behind the last profile that the reader of the stream before has had."""
+        self._first += self._taken or self._sent
+        self._sent = self._taken = 0
+
+    def lines(self, layout: StreamLayout) -> Iterator[Lines]:
+        """Yield profiles without end."""
+        while True:
+            numbers = np.arange(self._at_once, dtype=np.int64)
+            counts = self.count() + self._step * numbers
+            times = (self._sent + numbers + 1) / self._rate
+            heights = np.array([self._source.profile(int(count), layout.points, layout.x) for count in counts])
+            self._sent += self._at_once
+            yield Lines(counts, heights, 0.0, times)
+
+    def handed_over(self, profiles: int) -> None:
+        """Take note of how many profiles of the stream its reader has had."""
+        self._taken = profiles
+
+    def end(self) -> None:
+        """Do nothing: nothing waits for the end."""
 
 
 class SweptSurface:
@@ -77,5 +173,5 @@ SOURCES: dict[str, Callable[[int], ProfileSource]] = {"swept": SweptSurface}
 def make_source(name: str, seed: int, sources: Mapping[str, Callable[[int], ProfileSource]] = SOURCES) -> ProfileSource:
     """Return a surface by its name; InstrumentError names those there are."""
     if name not in sources:
-        raise InstrumentError(f"'artefact={name}': expected one of {', '.join(sorted(sources))}")
+        raise InstrumentError(f"'artefact={name}': expected one of {', '.join(sorted({*sources, 'twin'}))}")
     return sources[name](seed)

@@ -1,9 +1,10 @@
 """The virtual world: one machine, one clock, and the thread that makes the samples of all channels in lockstep.
 
-The clock advances only while samples stream (or by ``elapse``). Nobody waits for real time unless a pace is asked
-for: a block of samples is made for every streaming channel, then sent, and sending waits for the readers. The time of
-the world is that of the last sample that its readers have handed over, so that what else is asked (a temperature)
-belongs to it, although the samples under way are further on; and when the streams end, the world goes on from there.
+The clock advances only while samples stream, evenly spaced or wherever a moving axis triggers them, or by ``elapse``.
+Nobody waits for real time unless a pace is asked for: a block of samples is made for every streaming channel, then
+sent, and sending waits for the readers. The time of the world is that of the last sample that its readers have handed
+over, so that what else is asked (a temperature) belongs to it, although the samples under way are further on; and when
+the streams end, the world goes on from there.
 """
 
 from __future__ import annotations
@@ -11,45 +12,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.streams import Device, Stream, TriggeredStream
 from errormotion.twin import Event, StepProgram
+from errormotion.twin.paths import Path
 
 BLOCK = 4096  # samples made at once when running freely
 PACED_BLOCK = 0.01  # s, when running at a pace
-LEAD_IN = (0.5, 2.5)  # s between the order to step and the first motion: nobody outside knows exactly
-
-
-class Stream(Protocol):
-    """A channel that wants samples.
-
-    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
-    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more.
-    """
-
-    rate: float
-    sync: str
-    start: int
-    position: int
-    taken: int | None
-    ended: bool
-
-    @property
-    def channel(self) -> str:
-        """Name of its beam."""
-
-    def push(self, distances: np.ndarray[Any, Any]) -> None:
-        """Send the next samples, m; may wait for the reader."""
-
-
-class Device(Protocol):
-    """A simulated device in a world."""
-
-    def close(self) -> None:
-        """End the device."""
+LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: nobody outside knows exactly
 
 
 class VirtualWorld:
@@ -84,10 +60,13 @@ class VirtualWorld:
         self.tool = "bar"
         self.motion: StepProgram | None = None
         self._programs = 0
+        self.path = Path.resting((0.0, 0.0, 0.0))
+        self._warm_up: float | None = None  # time at which it began
         self._schedule: tuple[Event, ...] = ()
         self._devices: set[Device] = set()
         self._streams: list[Stream] = []
         self._armed: list[Stream] = []  # slaves that wait for their master
+        self._triggered: list[TriggeredStream] = []
         self._change = threading.Condition()
         self._thread: threading.Thread | None = None
 
@@ -121,6 +100,7 @@ class VirtualWorld:
             devices, self._devices = self._devices, set()
             self._streams.clear()
             self._armed.clear()
+            self._triggered.clear()
             thread, self._thread = self._thread, None
             self._change.notify_all()
         for device in devices:
@@ -137,6 +117,7 @@ class VirtualWorld:
         """Simulated seconds since the start of the schedule."""
         with self._change:
             seen = [(each.start + each.taken) / each.rate for each in self._streams if each.taken is not None]
+            seen += [each.seen for each in self._triggered if each.seen is not None]
             return min(seen, default=self._front)
 
     def _set_clock(self, time: float) -> None:
@@ -146,7 +127,7 @@ class VirtualWorld:
     @property
     def streaming(self) -> bool:
         """Whether any channel streams."""
-        return bool(self._streams)
+        return bool(self._streams or self._triggered)
 
     # ------------------------------------------------------------------ what a controller orders
 
@@ -156,8 +137,9 @@ class VirtualWorld:
             self._refuse_while_streaming("start a schedule")
             self.machine.start(schedule)
             self._schedule = tuple(schedule)
+            resting = Path.resting(self.path.place(self.time))
             self._set_clock(0.0)
-            self.motion = None
+            self.motion, self.path, self._warm_up = None, resting, None
 
     def mount(self, tool: str) -> None:
         """Put the bar or the sphere into the spindle."""
@@ -182,13 +164,31 @@ class VirtualWorld:
         with self._change:
             if self.tool != "sphere":
                 raise InstrumentError("Only the sphere is stepped; mount it first")
-            if self.stepping:
-                raise InstrumentError("The machine is still stepping; wait until its program has ended")
-            rng = np.random.default_rng([abs(self.seed), self._programs])
-            self._programs += 1
-            begin = self._front + rng.uniform(*LEAD_IN)
+            self._refuse_while_moving()
+            begin = self._begin_of_motion()
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
             return self.motion
+
+    def run_program(self, text: str) -> Path:
+        """Run an NC program, see `nc_program`; the motion begins a short and unknown time from now."""
+        with self._change:
+            self._refuse_while_moving()
+            place = self.path.place(self.time)
+            path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid)
+            self.motion, self.path = None, path.beginning(self._begin_of_motion())
+            if self._warm_up is None:
+                self._warm_up = self.path.warm_up()
+            return self.path
+
+    def _refuse_while_moving(self) -> None:
+        if self.stepping or self.running:
+            what = "stepping" if self.stepping else "running"
+            raise InstrumentError(f"The machine is still {what}; wait until its program has ended")
+
+    def _begin_of_motion(self) -> float:
+        rng = np.random.default_rng([abs(self.seed), self._programs])
+        self._programs += 1
+        return float(max(self._front, self.time) + rng.uniform(*LEAD_IN))
 
     @property
     def stepping(self) -> bool:
@@ -196,32 +196,49 @@ class VirtualWorld:
         return self.motion is not None and self.time < self.motion.end
 
     @property
+    def running(self) -> bool:
+        """Whether an NC program waits or runs."""
+        return self.time < self.path.end
+
+    def warm_time(self, times: ArrayLike) -> np.ndarray[Any, Any]:
+        """Return how long the axes have been warming up at times of the world's clock, s; 0 before they began.
+
+        This is the time for which the gantry's `truth_crossbeam` tells the errors. It begins with the first move of
+        a program that warms up (`Path.warm_up`) and then counts on.
+        """
+        times = np.asarray(times, dtype=float)
+        with self._change:
+            begin = self._warm_up
+        return np.zeros_like(times) if begin is None else np.maximum(times - begin, 0.0)
+
+    @property
     def sensors_on_for(self) -> float:
         """How long the sensors have been on, s."""
         return self.machine.sensors_on_for + self.time
 
     def commanded(self) -> dict[str, Any]:
-        """Return what a controller displays: time, speed, compensation, whether it is stepping."""
+        """Return what a controller displays: time, speed, compensation, whether it moves."""
         now = self.time
         speed, compensation = 0.0, {"X": True, "Y": True, "Z": True}
         for event in self._schedule:
             if event.time <= now:
                 speed = speed if event.spindle_speed is None else event.spindle_speed
                 compensation.update(event.compensation or {})
-        return {"time": now, "spindle_speed": speed, "compensation": compensation, "stepping": self.stepping}
+        shown = {"time": now, "spindle_speed": speed, "compensation": compensation}
+        return {**shown, "stepping": self.stepping, "running": self.running}
 
     def position(self) -> list[float]:
         """Return the commanded position of the tool, m."""
         motion = self.motion
         if motion is None:
-            return [0.0, 0.0, 0.0]
+            return [float(x) for x in self.path.place(self.time)]
         place = max(int(np.searchsorted(motion.arrivals, self.time, side="right")) - 1, 0)
         return [float(x) for x in motion.places[place]]
 
     def _refuse_while_streaming(self, what: str) -> None:
-        if self._streams:
-            names = ", ".join(stream.channel for stream in self._streams)
-            raise InstrumentError(f"Cannot {what} while {names} stream; stop the streams first")
+        names = [each.channel for each in self._streams] + [each.channel for each in self._triggered]
+        if names:
+            raise InstrumentError(f"Cannot {what} while {', '.join(names)} stream; stop the streams first")
 
     # ------------------------------------------------------------------ samples
 
@@ -256,6 +273,30 @@ class VirtualWorld:
                     self._armed.extend(slaves)
                     self._streams = [each for each in self._streams if each not in slaves]
                 if not self._streams:
+                    self._set_clock(seen)
+
+    def begin_triggered(self, stream: TriggeredStream) -> float:
+        """Let a device follow the axes; return the time from which on.
+
+        Raises
+        ------
+        InstrumentError
+            Devices with a clock of their own stream.
+        """
+        with self._change:
+            if self._streams:
+                self._refuse_while_streaming("follow the axes")
+            now = self.time
+            self._triggered.append(stream)
+            return now
+
+    def end_triggered(self, stream: TriggeredStream) -> None:
+        """Let the clock stand where the device's reader is. Idempotent."""
+        with self._change:
+            if stream in self._triggered:
+                seen = self.time
+                self._triggered.remove(stream)
+                if not self.streaming:
                     self._set_clock(seen)
 
     def _generate(self) -> None:

@@ -1,0 +1,165 @@
+"""The control's interpreter of NC programs: a part of ISO 6983, every other word refused with the line it stands in."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from errormotion.errors import InstrumentError
+from errormotion.twin.paths import Path
+
+UNDERSTOOD = (
+    "% , (comments), ; comments, N, G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M2, M30"
+)
+MM, MINUTE = 1000.0, 60.0  # per m; s
+
+_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*")
+_COMMENT = re.compile(r"\([^()]*\)")
+_REFUSED = {
+    "G20": "inches are not understood; write mm and G21",
+    "G91": "places relative to the last one are not understood; write G90 and places of the axes",
+    "M0": "nobody is there to start the program again; leave the stop out",
+    "M1": "nobody is there to start the program again; leave the stop out",
+}
+_WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only thing there is, in units, places and feeds
+_ROUNDING = 1e-9  # m
+
+
+def interpret(
+    text: str, start: tuple[float, float, float], travel: Mapping[str, tuple[float, float]], rapid: float
+) -> Path:
+    """Return the path of a program, begun at time 0.
+
+    Each move takes its way over its feed: there is no acceleration, and no rounding of corners.
+
+    Parameters
+    ----------
+    text : str
+        The program; G90, G21 and G94 hold from its beginning.
+    start : (float, float, float)
+        Where the machine is, m.
+    travel : mapping
+        Axis to (lowest, highest) position, m.
+    rapid : float
+        Feed of G0, and the greatest of G1, m/s.
+
+    Raises
+    ------
+    InstrumentError
+        A word that is not understood, a place out of travel, a move without feed, a program without end; with the
+        number of the line.
+    """
+    control = _Control(start, travel, rapid)
+    for number, line in enumerate(text.splitlines(), 1):
+        try:
+            control.obey(_words(line))
+        except InstrumentError as error:
+            raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}") from None
+        if control.ended:
+            return control.path()
+    raise InstrumentError("The program ends without M30 or M2: is it whole?")
+
+
+def _words(line: str) -> list[tuple[str, float]]:
+    """Return letters and numbers of a line without its comments."""
+    plain = _COMMENT.sub(" ", line).partition(";")[0].strip().upper()
+    if plain == "%":
+        return []
+    words, place = [], 0
+    while place < len(plain):
+        word = _WORD.match(plain, place)
+        if word is None:
+            raise InstrumentError(f"'{plain[place:][:20]}' is no word of a program; understood are {UNDERSTOOD}")
+        words.append((word[1], float(word[2])))
+        place = word.end()
+    return words
+
+
+class _Control:
+    """What the control keeps from line to line."""
+
+    def __init__(
+        self, start: tuple[float, float, float], travel: Mapping[str, tuple[float, float]], rapid: float
+    ) -> None:
+        self.ended = False
+        self._travel = travel
+        self._rapid = rapid
+        self._move = ""  # G0 or G1, once one of them was said
+        self._feed: float | None = None
+        self._times = [0.0]
+        self._places = [np.array(start, dtype=float)]
+        self._fast: list[bool] = []
+
+    def path(self) -> Path:
+        """Return what has been commanded."""
+        return Path(np.array(self._times), np.array(self._places), np.array(self._fast, dtype=bool))
+
+    def obey(self, words: list[tuple[str, float]]) -> None:
+        """Take over one line."""
+        codes = [f"{letter}{value:g}" for letter, value in words if letter in "GM"]
+        numbers = [(letter, value) for letter, value in words if letter not in "GMN"]
+        values = dict(numbers)
+        if len(values) < len(numbers):
+            raise InstrumentError("the same letter twice in one line")
+        for code in codes:
+            self._set(code, codes)
+        if unknown := set(values) - set("XYZFP"):
+            raise InstrumentError(f"'{min(unknown)}' is not understood; understood are {UNDERSTOOD}")
+        if "G4" in codes:
+            self._dwell(values)
+        elif "P" in values:
+            raise InstrumentError("P (s) belongs to a dwell, G4")
+        else:
+            self._advance(values)
+
+    def _set(self, code: str, codes: list[str]) -> None:
+        if code in _REFUSED:
+            raise InstrumentError(_REFUSED[code])
+        if code in ("G0", "G1"):
+            if "G0" in codes and "G1" in codes:
+                raise InstrumentError("G0 and G1 in one line")
+            self._move = code
+        elif code in ("M2", "M30"):
+            self.ended = True
+        elif code not in (*_WITHOUT_EFFECT, "G4"):
+            raise InstrumentError(f"'{code}' is not understood; understood are {UNDERSTOOD}")
+
+    def _dwell(self, values: Mapping[str, float]) -> None:
+        if set(values) != {"P"} or values["P"] < 0:
+            raise InstrumentError("expected a dwell as G4 P2.5, P in s, and nothing beside it")
+        self._append(values["P"], self._places[-1], fast=False)
+
+    def _advance(self, values: Mapping[str, float]) -> None:
+        """Set the feed, and move where a place is given."""
+        if "F" in values:
+            self._feed = values["F"] / MM / MINUTE
+            if not 0 < self._feed <= self._rapid + _ROUNDING:
+                raise InstrumentError(
+                    f"the feed is above 0 and at most {self._rapid * MM * MINUTE:g} mm/min; found {values['F']:g}"
+                )
+        goal = self._places[-1].copy()
+        for number, axis in enumerate("XYZ"):
+            if axis in values:
+                goal[number] = self._within(axis, values[axis])
+        if not set(values) & set("XYZ"):
+            return
+        if not self._move:
+            raise InstrumentError("a place, but neither G0 nor G1 has been said")
+        feed = self._rapid if self._move == "G0" else self._feed
+        if feed is None:
+            raise InstrumentError("a move with G1, but no feed F has been said")
+        self._append(float(np.linalg.norm(goal - self._places[-1])) / feed, goal, fast=self._move == "G0")
+
+    def _within(self, axis: str, value: float) -> float:
+        low, high = self._travel[axis]
+        if not low - _ROUNDING <= value / MM <= high + _ROUNDING:
+            raise InstrumentError(f"{axis} travels from {low * MM:g} to {high * MM:g} mm; found {value:g}")
+        return value / MM
+
+    def _append(self, seconds: float, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]], *, fast: bool) -> None:
+        if seconds > 0:
+            self._times.append(self._times[-1] + seconds)
+            self._places.append(place)
+            self._fast.append(fast)

@@ -1,0 +1,51 @@
+"""What the virtual world knows of those who stream from it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class Stream(Protocol):
+    """A channel that wants samples.
+
+    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
+    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more.
+    """
+
+    rate: float
+    sync: str
+    start: int
+    position: int
+    taken: int | None
+    ended: bool
+
+    @property
+    def channel(self) -> str:
+        """Name of its beam."""
+
+    def push(self, distances: np.ndarray[Any, Any]) -> None:
+        """Send the next samples, m; may wait for the reader."""
+
+
+class TriggeredStream(Protocol):
+    """A device that samples where a moving axis triggers it.
+
+    ``seen`` is the time of the last sample that its reader has handed over, None before the first one.
+    """
+
+    @property
+    def channel(self) -> str:
+        """Name, for messages."""
+
+    @property
+    def seen(self) -> float | None:
+        """Time, s."""
+
+
+class Device(Protocol):
+    """A simulated device in a world."""
+
+    def close(self) -> None:
+        """End the device."""

@@ -1,0 +1,106 @@
+"""Where the axes of the machine are at what time: straight pieces, each at a constant feed, without acceleration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+#: a move along Y that warms the crossbeam up: at this feed at least, m/s, and longer than this, m
+WARM_UP_FEED, WARM_UP_WAY = 2.0 / 60, 0.2
+_ROUNDING = 1e-6  # counts
+
+
+@dataclass(frozen=True)
+class Path:
+    """The way of the axes X, Y, Z.
+
+    Attributes
+    ----------
+    times : ndarray, (n,)
+        Increasing, s. Before the first and after the last of them the machine stands still.
+    places : ndarray, (n, 3)
+        Commanded, m. Where two that follow one another are the same, the machine dwells.
+    rapid : ndarray of bool, (n - 1,)
+        Which of the pieces are moves between two works, as fast as the machine can.
+    """
+
+    times: Array
+    places: Array
+    rapid: NDArray[np.bool_]
+
+    @classmethod
+    def resting(cls, place: ArrayLike) -> Path:
+        """Return the path of a machine that stands still."""
+        return cls(np.zeros(1), np.array(place, dtype=float).reshape(1, 3), np.zeros(0, dtype=bool))
+
+    @property
+    def begin(self) -> float:
+        """When the first piece begins, s."""
+        return float(self.times[0])
+
+    @property
+    def end(self) -> float:
+        """When the last piece has ended, s."""
+        return float(self.times[-1])
+
+    @property
+    def duration(self) -> float:
+        """From ``begin`` to ``end``, s."""
+        return self.end - self.begin
+
+    def beginning(self, time: float) -> Path:
+        """Return the same path, begun at another time, s."""
+        return replace(self, times=self.times - self.begin + time)
+
+    def place(self, t: ArrayLike) -> Array:
+        """Return where the machine is at times t (...), m, shape (..., 3)."""
+        t = np.asarray(t, dtype=float)
+        return np.stack([np.interp(t, self.times, axis) for axis in self.places.T], axis=-1)
+
+    def warm_up(self) -> float | None:
+        """Return when the first move begins that warms the crossbeam up, s; None where there is none.
+
+        That is a move along Y at `WARM_UP_FEED` or faster over more than `WARM_UP_WAY`, but no rapid one: a measuring
+        pass that returns in rapid is no warm-up.
+        """
+        way, seconds = np.abs(np.diff(self.places[:, 1])), np.diff(self.times)
+        warming = (way > WARM_UP_WAY) & (way >= WARM_UP_FEED * seconds * (1 - 1e-9)) & ~self.rapid
+        return float(self.times[np.argmax(warming)]) if warming.any() else None
+
+    def pieces_forwards(self, after: float) -> list[int]:
+        """Return the numbers of the pieces in +Y that end after a time, in order."""
+        forwards = (np.diff(self.places[:, 1]) > 0) & (self.times[1:] > after)
+        return [int(piece) for piece in np.flatnonzero(forwards)]
+
+    def crossings(self, piece: int, count: float, start: int, step: int) -> tuple[NDArray[np.int64], Array]:
+        """Return at which counts an encoder on Y triggers during a piece in +Y, and when.
+
+        It triggers wherever its count is a multiple of ``step``, at the end of the piece but not at its begin, so that
+        two pieces that follow one another trigger once where they meet.
+
+        Parameters
+        ----------
+        piece : int
+            Number of the piece.
+        count : float
+            Way of one count, m.
+        start : int
+            Count at Y = 0.
+        step : int
+            Counts from trigger to trigger.
+
+        Returns
+        -------
+        counts : ndarray, int64, (n,)
+        times : ndarray, (n,)
+            s.
+        """
+        low, high = self.places[piece : piece + 2, 1] / count + start
+        first, last = (int(np.floor((end + _ROUNDING) / step)) for end in (low, high))
+        counts = step * np.arange(first + 1, last + 1, dtype=np.int64)
+        t0, t1 = self.times[piece : piece + 2]
+        return counts, np.asarray(t0 + np.clip((counts - low) / (high - low), 0.0, 1.0) * (t1 - t0))

@@ -1,0 +1,142 @@
+"""What stands on the table of the gantry, and what the line profiler sees of it as the carriage passes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.errors import BenchError
+from errormotion.twin.artefacts import Artefact, circular_pocket, swept
+from errormotion.twin.crossbeam import Crossbeam
+from errormotion.twin.profiler import Profiler
+
+Array = NDArray[np.float64]
+
+#: from one artefact to the next where nobody says otherwise, m
+SPACING = 0.2
+#: how much further than the artefact itself the profiler is asked, m: an artefact is off its place by 0.2 mm (one
+#: sigma), and the profiler, whose frame leans by some mrad, sees 20 mm up and down
+BESIDE = 3e-3
+#: lines computed at once; their noise does not depend on where a stream begins
+CHUNK = 64
+
+
+@dataclass(frozen=True)
+class Target:
+    """A piece on the table.
+
+    Attributes
+    ----------
+    artefact : Artefact
+        What it is.
+    pose : ndarray, (4, 4)
+        Where it stands, in the machine, m.
+    position : float
+        Of the axis over its middle, m.
+    """
+
+    artefact: Artefact
+    pose: Array
+    position: float
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Between which positions of the axis the profiler may see it, m."""
+        half = self.artefact.half_size[1] + BESIDE
+        return self.position - half, self.position + half
+
+
+@dataclass(frozen=True)
+class Table:
+    """Pieces on the table under the line profiler of a crossbeam.
+
+    Attributes
+    ----------
+    crossbeam : Crossbeam
+        Carries the profiler.
+    targets : sequence of Target
+        By their position; no two overlap.
+    """
+
+    crossbeam: Crossbeam
+    targets: Sequence[Target]
+
+    def __post_init__(self) -> None:
+        ordered = sorted(self.targets, key=lambda target: target.position)
+        for one, other in pairwise(ordered):
+            if one.reach[1] > other.reach[0]:
+                raise BenchError(
+                    f"Pieces on the table are {(one.reach[1] - one.reach[0]) * 1e3:.0f} mm or more apart along Y; "
+                    f"found them at {one.position:g} and {other.position:g} m."
+                )
+        object.__setattr__(self, "targets", tuple(ordered))
+
+    def runs(self, y: Array) -> Iterator[tuple[slice, Target | None]]:
+        """Yield which of increasing positions (n,) of the axis lie over which piece, None over none, in order."""
+        first = 0
+        for target in self.targets:
+            begin, end = (int(place) for place in np.searchsorted(y, target.reach))
+            if first < begin:
+                yield slice(first, begin), None
+            if begin < end:
+                yield slice(begin, end), target
+            first = max(first, end)
+        if first < y.size:
+            yield slice(first, y.size), None
+
+    def scan(self, target: Target, profiler: Profiler, t: Array, places: Array, key: tuple[int, ...]) -> Array:
+        """Return the lines that the profiler takes of a piece, each under the error at its own moment.
+
+        Parameters
+        ----------
+        target : Target
+            What is seen.
+        profiler : Profiler
+            Sees it.
+        t : ndarray, (n,)
+            Time since the warm-up began, s, of each line; cold before 0.
+        places : ndarray, (n, 3)
+            Commanded X, Y and Z, m.
+        key : tuple of int
+            Of the noise.
+
+        Returns
+        -------
+        ndarray, (n, point)
+            Heights, m; NaN = none.
+        """
+        alone = len(t) == 1
+        if alone:  # a direction along the feed takes two lines
+            t, places = np.repeat(t, 2), places + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
+        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, places), target.pose, lift=places[:, 2])
+        heights = profiler.scan(target.artefact, lines, key=key)
+        return heights[:1] if alone else heights
+
+
+def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocket: float | None = None) -> Table:
+    """Return a table with a swept free form at each position of the axis, m, and perhaps a circular pocket.
+
+    The free forms stand a little crooked under the profiler, as `Crossbeam.artefact_pose` says; the pocket was cut by
+    the cold machine itself at the position ``pocket`` and Z = 0.
+
+    Raises
+    ------
+    BenchError
+        Two of them overlap.
+    """
+    shape = swept()
+    targets = [Target(shape, crossbeam.artefact_pose(seed, position), position) for position in positions]
+    if pocket is not None:
+        over = pocket - float(crossbeam.pose[1, 3])  # here the profiler, not the tool, is over its middle
+        targets.append(Target(circular_pocket(), crossbeam.pocket_pose(pocket), over))
+    return Table(crossbeam, targets)
+
+
+def default_positions(travel: tuple[float, float]) -> list[float]:
+    """Return the places of artefacts that fit a travel, one every 200 mm and as far from both ends, m."""
+    n = int(round((travel[1] - travel[0]) / SPACING, 6))
+    return [round(travel[0] + SPACING * k, 9) for k in range(1, n)]
