@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import beam, generic, provenance, spindle
+from errormotion.report import beam, crossbeam, generic, provenance, spindle
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH
@@ -70,10 +70,7 @@ def write_report(
                 "Identify the raw dataset first."
             )
     sources = [Source(dataset, raw, dict(run or {}), provenance.read(dataset)) for dataset in datasets]
-    parts = [
-        BUILDERS.get(str(source.errors.attrs.get("component")), generic.part)(source, f"p{i + 1}")
-        for i, source in enumerate(sources)
-    ]
+    parts = [_builder(source.errors)(source, f"p{i + 1}") for i, source in enumerate(sources)]
     page = _page(sources, parts, title)
     out = Path(out)
     beside = out.with_name(out.name + ".part")
@@ -115,6 +112,12 @@ def write_run_report(run_folder: Path) -> Path:
             ) from error
     raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
     return write_report([load(path) for path in files], folder / "report.html", raw=raw, run=run)
+
+
+def _builder(errors: xr.Dataset) -> Builder:
+    if crossbeam.is_campaign(errors):
+        return crossbeam.part
+    return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 
 def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -> str:
