@@ -21,8 +21,8 @@ independent variance alone, and take the rest through the same weights with ``ca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import comb, factorial
+from dataclasses import dataclass, field
+from math import comb, factorial, prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -149,7 +149,7 @@ def smooth(
     x, y, v, to = (np.asarray(given, dtype=float) for given in (places, values, variance, at))
     _check(x, y, v, to, exact_zero)
     batch, n = y.shape[:-1], x.size
-    y, v = y.reshape(-1, n), v.reshape(-1, n)
+    y, v = y.reshape(prod(batch), n), v.reshape(prod(batch), n)
     known = np.isfinite(y) & np.isfinite(v)
     if (v[known] <= 0).any():
         raise MethodError("Points need a variance above 0 to be smoothed; leave out what is exact (the cold cycle).")
@@ -285,53 +285,70 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
 
 @dataclass
 class _Series:
-    """The points of one curve, and how likely each amplitude (squared) is."""
+    """The points of one curve, and how likely each amplitude (squared) is.
 
-    basis: _Basis
-    y: Array
-    v: Array
+    In units of its noise, a set of points is what a polynomial fits, and contrasts that no polynomial moves:
+    uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the polynomial fitted, plus
+    the reach of the contrasts to the places asked for. (Keeping the two apart is accurate where the noise is tiny.)
+    """
+
     known: NDArray[np.bool_]
-    gain: Array  # variance of each contrast of the points per amplitude squared, noise 1
-    contrast: Array  # combinations of the points that no polynomial moves, uncorrelated, noise 1
-    amplitudes: Array  # squared
-    share: Array  # of each amplitude
+    contrast: Array  # (c,)
+    gain: Array  # (c,)
+    reach: Array  # (m, c), per amplitude
+    own: Array  # variance of the curve about the polynomial fitted, per amplitude, (m,)
+    fitted: Array  # polynomial, (m,)
+    fit: Array  # weights of the points in it, (m, n)
+    to_contrast: Array  # weights of the points in each contrast, (c, n)
+    noise: Array  # variance of the polynomial by the noise of the points, (m,)
+    amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
+    share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
     best: float = np.nan
     evidence: float = np.nan
 
     @classmethod
     def of(cls, basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_]) -> _Series:
         sigma = np.sqrt(v[known])
+        K, K_at = basis.K[np.ix_(known, known)] / np.outer(sigma, sigma), basis.K_at[:, known] / sigma
         T = basis.T[known] / sigma[:, None]
-        rest = np.linalg.qr(T, mode="complete").Q[:, T.shape[1] :]
-        gain, axes = np.linalg.eigh(rest.T @ (basis.K[np.ix_(known, known)] / np.outer(sigma, sigma)) @ rest)
-        contrast = axes.T @ rest.T @ (y[known] / sigma)
-        gain = np.maximum(gain, 1e-10 * gain.max(initial=0.0))
-        return cls(basis, y[known], v[known], known, gain, contrast, np.empty(0), np.empty(0))
+        Q, R = np.linalg.qr(T, mode="complete")
+        inside, rest = Q[:, : T.shape[1]], Q[:, T.shape[1] :]
+        gain, axes = np.linalg.eigh(rest.T @ K @ rest)
+        gain = np.maximum(gain, 1e-14 * gain.max(initial=0.0))
+        rest = rest @ axes
+        H = np.linalg.solve(R[: T.shape[1]].T, basis.T_at.T).T  # of the fitted polynomial, (m, p)
+        off = K_at - H @ inside.T @ K
+        own = basis.own - np.einsum("mn,mn->m", K_at + off, H @ inside.T)
+        points = y[known] / sigma
+        return cls(
+            known,
+            rest.T @ points,
+            gain,
+            off @ rest,
+            own,
+            H @ inside.T @ points,
+            H @ inside.T / sigma,
+            rest.T / sigma,
+            (H**2).sum(axis=1),
+        )
 
     def log_likelihood(self, amplitudes: Array) -> Array:
-        """Return that of each amplitude over that of a polynomial."""
+        """Return that of each amplitude, up to a constant."""
         grown = 1 + amplitudes[:, None] * self.gain
-        return np.asarray((self.contrast**2 * (1 - 1 / grown) - np.log(grown)).sum(axis=1) / 2)
+        return np.asarray(-(self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
 
     def mixture(self) -> tuple[Array, Array, Array]:
         """Return values (m,), variance (m,) and weights (m, n) over all amplitudes."""
-        b, known = self.basis, self.known
-        T, T_at, k = b.T[known], b.T_at, b.K_at[:, known]
-        A = self.amplitudes[:, None, None]
-        inverse = np.linalg.inv(A * b.K[np.ix_(known, known)] + np.diag(self.v))
-        normal = T.T @ inverse @ T
-        G = np.linalg.solve(normal, T.T @ inverse)  # generalised least squares of the polynomial
-        pull = A * k @ inverse
-        unknown = T_at - pull @ T
-        W = pull + unknown @ G
-        variance = self.amplitudes[:, None] * (b.own - np.einsum("amn,mn->am", pull, k))
-        variance += np.einsum("amp,apm->am", unknown, np.linalg.solve(normal, np.swapaxes(unknown, 1, 2)))
-        curves = W @ self.y
+        A = self.amplitudes[:, None]
+        held = A / (1 + A * self.gain)  # of each contrast by each amplitude
+        curves = self.fitted + (held * self.contrast) @ self.reach.T
         values = self.share @ curves
-        spread = self.share @ (np.maximum(variance, 0.0) + (curves - values) ** 2)
-        weights = np.zeros((T_at.shape[0], known.size))
-        weights[:, known] = np.einsum("a,amn->mn", self.share, W)
-        return values, spread, weights
+        strength = self.reach**2 / self.gain
+        between = np.maximum(self.own - strength.sum(axis=1), 0.0)  # of a curve through all points, per amplitude
+        variance = self.noise + A * between + held @ strength.T
+        weights = np.zeros((values.size, self.known.size))
+        weights[:, self.known] = self.fit + (self.reach * (self.share @ held)) @ self.to_contrast
+        return values, self.share @ (variance + (curves - values) ** 2), weights
 
 
 def _weigh(group: list[_Series]) -> None:
@@ -348,10 +365,10 @@ def _weigh(group: list[_Series]) -> None:
     amplitudes = np.geomspace(low, high, _LOOKED_AT)
     log = likelihood(amplitudes)
     top = int(log.argmax())
-    matter = np.flatnonzero(log > log[top] + np.log(_NEGLIGIBLE))
+    matter = np.flatnonzero(log >= log[top] + np.log(_NEGLIGIBLE))
     first, last = max(matter[0] - 1, 0), min(matter[-1] + 1, _LOOKED_AT - 1)
     chosen = np.geomspace(amplitudes[first], amplitudes[last], _AVERAGED)
     share = np.exp(likelihood(chosen) - log[top])
     for one in group:
         one.amplitudes, one.share = chosen, share / share.sum()
-        one.best, one.evidence = (np.sqrt(amplitudes[top]), log[top]) if top else (0.0, 0.0)
+        one.best, one.evidence = (np.sqrt(amplitudes[top]), log[top] + (contrasts**2).sum() / 2) if top else (0.0, 0.0)
