@@ -45,7 +45,33 @@ class Freedoms:
     radius: float
 
 
-def freedoms(information: Array, blocks: int, slope_noise: float = 0.0) -> Freedoms:
+def noise_information(x: Array, y: Array, z: Array, bases: Array) -> Array:
+    """Return what slopes with a noise of 1 add to the information J^T J, (6 + k, 6 + k).
+
+    The noise of a block's slopes meets a motion with what it moves the block across: a translation along x looks
+    determined where a plane is noisy.
+
+    Parameters
+    ----------
+    x, y, z : ndarray (n,)
+        The blocks about the centre, m.
+    bases : ndarray (k, 3, 3)
+        Displacements of further parameters per distance from the centre.
+    """
+    zero, one, P = np.zeros_like(x), np.ones_like(x), np.stack([x, y, z])
+    across = np.array([[one, zero, zero, zero, z, -y], [zero, one, zero, -z, zero, x]])
+    across = np.concatenate([across, np.moveaxis(bases @ P, 0, 1)[:2]], axis=1)
+    total: Array = np.einsum("dkn,dqn->kq", across, across)
+    return total
+
+
+def undetermined(information: Array, scale: Array, blocks: int) -> tuple[Array, Array]:
+    """Return eigenvalues and scaled vectors (columns) of the motions that an information leaves undetermined."""
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale) / blocks)
+    return values, vectors[:, values < LEAST_SLOPE**2]
+
+
+def freedoms(information: Array, blocks: int, noise: Array | None = None) -> Freedoms:
     """Return what an artefact determines.
 
     Parameters
@@ -54,21 +80,24 @@ def freedoms(information: Array, blocks: int, slope_noise: float = 0.0) -> Freed
         Sum of J^T J over the blocks, at the artefact's centre.
     blocks : int
         Number of blocks in the sum.
-    slope_noise : float
-        Standard deviation of the slopes' noise, which alone makes an eigenvalue of its square.
+    noise : ndarray (6, 6), optional
+        As much of the information as may come from noise alone.
     """
     # J's columns for a and b are about y and -x: their squares give the radius.
     radius = float(np.sqrt((information[3, 3] + information[4, 4]) / information[2, 2]))
-    scale = np.array([1.0, 1.0, 1.0, 1 / radius, 1 / radius, 1 / radius])
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale) / blocks)
-    least = max(LEAST_SLOPE**2, 10 * slope_noise**2)
-    k = int(np.count_nonzero(values < least))
-    motions = vectors[:, :k]
+    scale = scales(radius, 0)
+    values = np.linalg.eigvalsh(information * np.outer(scale, scale) / blocks)
+    _, motions = undetermined(information - (0.0 if noise is None else noise), scale, blocks)
     share = np.sum(motions**2, axis=1)
     # Equal shares: the later freedom, so that a sphere's rotations are named before its translations.
-    order = np.lexsort((-np.arange(6), -np.round(share, 3)))[:k]
+    order = np.lexsort((-np.arange(6), -np.round(share, 3)))[: motions.shape[1]]
     loose = tuple(DOF[i] for i in sorted(order))
     return Freedoms(float(values[-1] / max(values[0], np.finfo(float).tiny)), loose, motions, radius)
+
+
+def scales(radius: float, extra: int) -> Array:
+    """Return what makes every unit a length: rotations and extra parameters are multiplied by the radius (m)."""
+    return np.array([1.0, 1.0, 1.0, *[1 / radius] * (3 + extra)])
 
 
 def refuse(found: Freedoms, what: str) -> None:

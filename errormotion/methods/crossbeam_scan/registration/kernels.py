@@ -24,8 +24,6 @@ ROWS = 4
 POINTS = ROWS * COLUMNS
 FEWEST = 20
 """A block with fewer valid points says nothing."""
-STATISTICS = 45
-"""Sums of one row of blocks: J^T W J (36), J^T W r (6), r^T W r, number of blocks, sum of t (1 - t) along y."""
 
 # Sums may be taken in any order (so that they vectorise), but NaN stays NaN.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -377,13 +375,38 @@ def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover
     )
 
 
+@compiled(fastmath=_FAST)
+def _row_sums(J: Array, w: Array, r: Array, weighted: Array, total: Array) -> None:  # pragma: no cover - compiled
+    """Add up J^T W J, J^T W r and r^T W r of a row; ``w`` is 0 where a block does not count, ``weighted``: scratch."""
+    n, m = J.shape
+    for k in range(n):
+        for c in range(m):
+            weighted[c] = w[c] * J[k, c]
+        for q in range(k, n):
+            s = 0.0
+            for c in range(m):
+                s += weighted[c] * J[q, c]
+            total[n * k + q] = s
+            total[n * q + k] = s
+        s = 0.0
+        for c in range(m):
+            s += weighted[c] * r[c]
+        total[n * n + k] = s
+    s = 0.0
+    for c in range(m):
+        s += w[c] * r[c] * r[c]
+    total[n * n + n] = s
+
+
 @compiled()
 def accumulate(
     blocks: Array,
     x: Array,
     y: Array,
     pose: Array,
+    normal: Array,
     centre: Array,
+    bases: Array,
     surface: Array,
     spread_of: Array,
     grid: Array,
@@ -400,9 +423,13 @@ def accumulate(
     x, y : ndarray
         Centres of the blocks, m.
     pose : ndarray (3, 4)
-        Rotation and translation of M.
+        Linear part and translation of what takes warm points to the cold frame.
+    normal : ndarray (3, 3)
+        What takes normals there.
     centre : ndarray (3,)
         Point about which the Jacobian turns, m.
+    bases : ndarray (k, 3, 3)
+        Displacements of the further parameters per distance from the centre.
     surface : ndarray (n + 2, m + 2)
         B-spline coefficients of the cold surface, one beyond its nodes on every side.
     spread_of : ndarray (n, m)
@@ -413,16 +440,21 @@ def accumulate(
         Blocks whose residual is larger than this, m, are left out.
     residual : ndarray (block row, block column)
         Receives Z - S(X, Y), m; NaN where there is none.
-    rows : ndarray (block row, 45)
-        Receives the sums.
+    rows : ndarray (block row, (6 + k) (7 + k) + 3)
+        Receives the sums: J^T W J, J^T W r, r^T W r, number of blocks, sum of t (1 - t) along y.
     """
     by, bx = residual.shape
     n, m = spread_of.shape
+    extra = len(bases)
+    size = 6 + extra
+    J, w, difference, room = np.empty((size, bx)), np.empty(bx), np.empty(bx), np.empty(bx)
+    flat = bases.reshape(extra, 9)
     for row in range(by):
-        J = np.empty(6)
-        total = np.zeros(STATISTICS)
+        count, between = 0.0, 0.0
         for column in range(bx):
             residual[row, column] = np.nan
+            w[column], difference[column] = 0.0, 0.0
+            J[:, column] = 0.0
             variance = blocks[3, row, column]
             if not variance < np.inf:
                 continue
@@ -458,22 +490,23 @@ def accumulate(
                 continue
             # The warm block's own plane, turned into the cold frame: its noise is not that of r.
             sx, sy = blocks[1, row, column], blocks[2, row, column]
-            nx = -pose[0, 0] * sx - pose[0, 1] * sy + pose[0, 2]
-            ny = -pose[1, 0] * sx - pose[1, 1] * sy + pose[1, 2]
-            nz = -pose[2, 0] * sx - pose[2, 1] * sy + pose[2, 2]
-            Sx, Sy = -nx / nz, -ny / nz
+            nx = -normal[0, 0] * sx - normal[0, 1] * sy + normal[0, 2]
+            ny = -normal[1, 0] * sx - normal[1, 1] * sy + normal[1, 2]
+            nz = -normal[2, 0] * sx - normal[2, 1] * sy + normal[2, 2]
+            a, b = nx / nz, ny / nz
             X, Y, Z = X - centre[0], Y - centre[1], Z - centre[2]
-            J[0], J[1], J[2], J[3], J[4], J[5] = -Sx, -Sy, 1.0, Y + Sy * Z, -X - Sx * Z, Sx * Y - Sy * X
-            w = 1.0 / (variance + cold)
-            for k in range(6):
-                for q in range(k, 6):
-                    total[6 * k + q] += w * J[k] * J[q]
-                total[36 + k] += w * J[k] * r
-            total[42] += w * r * r
-            total[43] += 1.0
+            J[0, column], J[1, column], J[2, column] = a, b, 1.0
+            J[3, column], J[4, column], J[5, column] = Y - b * Z, a * Z - X, b * X - a * Y
+            for e in range(extra):
+                G = flat[e]
+                J[6 + e, column] = (
+                    a * (G[0] * X + G[1] * Y + G[2] * Z)
+                    + b * (G[3] * X + G[4] * Y + G[5] * Z)
+                    + (G[6] * X + G[7] * Y + G[8] * Z)
+                )
+            w[column], difference[column] = 1.0 / (variance + cold), r
+            count += 1.0
             # How far between two cold lines: there the spline averages their noise.
-            total[44] += t * (1.0 - t)
-        for k in range(6):
-            for q in range(k):
-                total[6 * k + q] = total[6 * q + k]
-        rows[row] = total
+            between += t * (1.0 - t)
+        _row_sums(J, w, difference, room, rows[row])
+        rows[row, -2], rows[row, -1] = count, between

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,14 +12,21 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import adjoint, transform_covariance
 from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
-from errormotion.methods.crossbeam_scan.registration.freedoms import Freedoms, freedoms, refuse
+from errormotion.methods.crossbeam_scan.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.registration.freedoms import (
+    Freedoms,
+    freedoms,
+    noise_information,
+    refuse,
+    scales,
+)
 from errormotion.methods.crossbeam_scan.registration.kernels import ROWS
 from errormotion.methods.crossbeam_scan.registration.result import Registration
 from errormotion.methods.crossbeam_scan.registration.solver import (
     Noise,
     Problem,
+    State,
     Sums,
     estimate_noise,
     inverse,
@@ -40,6 +48,8 @@ LEAST_OVERLAP = 0.5
 """Share of the warm blocks that must have cold surface beneath them."""
 LARGEST_MISFIT = 0.02
 """Residuals may be this share of the surface's relief before the scans count as two artefacts."""
+NOISY = 10.0
+"""Information counts beyond this many times what the slopes' noise makes of nothing."""
 _STEPS = 12
 
 
@@ -51,6 +61,7 @@ def register(
     point: ArrayLike | None = None,
     line_effects: bool = True,
     loose: Literal["refuse", "report"] = "refuse",
+    extra: Mapping[str, float] | None = None,
 ) -> Registration:
     """Find how the profiler's frame has moved between two scans of one artefact.
 
@@ -67,6 +78,9 @@ def register(
         Whether jitter from profile to profile is looked for, and taken out where it shows.
     loose : {"refuse", "report"}
         What to do with an artefact that leaves freedoms undetermined: raise, or find the others and name these.
+    extra : mapping of str to float, optional
+        Further parameters to be found with the motion, out of `extra.BASES`: name and standard deviation of the prior
+        about 0, in m per m; inf for a free one.
 
     Returns
     -------
@@ -75,65 +89,98 @@ def register(
     Raises
     ------
     MethodError
-        The artefact leaves freedoms undetermined (they are named), the scans do not overlap or show two surfaces, an
-        unknown backend is asked for, its extra is not installed, or the steps do not settle.
+        The artefact leaves freedoms or extra parameters undetermined (they are named), the scans do not overlap or show
+        two surfaces, an unknown backend or parameter is asked for, the backend is not installed, or the steps do not
+        settle.
     """
     if registration not in ("height_map", "open3d_plane", "paper"):
         raise MethodError(
             f"expected registration 'height_map', 'open3d_plane' or 'paper', found {registration!r}; choose one of them"
         )
-    free = _determined(cold, warm, loose)
+    terms = Extra.of(extra)
+    if terms.names and registration != "height_map":
+        raise MethodError(
+            f"expected registration 'height_map' for the extra parameters {', '.join(terms.names)}, found "
+            f"{registration!r}, which knows the rigid motion only; choose one of both"
+        )
+    free = _determined(cold, warm, loose, terms)
     begun = _begin(cold, warm, free)
-    problem = Problem.of(cold, warm)
+    problem = Problem.of(cold, warm, extra=terms)
     at = problem.centre if point is None else np.asarray(point, dtype=float)
     if registration == "height_map":
         found = _refined(problem, begun, free, line_effects)
-        sums, rms, missed = found.sums, None, np.zeros(6)
+        rms, missed = None, np.zeros(6 + len(terms.names))
     else:
         from errormotion.methods.crossbeam_scan.registration import clouds
 
         pose, rms, steps = clouds.BACKENDS[registration](cold.scan, warm.scan)
         gate = GATE * problem.evaluate(pose).scale()
         sums = problem.evaluate(pose, gate)
-        found = _Found(pose, sums, Noise(), gate, steps)
+        found = _Found(State(pose, np.zeros(0)), sums, Noise(), gate, steps)
         # What the height map still sees of this pose's error is the honest part of its covariance.
         missed = solve(*normal_equations(sums, found.noise), free.motions, free.radius)
-    H, _ = normal_equations(sums, found.noise)
-    scale = np.array([1.0, 1.0, 1.0, 1 / free.radius, 1 / free.radius, 1 / free.radius])
-    C = found.noise.k * np.outer(scale, scale) * inverse(H * np.outer(scale, scale), free.motions)
-    C = _unknown(C + np.outer(missed, missed), free)
-    C = transform_covariance(C, adjoint(shift=at - problem.centre))
+    sums, state = found.sums, found.state
+    C = _covariance(problem, found, found.noise, free)
+    share = _cold_share(problem, warm, found, free, C)
+    C = terms.moved(_unknown(C + np.outer(missed, missed), free), at - problem.centre)
     used = np.abs(sums.residual) < found.gate
     if rms is None:
         rms = float(np.sqrt(np.mean(sums.residual[used] ** 2)))
     return Registration(
-        backend=registration, pose=found.pose, point=at, covariance=C, residual=sums.residual, x=warm.x, y=warm.y,
+        backend=registration, pose=terms.pose_about(state.pose, state.values, at - problem.centre), point=at,
+        covariance=C[:6, :6], residual=sums.residual, x=warm.x, y=warm.y,
         rms=rms, points=int(warm.points[used].sum()), noise=(cold.noise, warm.noise),
         line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
         condition=free.condition, loose=free.loose, iterations=found.steps,
+        extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Found:
-    pose: RigidTransform
+    state: State
     sums: Sums
     noise: Noise
     gate: float
     steps: int
 
 
-def _determined(cold: BlockMap, warm: BlockMap, loose: str) -> Freedoms:
+def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Freedoms:
     """Return what both scans determine, from the surfaces alone: each laid on itself."""
     found = []
     for block_map, what in ((cold, "a cold scan"), (warm, "a warm scan")):
-        sums = Problem.of(block_map, block_map, THIN).evaluate(RigidTransform.identity())
-        weight = float(np.sum(sums.A[:, 2, 2]))
-        free = freedoms(sums.A.sum(axis=0) * (sums.used / weight), sums.used, block_map.slope_noise)
+        problem = Problem.of(block_map, block_map, THIN, extra)
+        sums = problem.evaluate(problem.rest)
+        information = sums.A.sum(axis=0) * (sums.used / float(np.sum(sums.A[:, 2, 2])))
+        X, Y = np.meshgrid(problem.x - problem.centre[0], problem.y - problem.centre[1])
+        known = np.isfinite(sums.residual)
+        noise = noise_information(X[known], Y[known], problem.stack[0][known] - problem.centre[2], extra.bases)
+        noise *= NOISY * block_map.slope_noise**2
+        free = freedoms(information[:6, :6], sums.used, noise[:6, :6])
         if loose == "refuse":
             refuse(free, what)
+        extra.refuse_undetermined(information - noise, sums.used, free)
         found.append(free)
     return max(found, key=lambda free: (len(free.loose), free.condition))
+
+
+def _covariance(problem: Problem, found: _Found, noise: Noise, free: Freedoms) -> Array:
+    """Return the covariance (n, n) of twist and extra parameters at the problem's centre."""
+    H, _ = problem.equations(found.sums, noise, found.state)
+    scale = scales(free.radius, len(H) - 6)
+    C: Array = noise.k * np.outer(scale, scale) * inverse(H * np.outer(scale, scale), free.motions)
+    return C
+
+
+def _cold_share(problem: Problem, warm: BlockMap, found: _Found, free: Freedoms, covariance: Array) -> float:
+    """Return the share of the covariance that comes from the cold scan: that of its noise, and half of the jitter."""
+    white = problem.cold.usual_variance / (problem.cold.usual_variance + warm.usual_variance)
+    if not any(found.noise.tau):
+        return white
+    alone = _covariance(problem, found, Noise(found.noise.k), free)
+    known = np.diag(covariance) > 0
+    part = float(np.mean(np.diag(alone)[known] / np.diag(covariance)[known]))
+    return part * white + (1.0 - part) * 0.5
 
 
 def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
@@ -176,15 +223,16 @@ def _relief(block_map: BlockMap) -> float:
 
 def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool) -> _Found:
     """Take Gauss-Newton steps with all blocks; the noise is estimated once the pose is near."""
-    pose, noise, gate, near, steps = start.pose, Noise(), GATE * start.scale, False, start.steps
+    state, noise, gate = State(start.pose, problem.rest.values), Noise(), GATE * start.scale
+    near, steps = False, start.steps
     for _ in range(_STEPS):
         steps += 1
-        sums = problem.evaluate(pose, gate)
+        sums = problem.evaluate(state, gate)
         if near:
-            noise = estimate_noise(problem, pose, sums, gate, line_effects)
-        H, h = normal_equations(sums, noise)
+            noise = estimate_noise(problem, state, sums, gate, line_effects)
+        H, h = problem.equations(sums, noise, state)
         move = solve(H, h, free.motions, free.radius)
-        pose = problem.moved(pose, move)
+        state = problem.stepped(state, move)
         # Squared length in standard deviations: after one of 3, the next is far below a hundredth.
         length = float(move @ H @ move) / noise.k
         if near and length < 0.1:
@@ -196,7 +244,7 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
             f"expected the registration to settle within {_STEPS} steps, found it still {length**0.5:.1f} standard "
             "deviations from rest; look at both scans for a part that moved"
         )
-    return _Found(pose, sums, noise, gate, steps)
+    return _Found(state, sums, noise, gate, steps)
 
 
 def _unknown(covariance: Array, free: Freedoms) -> Array:

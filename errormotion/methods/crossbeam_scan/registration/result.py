@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics import poses
-from errormotion.kinematics.twists import adjoint, transform_covariance
+from errormotion.methods.crossbeam_scan.registration.extra import Extra
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,8 @@ class Registration:
     backend : str
         What found it.
     pose : RigidTransform
-        M: takes a point from the warm frame to the cold one.
+        M: takes a point from the warm frame to the cold one. Extra parameters come after it and leave ``point``
+        where it is: p of the warm frame is at ``point`` + (1 + sum e G) (M p - ``point``) of the cold one.
     point : ndarray (3,)
         Functional point of twist and covariance, in profiler coordinates, m.
     covariance : ndarray (6, 6)
@@ -47,6 +48,15 @@ class Registration:
         Freedoms that the artefact does not determine.
     iterations : int
         Steps taken.
+    extra_names : tuple of str
+        Further parameters that were estimated.
+    extra : ndarray (k,)
+        Their values: each displaces a point P of the cold frame by its matrix times (P - ``point``).
+    joint_covariance : ndarray (6 + k, 6 + k)
+        Of the twist at ``point`` and the further parameters; ``covariance`` is its first block.
+    cold_share : float
+        Share of the covariance that comes from the noise of the cold scan, which all warm scans registered onto it have
+        in common.
     """
 
     backend: str
@@ -63,6 +73,10 @@ class Registration:
     condition: float
     loose: tuple[str, ...]
     iterations: int
+    extra_names: tuple[str, ...]
+    extra: Array
+    joint_covariance: Array
+    cold_share: float
 
     @property
     def twist(self) -> Array:
@@ -76,5 +90,12 @@ class Registration:
 
     def at(self, point: Array) -> tuple[Array, Array]:
         """Return twist (6,) and covariance (6, 6) at another point (3,) of the profiler's frame, m."""
+        twist, _, covariance = self.joint_at(point)
+        return twist, covariance[:6, :6]
+
+    def joint_at(self, point: Array) -> tuple[Array, Array, Array]:
+        """Return twist (6,), extra parameters (k,) and their covariance (6 + k, 6 + k) about another point (3,), m."""
+        terms = Extra.of(dict.fromkeys(self.extra_names, np.inf))
         shift = np.asarray(point, dtype=float) - self.point
-        return poses.displacement(self.pose, point), transform_covariance(self.covariance, adjoint(shift=shift))
+        pose = terms.pose_about(self.pose, self.extra, shift)
+        return poses.displacement(pose, point), self.extra, terms.moved(self.joint_covariance, shift)

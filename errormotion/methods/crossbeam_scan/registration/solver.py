@@ -27,12 +27,16 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.registration import kernels
 from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
+from errormotion.methods.crossbeam_scan.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.registration.freedoms import scales
 
 Array = NDArray[np.float64]
 
+NONE = Extra.of(None)
 LINE = [2, 1]
 """Columns of J that are the line effects: 1 and, but for its sign, Sy."""
 LAGS = 2
+_NEIGHBOURS = (2 * LAGS + 1) ** 2
 _EM_STEPS = 25
 _FEW = 10000
 # What a cubic cardinal spline leaves of white noise is 1 - 1.27 t (1 - t) at t between two nodes, to 0.01.
@@ -48,29 +52,72 @@ class Problem:
     y: Array
     cold: BlockMap
     centre: Array
+    extra: Extra = NONE
 
     @classmethod
-    def of(cls, cold: BlockMap, warm: BlockMap, step: int = 1) -> Problem:
+    def of(cls, cold: BlockMap, warm: BlockMap, step: int = 1, extra: Extra = NONE) -> Problem:
         """Return the problem with every ``step``-th warm block along both directions; its centre is the cold one's."""
         some = slice(step // 2, None, step)
         maps = (warm.height, warm.slope_x, warm.slope_y, warm.variance)
-        return cls(np.stack([z[some, some] for z in maps]), warm.x[some].copy(), warm.y[some].copy(), cold, cold.centre)
+        x, y = warm.x[some].copy(), warm.y[some].copy()
+        return cls(np.stack([z[some, some] for z in maps]), x, y, cold, cold.centre, extra)
 
-    def evaluate(self, pose: RigidTransform, gate: float = np.inf) -> Sums:
-        """Return residuals and sums at a pose; blocks further off than ``gate`` (m) are left out of the sums."""
-        matrix = np.ascontiguousarray(np.asarray(pose.as_matrix(), dtype=float)[:3])
+    @property
+    def rest(self) -> State:
+        """No motion."""
+        return State(RigidTransform.identity(), np.zeros(len(self.extra.names)))
+
+    def evaluate(self, state: State | RigidTransform, gate: float = np.inf) -> Sums:
+        """Return residuals and sums at a state; blocks further off than ``gate`` (m) are left out of the sums."""
+        matrix, normal, bases = self.map(state)
+        n = 6 + len(bases)
         residual = np.empty(self.stack.shape[1:])
-        rows = np.empty((len(self.y), kernels.STATISTICS))
+        rows = np.empty((len(self.y), n * n + n + 3))
         surface = self.cold.surface
         kernels.accumulate(
-            self.stack, self.x, self.y, matrix, self.centre, surface.coefficients, self.cold.variance, surface.grid,
-            gate, residual, rows,
+            self.stack, self.x, self.y, matrix, normal, self.centre, bases, surface.coefficients, self.cold.variance,
+            surface.grid, gate, residual, rows,
         )  # fmt: skip
-        return Sums(residual, rows[:, :36].reshape(-1, 6, 6), rows[:, 36:42], *rows[:, 42:].T)
+        A, g = rows[:, : n * n].reshape(-1, n, n), rows[:, n * n : n * n + n]
+        return Sums(residual, A, g, *rows[:, n * n + n :].T)
+
+    def map(self, state: State | RigidTransform) -> tuple[Array, Array, Array]:
+        """Return what takes warm points to the cold frame (3, 4), what takes normals (3, 3), and the extra bases."""
+        if isinstance(state, RigidTransform):
+            matrix = np.ascontiguousarray(np.asarray(state.as_matrix(), dtype=float)[:3])
+            return matrix, matrix[:, :3].copy(), NONE.bases
+        matrix, normal, _ = self.map(state.pose)
+        if len(state.values):
+            stretch = self.extra.stretch(state.values)
+            matrix = stretch @ matrix
+            matrix[:, 3] += self.centre - stretch @ self.centre
+            normal = np.asarray(np.linalg.inv(matrix[:, :3]).T, dtype=float)
+        return np.ascontiguousarray(matrix), np.ascontiguousarray(normal), self.extra.bases
 
     def moved(self, pose: RigidTransform, step: Array) -> RigidTransform:
         """Return the pose after a further twist (6,) at the centre."""
         return poses.displaced(step, self.centre) * pose
+
+    def stepped(self, state: State, step: Array) -> State:
+        """Return the state after a further twist at the centre and extra values, (6 + k,)."""
+        return State(self.moved(state.pose, step[:6]), state.values + step[6:])
+
+    def equations(self, sums: Sums, noise: Noise, state: State) -> tuple[Array, Array]:
+        """Return information and gradient of twist and extra parameters, with their priors, in units of 1 / k."""
+        H, h = normal_equations(sums, noise)
+        if len(state.values):
+            weight = noise.k / self.extra.prior**2
+            H[range(6, len(H)), range(6, len(H))] += weight
+            h[6:] += weight * state.values
+        return H, h
+
+
+@dataclass(frozen=True)
+class State:
+    """Where the warm scan is thought to be: a warm point p is at c + stretch (M p - c), c the problem's centre."""
+
+    pose: RigidTransform
+    values: Array
 
 
 @dataclass(frozen=True)
@@ -113,7 +160,7 @@ class Noise:
 
 
 def normal_equations(sums: Sums, noise: Noise) -> tuple[Array, Array]:
-    """Return information H (6, 6) and gradient h (6,) of the twist, line effects eliminated, in units of 1 / k."""
+    """Return information H (n, n) and gradient h (n,), line effects eliminated, in units of 1 / k."""
     if not any(noise.tau):
         return sums.A.sum(axis=0), sums.g.sum(axis=0)
     K = noise.gains(sums.A)
@@ -125,31 +172,33 @@ def normal_equations(sums: Sums, noise: Noise) -> tuple[Array, Array]:
 
 
 def solve(H: Array, h: Array, motions: Array, radius: float) -> Array:
-    """Return the step -H^-1 h (6,) that stays out of undetermined motions (6, k), rotations scaled by the radius."""
-    scale = np.array([1.0, 1.0, 1.0, 1 / radius, 1 / radius, 1 / radius])
+    """Return the step -H^-1 h (n,) that stays out of undetermined motions (6, k); ``radius`` scales what turns."""
+    scale = scales(radius, len(h) - 6)
     step: Array = -scale * (inverse(H * np.outer(scale, scale), motions) @ (scale * h))
     return step
 
 
 def inverse(H: Array, motions: Array) -> Array:
-    """Return the inverse of a scaled information (6, 6) within the motions that are determined."""
+    """Return the inverse of a scaled information (n, n) within the motions (6, k) that are determined."""
     if motions.shape[1] == 0:
         return np.asarray(np.linalg.inv(H), dtype=float)
-    basis = np.linalg.svd(motions)[0][:, motions.shape[1] :]
+    basis = np.eye(len(H))[:, motions.shape[1] :]
+    basis[:6, : 6 - motions.shape[1]] = np.linalg.svd(motions)[0][:, motions.shape[1] :]
     C: Array = basis @ np.linalg.inv(basis.T @ H @ basis) @ basis.T
     return C
 
 
-def estimate_noise(problem: Problem, pose: RigidTransform, sums: Sums, gate: float, line_effects: bool = True) -> Noise:
+def estimate_noise(problem: Problem, state: State, sums: Sums, gate: float, line_effects: bool = True) -> Noise:
     """Estimate k and the line effects from the residuals at the solution.
 
     The covariance needs the noise of slow patterns. Between two nodes the spline averages the cold noise, and
     neighbours share speckle: so k is the sum of the covariances of neighbouring residuals, up to two blocks apart, and
     the variances of the lines are raised by what the spline has averaged away.
     """
-    weight, slope = _weights(problem, pose, sums, gate)
+    weight, slope = _weights(problem, state, sums, gate)
     normalised = np.where(weight > 0, sums.residual, 0.0) * np.sqrt(weight)
-    k = _long_run(normalised, weight > 0)
+    fitted = sums.A.shape[1]
+    k = _long_run(normalised, weight > 0, fitted)
     tau = np.zeros(2)
     rows = sums.count >= 3
     C, u = sums.A[rows][:, LINE][:, :, LINE], sums.g[rows][:, LINE]
@@ -157,7 +206,7 @@ def estimate_noise(problem: Problem, pose: RigidTransform, sums: Sums, gate: flo
         # Independent columns: the part of Sy that is no constant.
         ridge = C + 1e-9 * np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(2)
         effects = np.linalg.solve(ridge, u[..., None])[..., 0]
-        significant = _significant(effects, ridge, k)
+        significant = _significant(effects, ridge, k, sums.used)
         if significant:
             white = np.sqrt(np.mean(np.linalg.inv(ridge).diagonal(axis1=1, axis2=2), axis=0))
             tau = np.maximum(np.sqrt(np.mean(effects**2, axis=0)), np.sqrt(k) * white)
@@ -166,7 +215,7 @@ def estimate_noise(problem: Problem, pose: RigidTransform, sums: Sums, gate: flo
                 noise = Noise(k, (float(tau[0]), float(tau[1])))
                 effect = np.einsum("rij,rj->ri", noise.gains(sums.A), sums.g[:, LINE])
                 rest = sums.residual - effect[:, :1] + effect[:, 1:] * slope
-                k = _long_run(np.where(weight > 0, rest, 0.0) * np.sqrt(weight), weight > 0)
+                k = _long_run(np.where(weight > 0, rest, 0.0) * np.sqrt(weight), weight > 0, fitted)
     # Half of the jitter is the cold scan's, of which the spline shows only a part.
     averaged = 1.0 - _GAIN * float(sums.between.sum() / max(sums.count.sum(), 1))
     tau = tau * np.sqrt(2.0 / (1.0 + averaged))
@@ -183,24 +232,25 @@ def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     return tau
 
 
-def _significant(effects: Array, C: Array, k: float) -> bool:
+def _significant(effects: Array, C: Array, k: float, blocks: int) -> bool:
     """Return whether lines differ by more than the noise of their blocks: chi squared, four standard deviations."""
     chi2 = np.einsum("ri,rij,rj->", effects, C, effects) / k
     freedoms = effects.size
-    return bool(chi2 > freedoms + 4 * np.sqrt(2 * freedoms))
+    of_k = freedoms**2 * 2 * _NEIGHBOURS / max(blocks, 1)
+    return bool(chi2 > freedoms + 4 * np.sqrt(2 * freedoms + of_k))
 
 
-def _weights(problem: Problem, pose: RigidTransform, sums: Sums, gate: float) -> tuple[Array, Array]:
+def _weights(problem: Problem, state: State, sums: Sums, gate: float) -> tuple[Array, Array]:
     """Return the blocks' weights, 0 where a block is not in the sums, and Sy with the sign of J's second column."""
     known = np.isfinite(sums.residual) & (np.abs(sums.residual) < gate)
     variance = np.where(known, problem.stack[3], np.inf)
     cold = problem.cold.usual_variance
-    R = np.asarray(pose.rotation.as_matrix())
+    _, R, _ = problem.map(state)
     normal = [-R[i, 0] * problem.stack[1] - R[i, 1] * problem.stack[2] + R[i, 2] for i in (1, 2)]
     return np.where(known, 1.0 / (variance + cold), 0.0), -normal[0] / normal[1]
 
 
-def _long_run(r: Array, known: NDArray[np.bool_]) -> float:
+def _long_run(r: Array, known: NDArray[np.bool_], fitted: int) -> float:
     """Return the sum of covariances of r with its neighbours up to LAGS blocks away; zeros stand where not known."""
     n, m = r.shape
     total = 0.0
@@ -212,6 +262,8 @@ def _long_run(r: Array, known: NDArray[np.bool_]) -> float:
             pairs = max(int(np.count_nonzero(known[: n - i, left] & known[i:, right])), 1)
             covariance = float(np.sum(r[: n - i, left] * r[i:, right])) / pairs
             total += covariance if i == j == 0 else 2 * covariance
-    alone = float(np.sum(r * r)) / max(int(np.count_nonzero(known)), 1)
-    # Too few blocks make the sum uncertain; it is never far below the variance itself.
-    return max(total, 0.5 * alone)
+    count = max(int(np.count_nonzero(known)), 1)
+    alone = float(np.sum(r * r)) / count
+    # The fit has taken its parameters' share out of every block and each of its neighbours. Too few blocks make the sum
+    # uncertain; it is never far below the variance itself.
+    return max(total / max(1.0 - _NEIGHBOURS * fitted / count, 0.5), 0.5 * alone)
