@@ -112,6 +112,8 @@ class SimulatedOptoNCDT(SimulatedDevice):
     def _start(self) -> str:
         if self.name not in self.world.machine.frame.channels:
             return "E300 No such beam in the frame of this machine"
+        if self.world.following:
+            return "E301 The machine is being followed by another device"
         self._stop()
         self._stream = SensorStream(
             self._server,

@@ -129,6 +129,11 @@ class VirtualWorld:
         """Whether any channel streams."""
         return bool(self._streams or self._triggered)
 
+    @property
+    def following(self) -> bool:
+        """Whether a device follows the axes: its profiles drive the clock."""
+        return bool(self._triggered)
+
     # ------------------------------------------------------------------ what a controller orders
 
     def start(self, schedule: Sequence[Event]) -> None:

@@ -1,0 +1,95 @@
+"""The NC programs that the virtual control understands, and how it refuses the others."""
+
+import numpy as np
+import pytest
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.twin.paths import Path
+
+TRAVEL = {"X": (0.0, 4.0), "Y": (-0.9, 0.9), "Z": (0.0, 1.0)}
+RAPID = 20.0 / 60
+
+
+def run(*lines: str, start: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
+    return interpret("\n".join(lines), start, TRAVEL, RAPID)
+
+
+def test_a_measuring_pass_takes_its_way_over_its_feed() -> None:
+    path = run(
+        "%",
+        "(cold pass; eight artefacts)",
+        "N10 G90 G94 G21",
+        "N20 G1 Y-750.000 F1500 ; to the start",
+        "N30 G4 P2.0",
+        "N40 Y750.5",
+        "N50 G0 Y0",
+        "N60 M30",
+        "%",
+    )
+    assert path.times == pytest.approx(np.cumsum([0, 30, 2, 1500.5 / 25, 750.5 / 20000 * 60]))
+    assert path.places[:, 1].tolist() == [0.0, -0.75, -0.75, 0.7505, 0.0]
+    assert path.rapid.tolist() == [False, False, False, True]
+
+
+def test_words_stand_close_or_apart_in_either_case_with_leading_zeros() -> None:
+    path = run("g01x100.y+20Z.5f600", "G04 P.5", "G 00 X 0", "m02")
+    assert path.places[-2].tolist() == [0.1, 0.02, 0.0005]
+    assert path.times[1] == pytest.approx(np.linalg.norm([0.1, 0.02, 0.0005]) / 0.01)
+
+
+def test_a_program_begins_where_the_machine_is() -> None:
+    path = run("G1 Y200 F1200", "M30", start=(1.0, 0.1, 0.5))
+    assert path.places.tolist() == [[1.0, 0.1, 0.5], [1.0, 0.2, 0.5]]
+    assert path.duration == pytest.approx(5.0)
+
+
+def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end() -> None:
+    path = run("G1 Y0 F100", "G4 P0", "G0 Z0", "M30 (over)", "what stands here is not read")
+    assert path.duration == 0
+    assert path.places.shape == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        ("G91", "write G90"),
+        ("G20 G1 Y1", "inches"),
+        ("M0", "nobody is there"),
+        ("M01", "nobody is there"),
+        ("G2 Y10 I5", "'G2' is not understood; understood are %"),
+        ("G1.5 Y10", "'G1.5' is not understood"),
+        ("M3 S1000", "'M3' is not understood"),
+        ("T1", "'T' is not understood"),
+        ("O1234", "'O' is not understood"),
+        ("G1 A10", "'A' is not understood"),
+        ("G1 Y=10", "'Y=10' is no word"),
+        ("/G1 Y10", "'/G1 Y10' is no word"),
+        ("(a comment without end", "is no word"),
+        ("G1 Y10 Y20", "the same letter twice"),
+        ("G0 G1 Y10", "G0 and G1 in one line"),
+        ("G1 Y900.1", r"Y travels from -900 to 900 mm; found 900\.1"),
+        ("G0 Z-0.5", r"Z travels from 0 to 1000 mm; found -0\.5"),
+        ("G1 Y10 F0", r"at most 20000 mm/min; found 0"),
+        ("G1 Y10 F20001", r"at most 20000 mm/min; found 20001"),
+        ("G4", "expected a dwell as G4 P2.5"),
+        ("G4 X2.0", "expected a dwell"),
+        ("G4 P-1", "expected a dwell"),
+        ("G1 Y10 P5", "belongs to a dwell"),
+    ],
+)
+def test_what_is_not_understood_is_refused_with_its_line(line: str, why: str) -> None:
+    with pytest.raises(InstrumentError, match=rf"^Line 3 '.*': .*{why}"):
+        run("%", "G1 Y100 F1500", line, "M30")
+
+
+def test_a_move_needs_its_kind_and_its_feed() -> None:
+    with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a place, but neither G0 nor G1"):
+        run("Y10", "M30")
+    with pytest.raises(InstrumentError, match=r"Line 2 'G1 Y20': .* no feed F"):
+        run("G0 Y10", "G1 Y20", "M30")
+
+
+def test_a_program_that_was_cut_off_is_refused() -> None:
+    with pytest.raises(InstrumentError, match="without M30 or M2: is it whole"):
+        run("G1 Y100 F1500")
