@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 
 from errormotion.report import (
     budget,
@@ -21,6 +23,8 @@ from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Se
 from errormotion.report.text import fixed, integer, listed
 
 __all__ = ["is_campaign", "part"]
+
+_INDEPENDENT = "noise of the warm scan, independent from scan to scan"
 
 
 def part(source: Source, key: str) -> Part:
@@ -56,9 +60,9 @@ def _key_figures(seen: Campaign) -> list[KeyFigure]:
         if place is not None:
             cell = _value(seen, *place, i)
             found.append(KeyFigure(f"largest {seen.names[freedom]}", cell, unit_of(i)[0], seen.where(*place)))
-    planned, made, absent, refused = crossbeam_quality.counts(seen)
-    held = f"{integer(absent)} without a scan, {integer(refused)} refused"
-    found.append(KeyFigure("registrations", Cell(integer(made)), f"of {integer(planned)}", held))
+    planned, made = crossbeam_quality.made(seen)
+    lost = crossbeam_quality.lost(seen) or "none missing, none refused"
+    found.append(KeyFigure("registrations made", Cell(integer(made)), f"of {integer(planned)}", lost))
     return found
 
 
@@ -154,14 +158,9 @@ def _errors(seen: Campaign, key: str) -> list[Block]:
         crossbeam_figures.by_position(seen, f"{key}-position"),
         crossbeam_figures.by_time(seen, f"{key}-time"),
     ]
-    blocks: list[Block] = [figure for figure in made if figure is not None]
-    if not blocks:
+    if not seen.known[seen.warm].any():
         return [Text("No scan has a valid result.", "warning")]
-    if made[0] is None:
-        blocks.insert(
-            0, Text("One warm-up time or one artefact makes no surface: the errors are shown as curves.", "note")
-        )
-    return [*blocks, _last(seen)]
+    return [*(figure for figure in made if figure is not None), _last(seen)]
 
 
 def _last(seen: Campaign) -> Table:
@@ -184,7 +183,7 @@ def _uncertainty(seen: Campaign) -> list[Block]:
     point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(seen.errors.attrs["functional_point"]))
     return [
         _spans(seen),
-        budget.table(there, f"at {seen.where(*place)} of warm-up"),
+        _budget(there, seen.where(*place)),
         Text(
             f"Functional point ({point}) mm in the frame '{seen.errors.attrs.get('frame', 'not stated')}'. Pose and "
             "lever are one draw for all values; the cold scan of an artefact is one for all its warm scans. "
@@ -192,6 +191,12 @@ def _uncertainty(seen: Campaign) -> list[Block]:
             "note",
         ),
     ]
+
+
+def _budget(there: xr.Dataset, where: str) -> Table:
+    made = budget.table(there, f"at {where} of warm-up")
+    rest = budget.readable("independent")
+    return replace(made, rows=[[_INDEPENDENT if row[0] == rest else row[0], *row[1:]] for row in made.rows])
 
 
 def _spans(seen: Campaign) -> Table:

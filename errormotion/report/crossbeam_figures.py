@@ -21,15 +21,15 @@ from errormotion.report.text import finite, fixed
 
 _MOST = 10  # curves in one panel
 _ROW, _GAP, _FOOT, _HEAD = 1.42, 0.42, 0.46, 0.26  # inch: panels, room between them, below and above
-_LEFT, _BETWEEN, _END = 0.52, 0.46, 0.08  # inch
+_LEFT, _BETWEEN, _END = 0.52, 0.45, 0.08  # inch
 _BAR, _LEGEND = 0.48, 0.3  # inch: colour bar with its numbers, a line of the legend
 
 Paint = Callable[[Axes, int], None]
 
 
 def surfaces(seen: Campaign, key: str) -> Figure | None:
-    """Return the six errors as filled contours over time and position; None for one cycle or one artefact."""
-    if min(seen.values.shape[:2]) < 2 or not seen.known.any():
+    """Return the six errors as filled contours over time and position; None for one warm cycle or one artefact."""
+    if min(seen.warm.size, seen.position.size) < 2 or not seen.known[seen.warm].any():
         return None
     time, order = seen.time / 60, np.argsort(seen.position, kind="stable")
     place = 1e3 * seen.position[order]
@@ -59,7 +59,9 @@ def surfaces(seen: Campaign, key: str) -> Figure | None:
 
 
 def by_position(seen: Campaign, key: str) -> Figure | None:
-    """Return the six errors along the axis, one curve a warm-up time; None where nothing is known."""
+    """Return the six errors along the axis, one curve a warm-up time; None for one artefact or none."""
+    if seen.position.size < 2:
+        return None
     cycles = [k for k in seen.warm if seen.known[k].any()]
     picks = _picked(cycles)
     if not picks:
@@ -88,8 +90,10 @@ def by_position(seen: Campaign, key: str) -> Figure | None:
 
 
 def by_time(seen: Campaign, key: str) -> Figure | None:
-    """Return the six errors over time, one curve an artefact; None where nothing is known."""
-    artefacts = [k for k in np.argsort(seen.position, kind="stable") if seen.known[:, k].any()]
+    """Return the six errors over time, one curve an artefact; None for one warm cycle or none."""
+    if seen.warm.size < 2:
+        return None
+    artefacts = [k for k in np.argsort(seen.position, kind="stable") if seen.known[seen.warm, k].any()]
     picks = _picked(artefacts)
     if not picks:
         return None
@@ -206,10 +210,11 @@ def _six(
             left = _LEFT + (i % 3) * (panel + _BETWEEN + right)
             bottom = foot + (1 - i // 3) * (_ROW + _GAP)
             axes = figure.add_axes((left / canvas.WIDTH, bottom / high, panel / canvas.WIDTH, _ROW / high))
-            axes.set_title(seen.names[freedom])
-            if i % 3 == 0 or not labels[1]:
-                axes.set_ylabel(labels[1] or unit_of(i)[0])
-                axes.yaxis.set_label_coords(-(_LEFT - 0.09 if labels[1] else 0.36) / panel, 0.5)
+            name = seen.names[freedom]
+            axes.set_title(name if labels[1] else f"{name} / {unit_of(i)[0]}")
+            if i % 3 == 0 and labels[1]:
+                axes.set_ylabel(labels[1])
+                axes.yaxis.set_label_coords(-(_LEFT - 0.09) / panel, 0.5)
             if i >= 3:
                 axes.set_xlabel(labels[0])
             if not np.isfinite(seen.values[..., i]).any():

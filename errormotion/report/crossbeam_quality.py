@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.crossbeam_view import Array, Campaign, after, at_y, field, remarks, trimmed, unit_of
+from errormotion.report.crossbeam_view import NO_REASON, Array, Campaign, after, at_y, field, remarks, trimmed, unit_of
 from errormotion.report.document import Block, Cell, Table, Text, estimate, or_dash
 from errormotion.report.text import DASH, finite, fixed, integer, listed, significant
 
@@ -22,23 +22,36 @@ _JITTER = ("in z / µm", "in y / µm")
 _GROUPS = (("", 1), ("predicted", 2), ("by registration", 2), ("residual", 2), ("found", 1), ("line jitter", 2))
 
 
-def counts(seen: Campaign) -> tuple[int, int, int, int]:
-    """Return how many registrations were planned, made, without a scan, and refused."""
-    warm = seen.warm
-    known, absent = seen.known[warm], seen.absent[warm]
-    return known.size, int(known.sum()), int(absent.sum()), int((~known & ~absent).sum())
+def made(seen: Campaign) -> tuple[int, int]:
+    """Return how many registrations were planned, and how many made."""
+    known = seen.known[seen.warm]
+    return known.size, int(known.sum())
+
+
+def lost(seen: Campaign) -> str:
+    """Say how many registrations are missing and why; empty where none is."""
+    holes, absent = ~seen.known[seen.warm], seen.absent[seen.warm]
+    silent = holes & ~absent & (seen.reason[seen.warm] == NO_REASON)
+    kinds = (
+        (absent, "without a scan"),
+        (holes & ~absent & ~silent, "refused"),
+        (silent, "without a stated reason"),
+    )
+    return ", ".join(f"{integer(kind.sum())} {words}" for kind, words in kinds if kind.any())
 
 
 def blocks(seen: Campaign) -> list[Block]:
     """Return the method's remarks, the counts, and the table of registrations."""
     found: list[Block] = [Text(note, "warning") for note in remarks(seen.errors)]
-    planned, made, absent, refused = counts(seen)
+    planned, done = made(seen)
     if not planned:
         return [*found, Text("There is no warm cycle to register.", "warning")]
-    words = f"{integer(made)} of {integer(planned)} registrations were made"
-    if absent or refused:
-        words += f"; {integer(absent)} without a scan, {integer(refused)} refused"
-    found.append(Text(f"{words}.", "plain" if made == planned else "warning"))
+    words = f"{integer(done)} of {integer(planned)} registrations were made"
+    if done < planned:
+        words += f"; {lost(seen)}"
+    found.append(Text(f"{words}.", "plain" if done == planned else "warning"))
+    if done and not np.isfinite(_numbers(seen)[seen.known]).any():
+        return [*found, Text("The result holds no figures of the registrations' quality.", "note")]
     found.append(_by_scan(seen) if planned <= _MOST else _by_cycle(seen))
     drift = _drift(seen)
     return [*found, drift] if drift is not None else found
@@ -117,13 +130,13 @@ def _by_cycle(seen: Campaign) -> Table:
     numbers = _numbers(seen)
     rows: list[list[Cell | str]] = []
     for k in seen.warm:
-        made = numbers[k][seen.known[k]]
-        of_cycle = f"{after(seen.time[k])}: {len(made)} of {seen.position.size}"
-        if not len(made):
+        each = numbers[k][seen.known[k]]
+        of_cycle = f"{after(seen.time[k])}: {len(each)} of {seen.position.size}"
+        if not len(each):
             reasons = "; ".join(dict.fromkeys(seen.reason[k]))
             rows.append([of_cycle, Cell(DASH, reason=reasons), *[DASH] * 8])
             continue
-        worst = [finite(np.min if i == 5 else np.max, column) for i, column in enumerate(made.T)]
+        worst = [finite(np.min if i == 5 else np.max, column) for i, column in enumerate(each.T)]
         rows.append([of_cycle, *_cells(np.array(worst))])
     holes = [(k, j) for k in seen.warm for j in range(seen.position.size) if not seen.known[k, j]]
     told: dict[str, list[str]] = {}
@@ -170,17 +183,17 @@ def _moved(seen: Campaign) -> list[Block]:
     since = np.full(moved.size, np.nan)
     if "moved_since" in seen.errors and seen.errors["moved_since"].dims == ("position",):
         since = np.asarray(seen.errors["moved_since"].values, float)
-    made: list[Block] = []
+    told: list[Block] = []
     for j in np.flatnonzero(moved):
         when = f" since the scan at {after(since[j])}" if math.isfinite(since[j]) else ""
-        made.append(
+        told.append(
             Text(
                 f"The artefact at {at_y(seen.position[j])} moved on the table{when}. From then on its values "
                 "hold that movement beside the error of the axis.",
                 "warning",
             )
         )
-    return made
+    return told
 
 
 def _repeats(seen: Campaign) -> list[Block] | None:

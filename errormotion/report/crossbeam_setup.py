@@ -10,29 +10,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from errormotion.report import canvas
+from errormotion.report import canvas, crossbeam_pose
 from errormotion.report.canvas import BLUE, GREEN, PURPLE, VERMILLION
-from errormotion.report.crossbeam_view import Array, Campaign, field, millimetres
-from errormotion.report.document import Block, Cell, Figure, Table, Text, estimate
+from errormotion.report.crossbeam_view import Array, Campaign, millimetres
+from errormotion.report.document import Block, Cell, Figure, Text
 from errormotion.report.text import fixed
 
-_POSE = ("a", "b", "g", "dx", "dy", "dz")
-_MEANING = (
-    "rotation about x",
-    "rotation about y",
-    "rotation about z",
-    "shift in x",
-    "shift in y",
-    "shift in z, lift included",
-)
 _BEYOND = 0.25  # of the beam drawn beyond the first and the last artefact, m
+_SHORTEST = 1.2  # drawn beam, m
 _BEAM = 0.14  # side of the drawn beam, m
 _CARRIAGE = 0.2  # width of the drawn carriage, m
 _BLOCK = 0.06  # height of a drawn artefact, m
 _ROOM = 0.66  # left of a view, inch
-_TALLEST = 4.3  # of the drawing, inch
+_TALLEST = 3.7  # of the drawing, inch
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ def setup_of(seen: Campaign) -> Setup | None:
     lever = np.asarray(errors["lever"].values, float)
     if lever.shape != (3,) or not np.isfinite(lever).all():
         return None
-    pose = pose_of(seen)
+    pose = crossbeam_pose.matrix(errors)
     profiler = np.full(3, np.nan) if pose is None else pose[:3, 3]
     patch, below = np.full(2, np.nan), 0.0
     if "surface_x" in errors and "surface_y" in errors:
@@ -70,16 +61,6 @@ def setup_of(seen: Campaign) -> Setup | None:
     return Setup(lever, profiler, below, patch)
 
 
-def pose_of(seen: Campaign) -> Array | None:
-    """Return the pose (4, 4) of the profiler in the tool frame; None where it is not known or no pose."""
-    if "profiler_pose" not in seen.errors or set(seen.errors["profiler_pose"].dims) != {"row", "column"}:
-        return None
-    pose = field(seen.errors, "profiler_pose", "row", "column")
-    if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1) > 1e-3:
-        return None
-    return pose
-
-
 def blocks(seen: Campaign, key: str) -> list[Block]:
     """Return drawing and tables of the set-up, or words for what is not known."""
     setup, tables = setup_of(seen), _tables(seen)
@@ -89,51 +70,26 @@ def blocks(seen: Campaign, key: str) -> list[Block]:
 
 
 def _tables(seen: Campaign) -> list[Block]:
-    pose, found = pose_of(seen), []
+    pose = crossbeam_pose.matrix(seen.errors)
     if pose is None:
         return [Text("The result does not hold the pose of the profiler.", "note")]
-    angles = Rotation.from_matrix(pose[:3, :3]).as_euler("XYZ")
-    values = [*(1e3 * angles), *(1e3 * pose[:3, 3])]
-    sigma = _pose_uncertainty(seen)
-    rows: list[list[Cell | str]] = []
-    for i, name in enumerate(_POSE):
-        cell = estimate(values[i], 2e3 * sigma[i], digits=5)
-        if cell.reason:
-            cell = Cell(fixed(values[i], 3, signed=True), reason="no uncertainty is stated: the pose counts as exact")
-        rows.append([f"{name}, {_MEANING[i]}", "mrad" if i < 3 else "mm", cell])
+    more: list[list[Cell | str]] = []
     if "lever" in seen.errors:
-        for axis, value in zip("xyz", np.asarray(seen.errors["lever"].values, float), strict=True):
-            rows.append([f"lever in {axis}", "mm", fixed(1e3 * value, 3, signed=True)])
-    found.append(
-        Table(
-            "Pose of the profiler in the tool frame, T · Rx(a) · Ry(b) · Rz(g), and the lever from the carriage to the "
-            "tool frame. After ±: expanded uncertainty, k = 2.",
-            ["parameter", "unit", "value"],
-            rows,
-        )
-    )
-    return list(found)
-
-
-def _pose_uncertainty(seen: Campaign) -> Array:
-    """Return the standard uncertainties of a b g dx dy dz, rad and m; NaN where not stated."""
-    errors = seen.errors
-    if "pose_u" not in errors or errors["pose_u"].shape != (6,):
-        return np.full(6, np.nan)
-    sigma = np.asarray(errors["pose_u"].values, float)
-    labels = [str(label) for label in errors["pose_parameter"].values] if "pose_parameter" in errors.coords else _POSE
-    by_name = dict(zip(labels, sigma, strict=True))
-    return np.array([by_name.get(name, math.nan) for name in _POSE])
+        lever = 1e3 * np.asarray(seen.errors["lever"].values, float)
+        more += [
+            [f"lever in {axis}", "mm", fixed(value, 3, signed=True)] for axis, value in zip("xyz", lever, strict=True)
+        ]
+    return [crossbeam_pose.table(pose, crossbeam_pose.uncertainty(seen.errors), more)]
 
 
 def _figure(seen: Campaign, setup: Setup, key: str) -> Figure:
     shown = seen.shown()
     active = seen.position[shown[1]] if shown else float(np.median(seen.position))
-    low, high = float(seen.position.min()) - _BEYOND, float(seen.position.max()) + _BEYOND
+    low, high = _beam(seen)
     ground = setup.head[2] + setup.below - _BLOCK
     y = np.array([min(low, active + setup.lever[1] - 0.2), max(high, active + setup.lever[1] + 0.2)])
     x = np.array([min(0.0, setup.head[0]) - 0.3, max(0.0, setup.head[0]) + 0.3])
-    z = np.array([min(ground - 0.12, -0.3), max(0.22, setup.head[2] + 0.1)])
+    z = np.array([min(ground - 0.17, -0.3), max(0.22, setup.head[2] + 0.1)])
     room = 2 * _ROOM + 0.1
     scale = min((canvas.WIDTH - room) / (np.ptp(x) + np.ptp(y)), _TALLEST / np.ptp(z))
     tall = canvas.stack_height([scale * np.ptp(z)])
@@ -174,9 +130,16 @@ def _moved(seen: Campaign) -> NDArray[np.bool_]:
     return np.asarray(np.nan_to_num(np.asarray(seen.errors["moved"].values, float)), dtype=bool)
 
 
+def _beam(seen: Campaign) -> tuple[float, float]:
+    """Return the ends of the drawn beam, m: its true ones are not known."""
+    low, high = float(seen.position.min()), float(seen.position.max())
+    more = max(_BEYOND, (_SHORTEST - (high - low)) / 2)
+    return low - more, high + more
+
+
 def _front(axes: Axes, seen: Campaign, setup: Setup, active: float, scale: float) -> None:
     """Draw the view along X: the beam lengthwise, all artefacts."""
-    low, high = 1e3 * (seen.position.min() - _BEYOND), 1e3 * (seen.position.max() + _BEYOND)
+    low, high = (1e3 * end for end in _beam(seen))
     half = 5e2 * _BEAM
     axes.fill([low, high, high, low], [-half, -half, half, half], facecolor="#ececec", edgecolor="none")
     for side in (-half, half):
@@ -187,7 +150,7 @@ def _front(axes: Axes, seen: Campaign, setup: Setup, active: float, scale: float
     top = 1e3 * (setup.head[2] + setup.below)
     moved = _moved(seen)
     shift = 1e3 * setup.head[1]
-    names_apart = 72 * scale * np.ptp(np.sort(seen.position)[:2]) if seen.position.size > 1 else 99.0  # points
+    crowded = 72 * scale * np.diff(np.sort(seen.position)).min(initial=1.0) < 18  # points
     for i, place in enumerate(seen.position):
         middle = 1e3 * place + shift
         colour = VERMILLION if moved[i] else GREEN
@@ -199,9 +162,9 @@ def _front(axes: Axes, seen: Campaign, setup: Setup, active: float, scale: float
             (middle, top - 1e3 * _BLOCK),
             xytext=(0, -2),
             textcoords="offset points",
-            ha="center" if names_apart > 22 else "right",
+            ha="right" if crowded else "center",
             va="top",
-            rotation=0 if names_apart > 22 else 45,
+            rotation=60 if crowded else 0,
             rotation_mode="anchor",
             fontsize=6.5,
             color=colour if moved[i] else "#333333",

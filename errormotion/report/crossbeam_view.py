@@ -93,8 +93,8 @@ class Campaign:
         return np.full(sizes, np.nan)
 
     def largest(self, freedom: int) -> tuple[int, int] | None:
-        """Return (cycle, artefact) of the largest error of a freedom; None where it is unknown everywhere."""
-        size = np.abs(self.values[..., freedom])
+        """Return (cycle, artefact) of the largest error of a freedom when warm; None where it is unknown."""
+        size = np.where(self.reference[:, None], np.nan, np.abs(self.values[..., freedom]))
         if not np.isfinite(size).any():
             return None
         cycle, artefact = np.unravel_index(int(np.nanargmax(size)), size.shape)

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import beam, crossbeam, generic, provenance, spindle
+from errormotion.report import beam, crossbeam, crossbeam_pose, generic, provenance, spindle
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH
@@ -117,6 +117,8 @@ def write_run_report(run_folder: Path) -> Path:
 def _builder(errors: xr.Dataset) -> Builder:
     if crossbeam.is_campaign(errors):
         return crossbeam.part
+    if crossbeam_pose.is_pose(errors):
+        return crossbeam_pose.part
     return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 
