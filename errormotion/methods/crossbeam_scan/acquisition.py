@@ -193,7 +193,7 @@ class _Campaign:
         """Yield all that is still to be measured."""
         broken = 0
         if not self.move.virtual:
-            self._try_out()
+            prepare_profiler(self.profiler)
         while self.next < self.plan.cycles:
             if self.next >= self.plan.cold:
                 yield from self._warm_up()
@@ -207,7 +207,7 @@ class _Campaign:
                     raise InstrumentError(
                         f"{PATIENCE} passes in a row broke, the last one, number {self.next}: {error.reason}"
                     ) from error
-                self._reopen()
+                reopen(self.profiler)
                 if self.next < self.plan.cold:
                     continue  # the machine is still cold: once more
             else:
@@ -293,19 +293,21 @@ class _Campaign:
         self.pending.add(line, self.next, now - since, self.origin)
         yield self.pending.hand_over()
 
-    def _reopen(self) -> None:
-        """Begin anew with the profiler; where it does not come back the next pass breaks as well."""
-        with suppress(InstrumentError):
-            self.profiler.close()
-        try:
-            self.profiler.open()
-        except InstrumentError as error:
-            log.warning("the profiler does not come back: %s", error)
 
-    def _try_out(self) -> None:
-        """Listen once while nothing moves: whatever the profiler has to prepare is prepared when the axis begins."""
-        with suppress(InstrumentError), closing(self.profiler.stream(block=1)) as stream:
-            next(stream, None)
+def reopen(profiler: Any) -> None:
+    """Begin anew with a profiler; where it does not come back the next pass breaks as well."""
+    with suppress(InstrumentError):
+        profiler.close()
+    try:
+        profiler.open()
+    except InstrumentError as error:
+        log.warning("the profiler does not come back: %s", error)
+
+
+def prepare_profiler(profiler: Any) -> None:
+    """Listen once while nothing moves: whatever a driver has to prepare is prepared when the axis begins."""
+    with suppress(InstrumentError), closing(profiler.stream(block=1)) as stream:
+        next(stream, None)
 
 
 def _whole(done: xr.Dataset, cycle: int, end: float) -> bool:
