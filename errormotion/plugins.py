@@ -159,7 +159,8 @@ class Method(Protocol):
     """What is measured and how it becomes an error dataset.
 
     A method may also have ``follow(settings)``: it returns a function that takes each acquired dataset and returns a
-    line of text for the person at the machine.
+    line of text for the person at the machine. And it may have ``programs(settings)``: the NC programs with which a
+    machine makes the test, the name of each file to its text.
     """
 
     info: ClassVar[MethodInfo]

@@ -107,6 +107,20 @@ def import_(
 
 @app.command()
 @guarded
+def program(
+    campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
+    out: Annotated[Path, typer.Option(help="The folder for the programs; no file in it is replaced.")],
+    test: Annotated[str | None, typer.Option(help="One test; default: every test that has programs.")] = None,
+    json_: Json = False,
+) -> None:
+    """Write the NC programs with which a machine makes the tests of a campaign."""
+    from errormotion.cli import programs
+
+    programs.write(campaign, test, out, json_)
+
+
+@app.command()
+@guarded
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,

@@ -137,7 +137,9 @@ def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array,
     heights = np.concatenate([part.heights for part in parts])
     known = np.isfinite(y)
     y, heights = y[known], heights[known]
-    place = np.rint(y / settings.line_pitch).astype(np.int64) + count // 2
+    pitch = settings.line_pitch
+    phase = y[0] - pitch * round(y[0] / pitch)  # of the lines that came: none is on the verge of two places
+    place = np.rint((y - phase) / pitch).astype(np.int64) + count // 2
     inside = (place >= 0) & (place < count)
     if np.unique(place[inside]).size < 0.9 * count:
         raise MethodError(
@@ -147,7 +149,7 @@ def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array,
         )
     out: Heights = np.full((count, heights.shape[1]), np.nan, dtype=np.float32)
     out[place[inside]] = heights[inside]
-    at = (np.arange(count) - count // 2) * settings.line_pitch
+    at: Array = (np.arange(count) - count // 2) * pitch + phase
     at[place[inside]] = y[inside]
     invalid: dict[str, int] = {}
     for part in parts:
