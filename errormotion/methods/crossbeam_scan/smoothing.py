@@ -58,6 +58,9 @@ class Smooth:
         Of the white noise, best by evidence, in units of the value per place**(order - 1/2); 0: a polynomial.
     evidence : ndarray, (...)
         Log of the likelihood of that amplitude over that of a polynomial; 0 where a polynomial is enough.
+    log_likelihood : ndarray, (...)
+        Of that amplitude, comparable between points at the same ``places`` with others of them left out. Curves that
+        share an amplitude share this and the evidence.
     used : ndarray of int, (...)
         Points that are not NaN.
     order : int
@@ -69,6 +72,7 @@ class Smooth:
     weights: Array
     amplitude: Array
     evidence: Array
+    log_likelihood: Array
     used: NDArray[np.int64]
     order: int
 
@@ -169,17 +173,19 @@ def smooth(
 
     curves = np.full((len(y), to.size), np.nan)
     spread, W = np.full_like(curves, np.nan), np.full((len(y), to.size, n), np.nan)
-    amplitude, evidence = np.full(len(y), np.nan), np.full(len(y), np.nan)
+    amplitude, evidence, likelihood = np.full((3, len(y)), np.nan)
     for k, one in zip(np.flatnonzero(enough), series, strict=True):
         if one.amplitudes.size:
             curves[k], spread[k], W[k] = one.mixture()
-            amplitude[k], evidence[k] = one.best * basis.span ** (0.5 - order), one.evidence
+            amplitude[k] = one.best * basis.span ** (0.5 - order)
+            evidence[k], likelihood[k] = one.evidence, one.best_likelihood
     return Smooth(
         curves.reshape(*batch, to.size),
         spread.reshape(*batch, to.size),
         W.reshape(*batch, to.size, n),
         amplitude.reshape(batch),
         evidence.reshape(batch),
+        likelihood.reshape(batch),
         known.sum(axis=-1).reshape(batch),
         order,
     )
@@ -229,6 +235,7 @@ def smooth_twists(
         np.stack([one.weights for one in each], axis=batch),
         np.stack([one.amplitude for one in each], axis=batch),
         np.stack([one.evidence for one in each], axis=batch),
+        np.stack([one.log_likelihood for one in each], axis=batch),
         np.stack([one.used for one in each], axis=batch),
         min(one.order for one in each),
     )
@@ -301,10 +308,12 @@ class _Series:
     fit: Array  # weights of the points in it, (m, n)
     to_contrast: Array  # weights of the points in each contrast, (c, n)
     noise: Array  # variance of the polynomial by the noise of the points, (m,)
+    unit: float  # log of the density of the contrasts over that of the points
     amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
     share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
     best: float = np.nan
     evidence: float = np.nan
+    best_likelihood: float = np.nan
 
     @classmethod
     def of(cls, basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_]) -> _Series:
@@ -330,12 +339,13 @@ class _Series:
             H @ inside.T / sigma,
             rest.T / sigma,
             (H**2).sum(axis=1),
+            -float(np.log(sigma).sum() + np.log(np.abs(np.diag(R))).sum()) - gain.size * np.log(2 * np.pi) / 2,
         )
 
     def log_likelihood(self, amplitudes: Array) -> Array:
-        """Return that of each amplitude, up to a constant."""
+        """Return that of each amplitude, whatever the polynomial."""
         grown = 1 + amplitudes[:, None] * self.gain
-        return np.asarray(-(self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
+        return np.asarray(self.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
 
     def mixture(self) -> tuple[Array, Array, Array]:
         """Return values (m,), variance (m,) and weights (m, n) over all amplitudes."""
@@ -362,13 +372,20 @@ def _weigh(group: list[_Series]) -> None:
     def likelihood(amplitudes: Array) -> Array:
         return np.asarray(sum(one.log_likelihood(amplitudes) for one in group))
 
-    amplitudes = np.geomspace(low, high, _LOOKED_AT)
+    amplitudes = _spaced(low, high, _LOOKED_AT)
     log = likelihood(amplitudes)
     top = int(log.argmax())
     matter = np.flatnonzero(log >= log[top] + np.log(_NEGLIGIBLE))
     first, last = max(matter[0] - 1, 0), min(matter[-1] + 1, _LOOKED_AT - 1)
-    chosen = np.geomspace(amplitudes[first], amplitudes[last], _AVERAGED)
+    chosen = _spaced(amplitudes[first], amplitudes[last], _AVERAGED)
     share = np.exp(likelihood(chosen) - log[top])
+    none = float(likelihood(np.zeros(1))[0])
     for one in group:
         one.amplitudes, one.share = chosen, share / share.sum()
-        one.best, one.evidence = (np.sqrt(amplitudes[top]), log[top] + (contrasts**2).sum() / 2) if top else (0.0, 0.0)
+        one.best, one.best_likelihood = (np.sqrt(amplitudes[top]), log[top]) if top else (0.0, none)
+        one.evidence = one.best_likelihood - none
+
+
+def _spaced(low: float, high: float, n: int) -> Array:
+    """Return n numbers from low to high, each the same times the one before."""
+    return np.asarray(np.exp(np.linspace(np.log(low), np.log(high), n)))
