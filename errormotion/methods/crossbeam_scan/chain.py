@@ -97,7 +97,7 @@ def carriage_errors(
     E = transform(M, to_carriage)
     errors = np.concatenate(
         [
-            _root(pose_covariance) @ pose_twists(profiler_pose, x),
+            root(pose_covariance) @ pose_twists(profiler_pose, x),
             np.asarray(lever_uncertainty, dtype=float)[:, None] * np.eye(3, 6),
         ]
     )
@@ -166,7 +166,7 @@ def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: 
     return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
 
 
-def _root(covariance: ArrayLike | None) -> Array:
+def root(covariance: ArrayLike | None) -> Array:
     """Return rows whose outer products add up to the covariance, (6, 6), largest first in units of 10 um and 1 mrad."""
     if covariance is None:
         return np.zeros((6, 6))

@@ -26,6 +26,17 @@ class PoseSettings(PluginSettings):
     place_uncertainty: Length = Field(default=5e-3, ge=0, description="standard uncertainty of each length")
 
 
+class Layout(PluginSettings):
+    """The artefacts and the profiler that a plan assumes: waves along both directions, and what is wrong with lines."""
+
+    relief: Length = Field(default=1.5e-3, gt=0, description="amplitude of the waves")
+    wavelength: tuple[Length, Length] = Field(default=(28e-3, 36e-3), description="of the waves along x and y")
+    width: Length = Field(default=40e-3, gt=0, description="length of a profile")
+    points: int = Field(default=3200, ge=16, description="points of a profile")
+    jitter_z: Length = Field(default=0.5e-6, ge=0, description="standard deviation of a line's height")
+    jitter_y: Length = Field(default=2e-6, ge=0, description="standard deviation of a line's place along the feed")
+
+
 class Settings(PluginSettings):
     """Settings of ``crossbeam_scan``."""
 
@@ -88,10 +99,13 @@ class Settings(PluginSettings):
         default="height_map", description="what registers a warm scan on the cold one"
     )
     line_effects: bool = Field(default=True, description="look for jitter from line to line, and take it out")
-    strain: Literal["neighbours", "free", "rigid"] = Field(
-        default="neighbours",
-        description="how the carriage turns along a scan: by the errors at the neighbouring artefacts, as an unknown "
-        "of each scan, or not at all",
+    strain: Literal["free", "guided", "rigid"] = Field(
+        default="free",
+        description="how the carriage moves along a scan: with a drift of its own in each, with pitch and yaw that "
+        "follow the guide besides, or not at all (each scan a rigid picture, as published)",
+    )
+    guide_uncertainty: Angle = Field(
+        default=1e-6, gt=0, description="standard uncertainty of pitch and yaw against the slopes of the guide"
     )
     scale_uncertainty: float = Field(
         default=0.0, ge=0, description="relative standard uncertainty of the profiler's scale between cold and warm"
@@ -108,6 +122,9 @@ class Settings(PluginSettings):
         description="standard deviation with which the machine comes back, below which nothing moved",
     )
     repeatability_turn: Angle = Field(default=1e-6, gt=0, description="the same of its angles")
+
+    # Planning
+    layout: Layout = Field(default_factory=Layout, description="the artefacts and the profiler that a plan assumes")
 
     @model_validator(mode="after")
     def _fits(self) -> Settings:

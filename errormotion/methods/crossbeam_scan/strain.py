@@ -12,8 +12,10 @@ displacements c per metre of feed. By equal coefficients of 1, x, z and s,
 
     EC = f_y EC_Q,   EA = f_y EA_Q,   EB = EB_Q - f_z EC_Q,   T = B T_Q,   g = B (c + R_Q x e_y) .
 
-Roll and yaw of the maps show nearly as g does; what tells them apart is the artefact's relief alone. But g is the slope
-of T along the axis, and T is known at every artefact: by a spline through the neighbours the slope is, too.
+A line shows nothing of its own yaw and pitch but what its relief tells: pitch EA moves a point along the feed by -z EA.
+A rigid picture would show both by its slope along the feed, but that is g, and the carriage may turn without it. Where
+the carriage follows a guide, pitch and yaw are the slopes of the guide, EA = dEZ/dY and EC = -dEX/dY: `guided` adds
+this with a stated uncertainty, the slopes being those of a spline through the artefacts.
 """
 
 from __future__ import annotations
@@ -33,26 +35,26 @@ Array = NDArray[np.float64]
 
 FEED = ("feed_x", "feed_y", "feed_z")
 """Parameters of the registration that take the drift along a scan."""
-_DRIFT = slice(6, 9)
 # Metres and radians of one size, so that the normal equations are well scaled.
-_UNIT = np.array([1e-6] * 3 + [1e-5] * 3 + [1e-5] * 3)
-_LEAST_SLOPE_ERROR = 1e-8
+_UNIT = np.array([1e-6] * 3 + [1e-5] * 3)
+# (rotation, displacement, sign): EA = dEZ/dY, EC = -dEX/dY
+_GUIDE = ((3, 2, 1.0), (5, 0, -1.0))
 
 
 @dataclass(frozen=True)
-class Motions:
-    """How the profiler moved at every artefact.
+class Guided:
+    """Twists of the profiler at every artefact, the guide taken into account.
 
     Attributes
     ----------
     twist : ndarray (n, 6)
         (T, r) at the profiler's origin and in its frame, m and rad.
     covariance : ndarray (n, 6, 6)
-        Of these, the registration's noise alone.
-    gain : ndarray (6 n, 9 n)
-        What takes all observations (T, r, g) to the twists.
-    slope_error : ndarray (3,)
-        What the spline's slope is taken to be off by, standard deviation, 1.
+        Of these.
+    gain : ndarray (6 n, 6 n)
+        What takes the twists given to these.
+    slope_error : ndarray (2,)
+        What the spline's slopes of EZ and EX are taken to be off by, standard deviation, 1.
     """
 
     twist: Array
@@ -74,11 +76,6 @@ def from_maps(profiler_pose: RigidTransform) -> Array:
     return W
 
 
-def rigid(profiler_pose: RigidTransform) -> Array:
-    """Return the matrix (9, 6) that takes (T_Q, R_Q) to (T, r, g) where the picture counts as rigid."""
-    return from_maps(profiler_pose)[:, :6]
-
-
 def slopes(places: ArrayLike) -> tuple[Array, Array]:
     """Return two matrices (n, n) that take values at places to their slopes there: by a cubic spline, and by less.
 
@@ -95,42 +92,42 @@ def slopes(places: ArrayLike) -> tuple[Array, Array]:
     return fine, np.asarray(np.gradient(np.eye(n), y, axis=0, edge_order=1 if n == 3 else 2))
 
 
-def combined(observations: ArrayLike, covariance: ArrayLike, places: ArrayLike, *, neighbours: bool = True) -> Motions:
-    """Return the motion of the profiler at every artefact from all registrations of one cycle: least squares.
+def guided(
+    twist: ArrayLike, covariance: ArrayLike, places: ArrayLike, to_carriage: ArrayLike, uncertainty: float
+) -> Guided:
+    """Return the twists of one cycle when pitch and yaw of the carriage follow the guide: least squares of all places.
 
     Parameters
     ----------
-    observations : (n, 9)
-        (T, r, g) of every artefact.
-    covariance : (n, 9, 9)
-        Of these.
+    twist, covariance : (n, 6), (n, 6, 6)
+        (T, r) of every artefact by its registration alone, m and rad.
     places : (n,)
         Of the artefacts along the axis, m, rising.
-    neighbours : bool
-        Whether g is the slope of T along the axis; else it is an unknown of every scan.
+    to_carriage : (6, 6)
+        Takes twists of the profiler to errors of the carriage.
+    uncertainty : float
+        Standard uncertainty of EA - dEZ/dY and of EC + dEX/dY, rad. What the spline misses of the slopes is added.
     """
-    o, C, y = (np.asarray(value, dtype=float) for value in (observations, covariance, places))
-    n = len(y)
-    if not neighbours or n < 2:
-        gain = block_diag(*[np.eye(6, 9)] * n)
-        return Motions(o[:, :6].copy(), C[:, :6, :6].copy(), gain, np.full(3, np.inf))
-    fine, coarse = slopes(y)
-    A = np.zeros((n, 9, n, 6))
-    for k in range(n):
-        A[k, :6, k] = np.eye(6)
-        for axis in range(3):
-            A[k, 6 + axis, :, axis] = fine[k]
-    missed = np.sqrt(np.mean(((fine - coarse) @ o[:, :3]) ** 2, axis=0))
-    missed = np.maximum(missed, _LEAST_SLOPE_ERROR)
-    unit = _UNIT[:6]
-    scaled = (A / _UNIT[:, None, None] * unit).reshape(9 * n, 6 * n)
-    noise = C.copy()
-    noise[:, range(6, 9), range(6, 9)] += missed**2
-    weight = np.linalg.inv(noise / np.outer(_UNIT, _UNIT))
-    weighted = np.einsum("kij,kjm->kim", weight, scaled.reshape(n, 9, 6 * n)).reshape(9 * n, 6 * n)
-    factor = cho_factor(scaled.T @ weighted)
-    gain = cho_solve(factor, weighted.T)
+    e, C, A = (np.asarray(value, dtype=float) for value in (twist, covariance, to_carriage))
+    n = len(e)
+    if n < 2:
+        return Guided(e.copy(), C.copy(), np.eye(6 * n), np.zeros(2))
+    fine, coarse = slopes(places)
+    E = e @ A.T
+    rows, errors = np.zeros((2, n, n, 6)), np.zeros(2)
+    missed = fine - coarse
+    for i, (turn, way, sign) in enumerate(_GUIDE):
+        by_noise = np.mean(missed**2 @ np.einsum("a,kab,b->k", A[way], C, A[way]))
+        errors[i] = np.sqrt(max(np.mean((missed @ E[:, way]) ** 2) - by_noise, 0.0))
+        rows[i] = np.eye(n)[:, :, None] * A[turn] - sign * fine[:, :, None] * A[way]
+    sigma = np.sqrt(uncertainty**2 + errors**2)
+    scaled = (rows * _UNIT).reshape(2, n, 6 * n) / sigma[:, None, None]
+    weight = block_diag(*np.linalg.inv(C / np.outer(_UNIT, _UNIT)))
+    prior = np.einsum("ika,ikb->ab", scaled, scaled)
+    factor = cho_factor(weight + prior)
+    gain = cho_solve(factor, weight)
     inverse = cho_solve(factor, np.eye(6 * n))
-    blocks = np.stack([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]) * np.outer(unit, unit)
-    gain = gain * np.tile(unit, n)[:, None] / np.tile(_UNIT, n)
-    return Motions((gain @ o.ravel()).reshape(n, 6), blocks, gain, missed)
+    blocks = np.stack([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]) * np.outer(_UNIT, _UNIT)
+    unit = np.tile(_UNIT, n)
+    gain = gain * unit[:, None] / unit
+    return Guided((gain @ e.ravel()).reshape(n, 6), blocks, gain, errors)

@@ -1,0 +1,66 @@
+"""The plugin ``crossbeam_scan``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
+from errormotion.plugins import MethodInfo, Needs, PluginSettings
+
+if TYPE_CHECKING:
+    pass
+
+SCHEMA = "errormotion.raw.crossbeam_scan/1"
+
+
+class CrossbeamScan:
+    """How the carriage on a crossbeam moves and turns as the machine warms up, from scans of artefacts beneath it."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="crossbeam_scan",
+        summary="Six thermal errors of a crossbeam's axis from a line profiler that scans artefacts again and again",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "errors that the cold machine has already: all is relative to the cold scans",
+            "what moves the table and its artefacts along with the crossbeam",
+            "errors between two artefacts that neither of them shows",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(
+        instruments=("line_profiler",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
+    )
+    Settings: ClassVar[type[PluginSettings]] = ScanSettings
+
+    def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; stays as it is and may be larger than memory.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset does not follow its schema; all violations at once.
+        MethodError
+            The data do not determine the answer.
+        """
+        settings = settings or ScanSettings()
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        validate(checked)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"crossbeam_scan reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        if "pocket_radius" in checked:
+            from errormotion.methods.crossbeam_scan.pose_errors import identify_pose
+
+            return identify_pose(checked, settings, self.info.id, self.info.version)
+        from errormotion.methods.crossbeam_scan.identification import identify_scans
+
+        return identify_scans(checked, settings, self.info.id, self.info.version)

@@ -1,0 +1,111 @@
+"""What to expect of a campaign before anything is measured: the covariance of its errors.
+
+The artefacts are waves along x and y. From their slopes comes the information of one registration, line by line: a line
+that jitters along z and y with the variances t (of both scans) has two unknowns of its own, with B its columns for
+them, and what it says of the twist is A - B (1/t + C)^-1 B^T, all in units of the noise. Then the chain, as for real
+registrations.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.kinematics.twists import transform_covariance
+from errormotion.methods.crossbeam_scan import strain
+from errormotion.methods.crossbeam_scan.carriage import Rig
+from errormotion.methods.crossbeam_scan.chain import carriage_adjoint, carriage_errors
+from errormotion.methods.crossbeam_scan.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.settings import PoseSettings
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.plugins import MethodInfo
+
+Array = NDArray[np.float64]
+
+EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
+"""Errors (m, rad) of which a wrong pose and lever take their share in a plan."""
+_CELLS = 100
+
+
+def plan(info: MethodInfo, settings: Settings) -> xr.Dataset:
+    """Return an error dataset of zeros whose covariance is the one to expect, over (time, position).
+
+    Raises
+    ------
+    MethodError
+        No ``positions`` in the settings.
+    """
+    if not settings.positions:
+        raise MethodError("A plan needs the places of the artefacts: set positions, such as ['350 mm', '550 mm']")
+    places = np.array(settings.positions)
+    pose = settings.profiler_pose or PoseSettings()
+    rig = Rig(given(pose), np.array(settings.lever), given_covariance(pose), np.array(settings.lever_uncertainty))
+    W, A = strain.from_maps(rig.pose)[:6], carriage_adjoint(rig.pose, rig.lever)
+    noise = np.tile(W @ registration_covariance(settings) @ W.T, (places.size, 1, 1))
+    if settings.strain == "guided":
+        twist = np.zeros((places.size, 6))
+        noise = strain.guided(twist, noise, places, A, settings.guide_uncertainty).covariance
+    own = transform_covariance(noise, A)
+    shared = carriage_errors(
+        EXPECTED, np.zeros((6, 6)), rig.pose, rig.lever,
+        pose_covariance=rig.pose_covariance, lever_uncertainty=rig.lever_uncertainty,
+    )  # fmt: skip
+    time = np.array([0.0, *settings.warm_up])
+    shape = (time.size, places.size)
+    covariance = np.broadcast_to(own, (*shape, 6, 6)).copy()
+    # The influence is stated at the carriage's origin for errors of the size expected, for these are not known yet.
+    influence = np.broadcast_to(shared.influence[:, None, None], (len(shared.sources), *shape, 6)).copy()
+    covariance += np.einsum("stki,stkj->tkij", influence, influence)
+    covariance[0], influence[:, 0] = 0.0, 0.0
+    return build_errors(
+        np.zeros((*shape, 6)),
+        covariance,
+        dims=("time", "position"),
+        coords={"time": time, "y": ("position", places, {"units": "m"})},
+        component="Y",
+        machine="plan",
+        frame="carriage, machine directions",
+        functional_point=np.zeros(3),
+        reference="planned, not measured",
+        method=info.id,
+        method_version=info.version,
+        provenance=provenance.make(settings, None, None, steps=["plan"]),
+        influence=influence,
+        sources=shared.sources,
+        source_groups=shared.source_groups,
+    )
+
+
+def registration_covariance(settings: Settings) -> Array:
+    """Return the covariance (9, 9) of (T_Q, R_Q, drift) of one registration to expect; zeros for a rigid picture."""
+    layout = settings.layout
+    x = (np.arange(_CELLS) + 0.5) / _CELLS * layout.width - layout.width / 2
+    lines = max(2, round(settings.scan_length / settings.line_pitch))
+    y = np.linspace(-settings.scan_length / 2, settings.scan_length / 2, min(lines, 4 * _CELLS))
+    kx, ky = (2 * np.pi / wave for wave in layout.wavelength)
+    Y, X = np.meshgrid(y, x, indexing="ij")
+    # The phases leave the surface without symmetry.
+    z = layout.relief * (np.sin(kx * X + 0.4) + np.cos(ky * Y - 0.7))
+    zx, zy = layout.relief * kx * np.cos(kx * X + 0.4), -layout.relief * ky * np.sin(ky * Y - 0.7)
+    n = np.stack([-zx, -zy, np.ones_like(z)], axis=-1)
+    Q = np.stack([X, Y, z], axis=-1)
+    J = np.concatenate([n, np.cross(Q, n), n * Q[..., 1:2]], axis=-1)
+    used = 6 if settings.strain == "rigid" else 9
+    J = J[..., :used]
+    own = np.stack([np.ones_like(z), zy], axis=-1)
+    weight = layout.points / _CELLS / (2 * settings.height_noise**2)
+    A, B, C = (weight * np.einsum("lpi,lpj->lij", left, right) for left, right in ((J, J), (J, own), (own, own)))
+    jitter = np.diag(2 * np.array([layout.jitter_z, layout.jitter_y]) ** 2 + 1e-24)
+    inside = np.linalg.solve(np.linalg.inv(jitter) + C, np.swapaxes(B, 1, 2))
+    information = np.sum(A - B @ inside, axis=0) * lines / y.size
+    scale = 1 / np.sqrt(np.diag(information))
+    out = np.zeros((9, 9))
+    out[:used, :used] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return out
