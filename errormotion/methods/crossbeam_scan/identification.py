@@ -17,6 +17,7 @@ from errormotion.methods.crossbeam_scan.carriage import Carriage, Rig, carriage
 from errormotion.methods.crossbeam_scan.chain import SOURCES
 from errormotion.methods.crossbeam_scan.curves import curves
 from errormotion.methods.crossbeam_scan.cutting import Scans
+from errormotion.methods.crossbeam_scan.judgement import MOVED, judge
 from errormotion.methods.crossbeam_scan.registrations import Maps, Registrations, register_all
 
 if TYPE_CHECKING:
@@ -55,12 +56,14 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     rig = rig_of(raw)
     axis = carriage(found, places, rig, guide=settings.guide_uncertainty if settings.strain == "guided" else None)
     warm = [c for c in range(scans.cycles) if c not in cold]
+    if not warm:
+        raise MethodError(f"Expected warm scans after the cold ones; found {scans.cycles} cycles, all of them cold")
     if not np.isfinite(axis.values[warm]).any():
         reasons = sorted({reason for reason in found.reason.ravel() if reason})
         raise MethodError(
             f"Not one of {len(warm) * places.size} warm scans could be laid on its cold one: " + "; ".join(reasons[:3])
         )
-    return _dataset(raw, settings, method, version, found, axis, rig, cold, warm)
+    return _dataset(raw, settings, method, version, found, axis, rig, cold, warm, scans.notes)
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
@@ -99,6 +102,7 @@ def _dataset(
     rig: Rig,
     cold: list[int],
     warm: list[int],
+    mended: list[str],
 ) -> xr.Dataset:
     rows = [cold[0], *warm]
     time = cycle_times(found.time, rows)
@@ -110,11 +114,15 @@ def _dataset(
     influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
     reason = found.reason[rows]
     reason[0, reference] = ""
-    wrong = np.zeros(found.reason.shape, dtype=bool)
-    notes = _notes(reason, place, rig)
+    trust = judge(axis, found, settings, place, time[1:], cold, warm)
+    if settings.moved == "exclude":
+        gone = trust.wrong[rows]
+        values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan
+        reason[gone] = MOVED
+    notes = [*_notes(reason, place, rig), *trust.notes, *mended]
     for note in notes:
         log.warning(note)
-    curve = curves(axis, found, rig, place, time[1:], warm, wrong)
+    curve = curves(axis, found, rig, place, time[1:], warm, trust.wrong)
     rig_share = influence[: len(SOURCES)]  # the noise of the cold scans is in `own` already
     total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
     ds = build_errors(
@@ -133,7 +141,7 @@ def _dataset(
         influence=influence,
         sources=axis.sources,
         source_groups=axis.source_groups,
-        extras=_extras(found, axis, rig, rows, cold, reason, own, curve),
+        extras=_extras(found, axis, rig, rows, cold, reason, own, curve | trust.extras()),
     )
     return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
 
@@ -153,7 +161,7 @@ def cycle_times(scan_time: Array, rows: list[int]) -> Array:
 
 def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
     notes = []
-    lost = np.argwhere(reason[1:] != "")
+    lost = np.argwhere((reason[1:] != "") & (reason[1:] != MOVED))
     if len(lost):
         where = sorted({f"{place[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
         notes.append(
@@ -174,7 +182,7 @@ def _extras(
     cold: list[int],
     reason: NDArray[np.object_],
     own: Array,
-    curve: dict[str, Any],
+    further: dict[str, Any],
 ) -> Mapping[str, xr.DataArray]:
     two = ("time", "position")
     quality = {name: values[rows] for name, values in found.quality.items()}
@@ -202,7 +210,7 @@ def _extras(
         out["cold_repeat"] = (("repeat", "position", "dof"), axis.values[repeats])
         u = np.sqrt(np.diagonal(axis.covariance[repeats], axis1=-2, axis2=-1))
         out["cold_repeat_u"] = (("repeat", "position", "dof"), u)
-    out |= _map_extras(found.maps, rows) | curve
+    out |= _map_extras(found.maps, rows) | further
     coords = {"jitter": ["z", "y"], "direction": list("xyz"), "pose_parameter": ["a", "b", "g", "dx", "dy", "dz"]}
     ds = xr.Dataset(out).assign_coords(
         {name: labels for name, labels in coords.items() if name in xr.Dataset(out).dims}

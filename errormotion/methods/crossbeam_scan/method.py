@@ -9,10 +9,10 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
 if TYPE_CHECKING:
-    pass
+    from collections.abc import Callable, Iterator, Mapping
 
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
 
@@ -35,6 +35,49 @@ class CrossbeamScan:
         instruments=("line_profiler",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
     )
     Settings: ClassVar[type[PluginSettings]] = ScanSettings
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: ScanSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``pocket``."""
+        from errormotion.methods.crossbeam_scan import acquisition, pocket
+
+        if settings.procedure == "profiler_pose":
+            return pocket.record_pocket(bench, settings, done)
+        return acquisition.record_scans(bench, settings, inputs.get("pose"), done)
+
+    def append_dim(self, settings: ScanSettings) -> str:
+        """Return ``scan`` for the profiler's pose, ``line`` for scans."""
+        return "scan" if settings.procedure == "profiler_pose" else "line"
+
+    def progress(self, settings: ScanSettings) -> float:
+        """Return the expected number of lines, or of scans of the pocket."""
+        from errormotion.methods.crossbeam_scan.acquisition import expected_lines
+
+        return float(len(settings.pocket_lifts) if settings.procedure == "profiler_pose" else expected_lines(settings))
+
+    def follow(self, settings: ScanSettings) -> Callable[[xr.Dataset], str]:
+        """Return what tells, chunk by chunk while measuring, how far things are."""
+        from errormotion.methods.crossbeam_scan.live import LiveScans
+
+        return LiveScans(settings).update
+
+    def programs(self, settings: ScanSettings) -> Mapping[str, str]:
+        """Return the NC programs of a campaign, name to text."""
+        from errormotion.methods.crossbeam_scan.schedule import program_texts
+
+        return program_texts(settings)
+
+    def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        from errormotion.methods.crossbeam_scan.planning import plan
+
+        return plan(self.info, settings or ScanSettings())
 
     def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
