@@ -20,7 +20,7 @@ from errormotion.report import (
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.crossbeam_view import Campaign, after, at_y, campaign, is_campaign, millimetres, unit_of
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
-from errormotion.report.text import fixed, integer, listed
+from errormotion.report.text import decimals_of, fixed, integer, listed
 
 __all__ = ["is_campaign", "part"]
 
@@ -211,7 +211,7 @@ def _spans(seen: Campaign) -> Table:
         stated = expanded[np.isfinite(expanded)]
         spread = (np.median(stated), stated.max()) if stated.size else (math.nan, math.nan)
         cells = [fixed(values[known].min(), 2, signed=True), fixed(values[known].max(), 2, signed=True)]
-        cells += [fixed(float(value), 3) for value in spread]
+        cells += [fixed(float(value), decimals_of(float(value), 2)) for value in spread]
         rows.append([seen.names[freedom], unit, *cells, f"{integer(known.sum())} of {integer(known.size)}"])
     return Table(
         "Span of the six errors over the warm cycles and their expanded uncertainty, k = 2.",

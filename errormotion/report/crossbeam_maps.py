@@ -89,10 +89,10 @@ def contours(axes: Axes, x: Array, y: Array, values: Array, scale: ScalarMappabl
     masked = np.ma.masked_invalid(values)
     bounds = np.asarray(scale.norm.boundaries)  # type: ignore[attr-defined]
     axes.contourf(x, y, masked, levels=bounds, cmap=scale.cmap, norm=scale.norm, corner_mask=True)
-    # The lines also hide the seams between the bands.
-    axes.contour(x, y, masked, levels=bounds, colors="#ffffff", linewidths=0.4, corner_mask=True)
-    if bounds[0] < 0 < bounds[-1]:
-        axes.contour(x, y, masked, levels=[0.0], colors="#444444", linewidths=0.8, corner_mask=True)
+    inside = bounds[(bounds > masked.min()) & (bounds < masked.max())]
+    for levels, colour, width in ((inside, "#ffffff", 0.4), (inside[inside == 0], "#444444", 0.8)):
+        if levels.size:  # the white lines also hide the seams between the bands
+            axes.contour(x, y, masked, levels=levels, colors=colour, linewidths=width, corner_mask=True)
 
 
 def edges(middles: Array) -> Array:

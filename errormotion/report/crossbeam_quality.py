@@ -241,4 +241,7 @@ def _verdict(seen: Campaign, values: Array, sigma: Array) -> Text:
         f"uncertainty (95 % are expected to be); the largest is {seen.names[FREEDOMS[int(i)]]} at "
         f"{at_y(seen.position[int(j)])} with {trimmed(fixed(float(np.nanmax(ratio)), 2))} times its own."
     )
-    return Text(words, "warning" if outside > 0.2 * judged.sum() or np.nanmax(ratio) > 2 else "plain")
+    by_chance = 0.05 * judged.sum() + 3 * math.sqrt(0.05 * 0.95 * judged.sum())
+    if outside > by_chance or np.nanmax(ratio) > 2:
+        return Text(f"{words} That is more than chance: something moved or changed between the two.", "warning")
+    return Text(words)

@@ -42,7 +42,7 @@ def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
     if math.isfinite(noise):
         words += f"; noise of a point {_length(noise)}"
     turned = _wrong_pose(seen, cycle, artefact)
-    words += ". The residual is the noise of the two scans and says nothing about the pose"
+    words += ". The residual is what noise and jitter leave of two scans, and says nothing about the pose"
     if turned is not None:
         name, sigma, added = turned
         words += (
@@ -54,7 +54,7 @@ def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
 
 
 def _wrong_pose(seen: Campaign, cycle: int, artefact: int) -> tuple[str, float, float] | None:
-    """Return the rotation known worst (ISO name), its uncertainty by the registration, and what a wrong one adds.
+    """Return the rotation known best (ISO name), its uncertainty by the registration, and what a wrong one adds.
 
     The last is the root mean square, m, that a pose off by `_WRONG` times the uncertainty adds to the residual: the
     rotation R about the middle of the artefact moves a point P by R x P, which along z shows as n . (R x P) with
@@ -73,12 +73,12 @@ def _wrong_pose(seen: Campaign, cycle: int, artefact: int) -> tuple[str, float, 
     normal = np.stack([-across, -down, np.ones_like(z)], axis=-1)
     middle = [finite(np.mean, part) for part in (x, y, z)]
     point = np.stack([*np.broadcast_arrays(x[None, :] - middle[0], y[:, None] - middle[1]), z - middle[2]], axis=-1)
-    worst = int(np.nanargmax(sigma))
+    best = int(np.nanargmin(sigma))
     turn = np.zeros(3)
-    turn[worst] = _WRONG * sigma[worst]
+    turn[best] = _WRONG * sigma[best]
     shift = (normal * np.cross(turn, point)).sum(axis=-1)
     added = math.sqrt(finite(np.mean, shift**2))
-    return (seen.names[FREEDOMS[3 + worst]], float(sigma[worst]), added) if math.isfinite(added) else None
+    return (seen.names[FREEDOMS[3 + best]], float(sigma[best]), added) if math.isfinite(added) else None
 
 
 def _length(metres: float, digits: int = 3) -> str:
