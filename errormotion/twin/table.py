@@ -69,9 +69,10 @@ class Table:
         ordered = sorted(self.targets, key=lambda target: target.position)
         for one, other in pairwise(ordered):
             if one.reach[1] > other.reach[0]:
+                apart = one.reach[1] - one.position + other.position - other.reach[0]
                 raise BenchError(
-                    f"Pieces on the table are {(one.reach[1] - one.reach[0]) * 1e3:.0f} mm or more apart along Y; "
-                    f"found them at {one.position:g} and {other.position:g} m."
+                    f"Two such pieces stand {apart * 1e3:.0f} mm or more apart along Y; found {one.artefact.name} at "
+                    f"{one.position:g} m and {other.artefact.name} at {other.position:g} m."
                 )
         object.__setattr__(self, "targets", tuple(ordered))
 

@@ -81,6 +81,8 @@ def test_noise_goes_by_the_key(gantry: VirtualMachine) -> None:
 
 
 def test_pieces_that_overlap_are_refused(gantry: VirtualMachine) -> None:
-    with pytest.raises(BenchError, match=r"66 mm or more apart along Y; found them at 0\.1 and 0\.15 m"):
+    with pytest.raises(
+        BenchError, match=r"66 mm or more apart along Y; found swept free form at 0\.1 m and swept free form at 0\.15 m"
+    ):
         set_table(gantry.crossbeam, 3, [0.15, 0.1])
     assert set_table(gantry.crossbeam, 3, [0.1, 0.17]).targets[0].artefact.half_size == swept().half_size
