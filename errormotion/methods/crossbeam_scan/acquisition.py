@@ -232,12 +232,12 @@ class _Campaign:
         if self.zero is None:
             return planned
         left = self.zero + due - self.move.now() - PAUSE
-        if left > planned.seconds(self.low) - 2 * PAUSE:
+        if left > planned.seconds(self.high) - 2 * PAUSE:
             return planned
         if left < PAUSE:
             return None
         number = int(name.removesuffix(".nc").rpartition("_")[2])
-        return warm_up_piece(self.settings, number, left, self.low)
+        return warm_up_piece(self.settings, number, left, self.high)
 
     def _pass(self) -> Iterator[xr.Dataset]:
         item = self.plan.of_cycle(self.next)

@@ -58,7 +58,7 @@ class Program:
     steps: tuple[Move | Dwell, ...]
 
     def seconds(self, start: float | None = None) -> float:
-        """Return how long it takes from a place of Y, m; by default from where it ends, as when run in a circle.
+        """Return how long it takes from a place of Y, m; by default from where it ends, as when it is repeated.
 
         Moves of other axes than Y count as nothing.
         """
@@ -83,7 +83,7 @@ class Program:
         lines = [
             "%",
             f"({self.name}: {self.purpose})",
-            f"(Y{_mm(low)} to Y{_mm(high)}, {self.seconds():.0f} s at constant feed)",
+            f"(Y{_mm(low)} to Y{_mm(high)}, about {self.seconds():.0f} s)",
             "G90 G94 G21",
         ]
         for step in self.steps:
@@ -118,7 +118,7 @@ class Program:
 
 
 def measuring_pass(settings: Settings) -> Program:
-    """Return the pass over all artefacts in +Y and back again."""
+    """Return the pass over all artefacts in +Y. It moves with the measuring feed only: the machine stays cold."""
     low, high = pass_ends(settings)
     count = len(settings.positions)
     return Program(
@@ -153,12 +153,7 @@ def pocket_pass(settings: Settings, number: int) -> Program:
 
 
 def _pass(low: float, high: float, settings: Settings) -> tuple[Move | Dwell, ...]:
-    return (
-        Move(low, settings.warm_up_feed),
-        Dwell(DWELL),
-        Move(high, settings.measuring_feed),
-        Move(low, settings.warm_up_feed),
-    )
+    return Move(low, settings.measuring_feed), Dwell(DWELL), Move(high, settings.measuring_feed)
 
 
 def warm_up_piece(settings: Settings, number: int, seconds: float, start: float) -> Program:

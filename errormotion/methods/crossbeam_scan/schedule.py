@@ -110,11 +110,14 @@ def schedule(settings: Settings) -> Schedule:
         No artefacts, a program that leaves the travel, or warm-up times with no time for the pass between them.
     """
     passing = measuring_pass(settings)
-    low, _ = pass_ends(settings)
-    length = passing.seconds(low)
-    warm_up = (*[0.0] * (1 + settings.cold_repeats), *settings.warm_up)
+    low, high = pass_ends(settings)
+    first, again = passing.seconds(low), passing.seconds(high)
     cold = 1 + settings.cold_repeats
-    items = [Item(passing.name, (number - cold) * (length + PAUSE), length, number) for number in range(cold)]
+    begin = -(first + PAUSE + settings.cold_repeats * (again + PAUSE))
+    items: list[Item] = []
+    for number in range(cold):
+        items.append(Item(passing.name, begin, again if number else first, number))
+        begin = items[-1].end + PAUSE
     programs = {passing.name: passing}
     free = 0.0  # when the axis is free
     for number, due in enumerate(settings.warm_up, 1):
@@ -122,16 +125,16 @@ def schedule(settings: Settings) -> Schedule:
         if seconds <= 0:
             raise MethodError(
                 f"warm_up: at {due / MINUTE:g} min the axis is not free before {(free + PAUSE) / MINUTE:.1f} min, a "
-                f"measuring pass takes {length / MINUTE:.1f} min; expected times further apart."
+                f"measuring pass takes {first / MINUTE:.1f} min; expected times further apart."
             )
-        piece = warm_up_piece(settings, number, seconds, low)
+        piece = warm_up_piece(settings, number, seconds, high)
         programs[piece.name] = piece
-        items.append(Item(piece.name, free, piece.seconds(low)))
+        items.append(Item(piece.name, free, piece.seconds(high)))
         items.append(Item(passing.name, due, passing.seconds(piece.end), cold + number - 1))
         free = items[-1].end + PAUSE
     for program in programs.values():
         program.check(settings.travel)
-    return Schedule(tuple(items), programs, warm_up)
+    return Schedule(tuple(items), programs, (*[0.0] * cold, *settings.warm_up))
 
 
 def scan_times(plan: Schedule, settings: Settings) -> list[list[float]]:
