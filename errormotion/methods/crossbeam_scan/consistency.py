@@ -174,7 +174,7 @@ def moved_artefacts(
     -------
     Consistency
         A step is sought over all six freedoms, so that its threshold at the ends, where the prediction reaches out,
-        is higher. Two artefacts that move in the same cycle may hide each other.
+        is higher. Two artefacts that move alike in the same cycle may hide each other.
 
     Raises
     ------
@@ -274,8 +274,8 @@ class _Scans:
         after, before = cycles + 1, np.concatenate([[0], cycles[:-1] + 1])
         E = np.concatenate([np.zeros((1, *self.errors.shape[1:])), self.errors])[:, left]
         N = np.concatenate([self.cold[None], self.noise])[:, left]
-        there = np.concatenate([self.there.any(axis=0)[None], self.there])[:, left]
-        both = np.asarray(there[after] & there[before])[..., None]
+        there = np.concatenate([np.any(self.there, axis=0, keepdims=True), self.there])[:, left]
+        both = (there[after] & there[before])[..., None]
         gain = np.where(both, E[after] - E[before], np.nan)
         return after, before, gain, np.where(both[..., None], N[after] + N[before], np.nan)
 
