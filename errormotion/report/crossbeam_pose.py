@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from errormotion.report import budget, provenance, quality
+from errormotion.report import provenance, quality
 from errormotion.report.crossbeam_view import Array, field, remarks
-from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate
+from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, estimate
 from errormotion.report.text import fixed, integer
 
 #: Parameter of the pose: its name, what it is; mrad for angles and mm for shifts.
@@ -35,10 +35,9 @@ def part(source: Source, _key: str) -> Part:
     errors = source.errors
     pose, sigma = matrix(errors), uncertainty(errors)
     nothing: list[Block] = [Text("The pose could not be determined.", "warning")]
-    cells = {} if pose is None else dict(zip(PARAMETERS, cells_of(pose, sigma), strict=True))
     return Part(
         "Pose of the line profiler",
-        [KeyFigure(f"{name}, {PARAMETERS[name]}", cell, _unit(i)) for i, (name, cell) in enumerate(cells.items())],
+        [],
         [f"The pose of the profiler's frame in the tool frame, {CONVENTION}, from scans of a circular pocket."],
         [
             Section("pose", "Pose", nothing if pose is None else [table(pose, sigma, []), *_correlation(errors)]),
@@ -127,9 +126,6 @@ def _quality(source: Source) -> list[Block]:
     if "pocket_radius_found" in errors:
         words.append(f"radius found {fixed(1e3 * float(errors['pocket_radius_found']), 4)} mm")
     found: list[Block] = [Text(f"Of the pocket: {'; '.join(words)}.")] if words else []
-    names = {name: name for name in budget.FREEDOMS}
-    places = {str(name): errors.isel(beam=i) for i, name in enumerate(errors["beam"].values)}
-    found.append(budget.twist_table(errors, places, names))
     counted = quality.counts(errors, source.raw)
     if counted:
         found.append(Text("Counted while measuring: " + ", ".join(f"{n} {c}" for n, c in counted.items()) + "."))
