@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.registration import clouds, prepare, register
-from errormotion.methods.crossbeam_scan.registration.solver import Problem
+from errormotion.methods.crossbeam_scan.registration.solver import Problem, State
 
 BLUE, ORANGE, GREEN, GREY = "#1f5a96", "#d9822b", "#2e8b57", "#8a8f98"
 PITCH_X, PITCH_Y, NOISE = 12.5e-6, 70e-6, 0.5e-6
@@ -57,7 +57,7 @@ def draw_distance(ax: Axes, cold, warm, twist) -> None:
     for offset in offsets:
         pose = poses.displaced(twist + np.array([0, offset, 0, 0, 0, 0]))
         nearest.append(np.sqrt(np.mean(tree.query(pose.apply(some))[0] ** 2)))
-        height.append(np.sqrt(np.nanmean(problem.evaluate(pose).residual ** 2)))
+        height.append(np.sqrt(np.nanmean(problem.evaluate(State.of(pose)).residual ** 2)))
     ax.semilogy(offsets * 1e6, np.array(nearest) * 1e6, color=ORANGE)
     ax.semilogy(offsets * 1e6, np.array(height) * 1e6, color=BLUE)
     ax.axvline(0, color=GREY, lw=0.8)

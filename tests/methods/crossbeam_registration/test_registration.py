@@ -8,8 +8,9 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import prepare, register
-from errormotion.methods.crossbeam_scan.registration.solver import Problem
+from errormotion.methods.crossbeam_scan.registration import prepare, register, solver
+from errormotion.methods.crossbeam_scan.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.registration.solver import Problem, State
 
 ORIGIN = np.zeros(3)
 BLOCK_X, BLOCK_Y = 16 * 12.5e-6, 4 * 70e-6
@@ -173,7 +174,7 @@ def test_sums_are_those_of_the_equations(make_scanner, motion):
     rng = np.random.default_rng(8)
     cold, warm = prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, motion))
     problem = Problem.of(cold, warm)
-    sums = problem.evaluate(motion)
+    sums = problem.evaluate(State.of(motion))
     P = np.stack([*np.meshgrid(warm.x, warm.y), warm.height], axis=-1)
     X, Y, Z = np.moveaxis(motion.apply(P.reshape(-1, 3)).reshape(P.shape), -1, 0)
     # FITPACK's interpolating spline has the same "not a knot" ends.
@@ -190,7 +191,7 @@ def test_sums_are_those_of_the_equations(make_scanner, motion):
     np.testing.assert_allclose(sums.A, np.einsum("rc,rci,rcj->rij", w, J, J), rtol=1e-9, atol=1e-9 * w.max() * 1e-6)
     # The derivative itself: r after a small further twist.
     step = np.array([2e-6, -1e-6, 3e-6, 1e-5, -2e-5, 3e-5])
-    moved = problem.evaluate(problem.moved(motion, step)).residual - sums.residual
+    moved = problem.evaluate(problem.stepped(State.of(motion), step)).residual - sums.residual
     both = np.isfinite(moved)
     assert np.std((moved - J @ step)[both]) < 0.02 * np.std(moved[both])
 
@@ -274,3 +275,28 @@ def test_unknown_backends_are_refused(scanner):
     block_map = prepare(*scanner.scan(np.random.default_rng(0)))
     with pytest.raises(MethodError, match="height_map"):
         register(block_map, block_map, registration="icp")
+
+
+def test_what_an_artefact_tells_is_the_sum_over_its_blocks(scanner):
+    found = prepare(*scanner.scan(np.random.default_rng(13)))
+    some = slice(2, None, 4)
+    X, Y = np.meshgrid(found.x[some] - found.centre[0], found.y[some] - found.centre[1])
+    Z, Sx, Sy = found.height[some, some] - found.centre[2], found.slope_x[some, some], found.slope_y[some, some]
+    J = np.stack([-Sx, -Sy, np.ones_like(X), Y + Sy * Z, -X - Sx * Z, Sx * Y - Sy * X, -Sx * Y]).reshape(7, -1)
+    terms = Extra.of({"feed_x": np.inf})
+    of_slopes, of_noise = found.moments.information(terms.motions)
+    np.testing.assert_allclose(of_slopes, J @ J.T, rtol=1e-12, atol=1e-12)
+    # What noise of the slopes adds on average, here for the motion across along x, and the turn about z.
+    assert of_noise[0, 0] == X.size
+    assert of_noise[5, 5] == pytest.approx(np.sum(X**2 + Y**2))
+    assert of_noise[6, 6] == pytest.approx(np.sum(Y**2))
+
+
+def test_one_thread_and_several_add_up_the_same(scanner, motion, monkeypatch):
+    rng = np.random.default_rng(14)
+    problem = Problem.of(prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, motion)))
+    alone = problem.evaluate(State.of(motion))
+    monkeypatch.setattr(solver, "MANY", 0)
+    shared = problem.evaluate(State.of(motion))
+    np.testing.assert_array_equal(shared.residual, alone.residual)
+    np.testing.assert_allclose(shared.A, alone.A, rtol=1e-12)

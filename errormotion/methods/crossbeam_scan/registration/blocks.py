@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation
 
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.registration import kernels
+from errormotion.methods.crossbeam_scan.registration.freedoms import Moments
 from errormotion.methods.crossbeam_scan.registration.kernels import COLUMNS, POINTS, ROWS
 from errormotion.methods.crossbeam_scan.registration.surface import Surface, repaired
 
@@ -27,8 +27,9 @@ LARGEST = 1.0
 FEWEST_BLOCKS = 8
 BESIDE_HOLE = 3.0
 """A block beside a hole counts with its variance times this: what fills the hole is no measurement."""
-_SAMPLED = 256
-_FEW = 5000
+THIN = 4
+_SAMPLED = 64
+_FEW = 2500
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,16 @@ class BlockMap:
     @cached_property
     def usual_variance(self) -> float:
         """Median variance of a block's height, m^2."""
-        return sampled_median(self.variance[self.known])
+        return sampled_median(self.variance)
+
+    @cached_property
+    def moments(self) -> Moments:
+        """What the slopes of every fourth block along both directions tell about motions."""
+        some = slice(THIN // 2, None, THIN)
+        known = self.known[some, some]
+        place = np.stack([*np.meshgrid(self.x[some], self.y[some]), self.height[some, some]])[:, known]
+        slope_x, slope_y = self.slope_x[some, some][known], self.slope_y[some, some][known]
+        return Moments.of(slope_x, slope_y, place - self.centre[:, None])
 
 
 def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
@@ -179,7 +189,7 @@ def _deblurred(
     out: Array, x: Array, y: Array, dx: Array, dy: Array, least: float, scan: tuple[NDArray[np.float32], Array, Array]
 ) -> BlockMap:
     """Return the block map of the kernel's columns: filled, sharpened, its noise estimated."""
-    mean, sx, sy, scatter, points, gain, qx, qy, qxy = out
+    mean, sx, sy, gain = out[0], out[1], out[2], out[5]
     pitch_x, pitch_y = x[1] - x[0], y[1] - y[0]
     known = np.isfinite(mean)
     if np.count_nonzero(known) < FEWEST_BLOCKS:
@@ -187,22 +197,27 @@ def _deblurred(
             "expected a smooth surface, found none: no plane explains the blocks of 16 x 4 points; "
             "check that heights are in metres and that the scan is of the artefact"
         )
-    mean, sx, sy = repaired(mean, sx, sy, pitch_x, pitch_y)
-    zxx, zyy = _second_difference(mean, 1) / pitch_x**2, _second_difference(mean, 0) / pitch_y**2
-    height = mean - np.where(known, qx, 0.0) * zxx - np.where(known, qy, 0.0) * zyy
-    zxy = np.gradient(sx, pitch_y, axis=0)
-    if np.any(points[known] < POINTS):
-        height -= np.where(known, qxy, 0.0) * zxy
+    out[0], out[1], out[2] = repaired(mean, sx, sy, pitch_x, pitch_y)
     # A curved block scatters about its plane without any noise.
-    bend_x, bend_y = np.var(0.5 * dx**2), np.var(0.5 * dy**2)
-    curved = POINTS / (POINTS - 3) * (zxx**2 * bend_x + zyy**2 * bend_y + zxy**2 * np.var(dx) * np.var(dy))
-    noise = np.sqrt(max(sampled_median((scatter - curved)[known]), least**2))
-    variance = np.where(known, gain * noise**2, np.inf)
+    share = POINTS / (POINTS - 3)
+    bends = share * np.array([np.var(0.5 * dx**2), np.var(0.5 * dy**2), np.var(dx) * np.var(dy)])
+    height, rest = np.empty((2, *mean.shape))
+    kernels.sharpen(out, pitch_x, pitch_y, bends, height, rest)
+    noise = np.sqrt(max(sampled_median(rest), least**2))
+    variance = gain * noise**2
     if not known.all():
-        variance = np.where(binary_dilation(~known, np.ones((3, 3), dtype=bool)), BESIDE_HOLE * variance, variance)
-    slope_noise = max(_slope_noise(sx, height, pitch_x, 1), _slope_noise(sy, height, pitch_y, 0))
-    points = np.where(known, points, 0).astype(np.int64)
-    return BlockMap(x, y, height, sx, sy, variance, points, float(noise), slope_noise, scan)
+        variance = np.where(known, np.where(_beside(~known), BESIDE_HOLE, 1.0) * variance, np.inf)
+    slope_noise = max(_slope_noise(out[1], height, pitch_x, 1), _slope_noise(out[2], height, pitch_y, 0))
+    points = out[4].astype(np.int64)
+    return BlockMap(x, y, height, out[1], out[2], variance, points, float(noise), slope_noise, scan)
+
+
+def _beside(lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which blocks have a lost one among their eight neighbours."""
+    wide = np.pad(lost, 1)
+    along = wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
+    beside: NDArray[np.bool_] = along[:-2] | along[1:-1] | along[2:]
+    return beside
 
 
 def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
@@ -216,13 +231,8 @@ def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
 
 
 def sampled_median(values: Array) -> float:
-    """Return the median of some thousand evenly chosen values: a robust scale needs no more."""
+    """Return the median of the finite out of some thousand evenly chosen values: a robust scale needs no more."""
     flat = values.reshape(-1)
-    return float(np.median(flat[:: max(1, flat.size // _FEW)]))
-
-
-def _second_difference(z: Array, axis: int) -> Array:
-    """Return the second difference along an axis; at both ends it goes on as a straight line."""
-    inner = np.diff(z, 2, axis=axis)
-    first, second, last, but_one = (inner.take([k], axis) for k in (0, 1, -1, -2))
-    return np.concatenate([2 * first - second, inner, 2 * last - but_one], axis=axis)
+    some = flat[:: flat.size // _FEW | 1]  # odd: not the same columns of every row
+    known = some[np.isfinite(some)]
+    return float(np.median(known if known.size else flat[np.isfinite(flat)]))

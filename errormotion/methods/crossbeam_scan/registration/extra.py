@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import adjoint, known_product
-from errormotion.methods.crossbeam_scan.registration.freedoms import Freedoms, scales, undetermined
+from errormotion.methods.crossbeam_scan.registration.freedoms import MOTIONS, Freedoms, scales, undetermined
 
 Array = NDArray[np.float64]
 
@@ -83,6 +83,13 @@ class Extra:
             )
         bases = np.array([BASES[name] for name in asked]).reshape(-1, 3, 3)
         return cls(tuple(asked), bases, np.array([float(sigma) for sigma in asked.values()]))
+
+    @property
+    def motions(self) -> Array:
+        """Displacement of a point by a unit of twist or parameter, affine in its place: (6 + k, 3, 4)."""
+        own = np.zeros((len(self.names), 3, 4))
+        own[:, :, 1:] = self.bases
+        return np.concatenate([MOTIONS, own])
 
     def stretch(self, values: Array) -> Array:
         """Return 1 + sum of e G, (3, 3)."""

@@ -18,6 +18,12 @@ from errormotion.errors import MethodError
 
 Array = NDArray[np.float64]
 
+MOTIONS = np.zeros((6, 3, 4))
+"""Displacement (3,) of a point by a unit of twist, affine in its place (1, X, Y, Z): (6, 3, 4)."""
+MOTIONS[[0, 1, 2], [0, 1, 2], 0] = 1.0
+MOTIONS[[3, 4, 5], [2, 0, 1], [2, 3, 1]] = 1.0
+MOTIONS[[3, 4, 5], [1, 2, 0], [3, 1, 2]] = -1.0
+
 LEAST_SLOPE = 2e-3
 """A motion that changes the heights by less than this share of itself (root mean square) is not determined."""
 _SHAPES = {1: "a surface of revolution or of straight rulings", 2: "a cylinder", 3: "a plane or a sphere"}
@@ -45,24 +51,39 @@ class Freedoms:
     radius: float
 
 
-def noise_information(x: Array, y: Array, z: Array, bases: Array) -> Array:
-    """Return what slopes with a noise of 1 add to the information J^T J, (6 + k, 6 + k).
+@dataclass(frozen=True)
+class Moments:
+    """Sums over the blocks of a map, from which its information about any motion follows.
 
-    The noise of a block's slopes meets a motion with what it moves the block across: a translation along x looks
-    determined where a plane is noisy.
-
-    Parameters
+    Attributes
     ----------
-    x, y, z : ndarray (n,)
-        The blocks about the centre, m.
-    bases : ndarray (k, 3, 3)
-        Displacements of further parameters per distance from the centre.
+    slopes : ndarray (12, 12)
+        Sum of q q^T, q the products of the normal (-Sx, -Sy, 1) with (1, X, Y, Z) about the centre.
+    places : ndarray (4, 4)
+        Sum of p p^T, p = (1, X, Y, Z).
+    blocks : int
+        Number of blocks.
     """
-    zero, one, P = np.zeros_like(x), np.ones_like(x), np.stack([x, y, z])
-    across = np.array([[one, zero, zero, zero, z, -y], [zero, one, zero, -z, zero, x]])
-    across = np.concatenate([across, np.moveaxis(bases @ P, 0, 1)[:2]], axis=1)
-    total: Array = np.einsum("dkn,dqn->kq", across, across)
-    return total
+
+    slopes: Array
+    places: Array
+    blocks: int
+
+    @classmethod
+    def of(cls, slope_x: Array, slope_y: Array, place: Array) -> Moments:
+        """Return the sums for slopes (n,) and places (3, n), m, about the centre."""
+        p = np.concatenate([np.ones((1, place.shape[1])), place])
+        q = np.concatenate([-slope_x * p, -slope_y * p, p])
+        return cls(q @ q.T, p @ p.T, place.shape[1])
+
+    def information(self, motions: Array) -> tuple[Array, Array]:
+        """Return J^T J of motions (n, 3, 4), and what of it slopes with a noise of 1 add, (n, n).
+
+        The noise of a block's slopes meets a motion with what it moves the block across: a translation along x looks
+        determined where a plane is noisy.
+        """
+        flat, x, y = motions.reshape(-1, 12), motions[:, 0], motions[:, 1]
+        return flat @ self.slopes @ flat.T, x @ self.places @ x.T + y @ self.places @ y.T
 
 
 def undetermined(information: Array, scale: Array, blocks: int) -> tuple[Array, Array]:

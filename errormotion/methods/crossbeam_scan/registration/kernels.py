@@ -1,12 +1,11 @@
-"""Compiled loops over points and blocks.
+"""Compiled loops over the points, which reduce them to blocks, and over the blocks, which fill and sharpen them.
 
-Threads share the points by rows of blocks, and every block is computed within one of them from its own row alone: the
-result has the same bits on any number of threads. Sums over blocks are taken by one thread, a row at a time.
+Threads share them by rows of blocks, and every block is computed within one thread: the result has the same bits on any
+number of threads.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -26,7 +25,7 @@ FEWEST = 20
 """A block with fewer valid points says nothing."""
 
 # Sums may be taken in any order (so that they vectorise), but NaN stays NaN.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
+FAST = {"reassoc", "contract", "nsz", "arcp"}
 _GATE = 4.5
 _BAD_BLOCK = 4.0
 
@@ -119,7 +118,7 @@ def block_scales(z: NDArray[np.float32], dx: Array, dy: Array, step: int) -> Arr
     return scales
 
 
-@compiled(fastmath=_FAST)
+@compiled(fastmath=FAST)
 def _trimmed_plane(
     z: NDArray[np.float32],
     r0: int,
@@ -225,7 +224,33 @@ def _refit(
     out[4] = 0.0
 
 
-@compiled(parallel=True, fastmath=_FAST)
+@compiled(fastmath=FAST)
+def _block_sums(
+    z: NDArray[np.float32], r0: int, dx: NDArray[np.float32], dy: NDArray[np.float32], sums: NDArray[np.float32]
+) -> None:  # pragma: no cover - compiled
+    """Add up v, dx v, dy v and v^2 of every block of four profiles, v counted from a point of the block: (4, block).
+
+    Every profile is an array of its own: the loop over 16 points then becomes one over the lanes of a register. Small
+    differences from one point keep 1e-7 of themselves in single precision.
+    """
+    z0, z1, z2, z3 = z[r0], z[r0 + 1], z[r0 + 2], z[r0 + 3]
+    d0, d1, d2, d3, zero = dy[0], dy[1], dy[2], dy[3], np.float32(0.0)
+    for column in range(sums.shape[1]):
+        c0 = column * COLUMNS
+        base = z1[c0 + 7]
+        S0, S1, S2, SS = zero, zero, zero, zero
+        for j in range(COLUMNS):
+            v0, v1 = z0[c0 + j] - base, z1[c0 + j] - base
+            v2, v3 = z2[c0 + j] - base, z3[c0 + j] - base
+            s = (v0 + v1) + (v2 + v3)
+            S0 += s
+            S1 += dx[j] * s
+            S2 += (d0 * v0 + d1 * v1) + (d2 * v2 + d3 * v3)
+            SS += (v0 * v0 + v1 * v1) + (v2 * v2 + v3 * v3)
+        sums[0, column], sums[1, column], sums[2, column], sums[3, column] = S0, S1, S2, SS
+
+
+@compiled(parallel=True, fastmath=FAST)
 def reduce_blocks(
     z: NDArray[np.float32], dx: Array, dy: Array, scale: float, out: Array
 ) -> None:  # pragma: no cover - compiled
@@ -249,7 +274,7 @@ def reduce_blocks(
     Sxx = ROWS * np.sum(dx * dx)
     qx = 0.5 * np.sum(dx * dx) / COLUMNS
     limit = 1.5 * scale * scale * (POINTS - 3)
-    dx4, zero, pitch = dx.astype(np.float32), np.float32(0.0), dx[1] - dx[0]
+    dx4, pitch = dx.astype(np.float32), dx[1] - dx[0]
     for row in numba.prange(by):
         room = np.empty((2, POINTS))
         fitted, plane = np.empty(9), np.empty(3)
@@ -263,19 +288,12 @@ def reduce_blocks(
         gain = 1.0 / POINTS + mean_y * mean_y / Syy
         y4, dy4 = (y - mean_y).astype(np.float32), y.astype(np.float32)
         r0 = row * ROWS
+        sums = np.empty((4, bx), np.float32)
+        _block_sums(z, r0, dx4, y4, sums)
         for column in range(bx):
             c0 = column * COLUMNS
-            # Differences from one point are small: single precision keeps 1e-7 of them.
             base = z[r0 + 1, c0 + 7]
-            S0, S1, S2, SS = zero, zero, zero, zero
-            for j in range(COLUMNS):
-                v0, v1 = z[r0, c0 + j] - base, z[r0 + 1, c0 + j] - base
-                v2, v3 = z[r0 + 2, c0 + j] - base, z[r0 + 3, c0 + j] - base
-                s = (v0 + v1) + (v2 + v3)
-                S0 += s
-                S1 += dx4[j] * s
-                S2 += (y4[0] * v0 + y4[1] * v1) + (y4[2] * v2 + y4[3] * v3)
-                SS += (v0 * v0 + v1 * v1) + (v2 * v2 + v3 * v3)
+            S0, S1, S2, SS = sums[0, column], sums[1, column], sums[2, column], sums[3, column]
             mean, sx, sy = np.float64(S0) / POINTS, np.float64(S1) / Sxx, np.float64(S2) / Syy
             rest = np.float64(SS) - mean * S0 - sx * S1 - sy * S2
             if rest < limit:
@@ -299,6 +317,51 @@ def reduce_blocks(
                 plane[2] = out[2, row, left] if column else np.nan
                 _refit(z, r0, c0, dx, y, dx4, dy4, scale, plane, room, fitted)
                 out[:, row, column] = fitted
+
+
+@compiled(fastmath=FAST)
+def sharpen(
+    maps: Array, pitch_x: float, pitch_y: float, bends: Array, height: Array, scatter: Array
+) -> None:  # pragma: no cover - compiled
+    """Take out what curvature adds to the blocks' means and to the scatter of their points.
+
+    Second differences go on as straight lines at both ends.
+
+    Parameters
+    ----------
+    maps : ndarray (9, block row, block column)
+        Columns of `reduce_blocks`, holes in means and slopes filled; no points where a block says nothing.
+    pitch_x, pitch_y : float
+        Distance of the blocks, m.
+    bends : ndarray (3,)
+        Variance about its plane of a block with z = dx^2 / 2, dy^2 / 2, dx dy.
+    height, scatter : ndarray (block row, block column)
+        Receive heights of the surface, m, and variances, m^2, that are noise.
+    """
+    by, bx = height.shape
+    for row in range(by):
+        # Coefficients of the second difference along y over four rows.
+        if row == 0:
+            k0, k1, k2, k3, a, b, c, d = 0, 1, 2, 3, 2.0, -5.0, 4.0, -1.0
+        elif row == by - 1:
+            k0, k1, k2, k3, a, b, c, d = by - 1, by - 2, by - 3, by - 4, 2.0, -5.0, 4.0, -1.0
+        else:
+            k0, k1, k2, k3, a, b, c, d = row - 1, row, row + 1, row, 1.0, -2.0, 1.0, 0.0
+        m0, m1, m2, m3, z = maps[0, k0], maps[0, k1], maps[0, k2], maps[0, k3], maps[0, row]
+        low, high = max(row - 1, 0), min(row + 1, by - 1)
+        s0, s1, step = maps[1, low], maps[1, high], 1.0 / ((high - low) * pitch_y)
+        qx, qy, qxy, points, found = maps[6, row], maps[7, row], maps[8, row], maps[4, row], maps[3, row]
+        along = np.empty(bx)
+        for j in range(1, bx - 1):
+            along[j] = z[j - 1] - 2.0 * z[j] + z[j + 1]
+        along[0], along[bx - 1] = 2.0 * along[1] - along[2], 2.0 * along[bx - 2] - along[bx - 3]
+        fx, fy = 1.0 / pitch_x**2, 1.0 / pitch_y**2
+        out, rest = height[row], scatter[row]
+        for j in range(bx):
+            zxx, zyy = fx * along[j], fy * (a * m0[j] + b * m1[j] + c * m2[j] + d * m3[j])
+            zxy = step * (s1[j] - s0[j])
+            out[j] = z[j] - (qx[j] * zxx + qy[j] * zyy + qxy[j] * zxy if points[j] > 0 else 0.0)
+            rest[j] = found[j] - (zxx * zxx * bends[0] + zyy * zyy * bends[1] + zxy * zxy * bends[2])
 
 
 @compiled()
@@ -361,152 +424,3 @@ def relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:  # pra
                 count += 6
             if count:
                 height[i, j] = total / count
-
-
-@compiled(inline="always")
-def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
-    """Return the four cubic B-splines at t in [0, 1) between the second and the third."""
-    u = 1.0 - t
-    return (
-        u * u * u / 6.0,
-        (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
-        (4.0 - 6.0 * u * u + 3.0 * u * u * u) / 6.0,
-        t * t * t / 6.0,
-    )
-
-
-@compiled(fastmath=_FAST)
-def _row_sums(J: Array, w: Array, r: Array, weighted: Array, total: Array) -> None:  # pragma: no cover - compiled
-    """Add up J^T W J, J^T W r and r^T W r of a row; ``w`` is 0 where a block does not count, ``weighted``: scratch."""
-    n, m = J.shape
-    for k in range(n):
-        for c in range(m):
-            weighted[c] = w[c] * J[k, c]
-        for q in range(k, n):
-            s = 0.0
-            for c in range(m):
-                s += weighted[c] * J[q, c]
-            total[n * k + q] = s
-            total[n * q + k] = s
-        s = 0.0
-        for c in range(m):
-            s += weighted[c] * r[c]
-        total[n * n + k] = s
-    s = 0.0
-    for c in range(m):
-        s += w[c] * r[c] * r[c]
-    total[n * n + n] = s
-
-
-@compiled()
-def accumulate(
-    blocks: Array,
-    x: Array,
-    y: Array,
-    pose: Array,
-    normal: Array,
-    centre: Array,
-    bases: Array,
-    surface: Array,
-    spread_of: Array,
-    grid: Array,
-    gate: float,
-    residual: Array,
-    rows: Array,
-) -> None:  # pragma: no cover - compiled
-    """Compare warm blocks with the cold surface: residuals, and the sums of every row of blocks.
-
-    Parameters
-    ----------
-    blocks : ndarray (4, block row, block column)
-        Warm heights (m), slopes along x and y, variances of the heights (m^2; not finite: not used).
-    x, y : ndarray
-        Centres of the blocks, m.
-    pose : ndarray (3, 4)
-        Linear part and translation of what takes warm points to the cold frame.
-    normal : ndarray (3, 3)
-        What takes normals there.
-    centre : ndarray (3,)
-        Point about which the Jacobian turns, m.
-    bases : ndarray (k, 3, 3)
-        Displacements of the further parameters per distance from the centre.
-    surface : ndarray (n + 2, m + 2)
-        B-spline coefficients of the cold surface, one beyond its nodes on every side.
-    spread_of : ndarray (n, m)
-        Variances of the cold heights, m^2; not finite where the cold scan knows nothing.
-    grid : ndarray (4,)
-        First node and pitch along x, then along y, m.
-    gate : float
-        Blocks whose residual is larger than this, m, are left out.
-    residual : ndarray (block row, block column)
-        Receives Z - S(X, Y), m; NaN where there is none.
-    rows : ndarray (block row, (6 + k) (7 + k) + 3)
-        Receives the sums: J^T W J, J^T W r, r^T W r, number of blocks, sum of t (1 - t) along y.
-    """
-    by, bx = residual.shape
-    n, m = spread_of.shape
-    extra = len(bases)
-    size = 6 + extra
-    J, w, difference, room = np.empty((size, bx)), np.empty(bx), np.empty(bx), np.empty(bx)
-    flat = bases.reshape(extra, 9)
-    for row in range(by):
-        count, between = 0.0, 0.0
-        for column in range(bx):
-            residual[row, column] = np.nan
-            w[column], difference[column] = 0.0, 0.0
-            J[:, column] = 0.0
-            variance = blocks[3, row, column]
-            if not variance < np.inf:
-                continue
-            px, py, pz = x[column], y[row], blocks[0, row, column]
-            X = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
-            Y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-            Z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            u, v = (X - grid[0]) / grid[1], (Y - grid[2]) / grid[3]
-            # A quarter of a block beyond the last centre there are still points behind the surface.
-            if not (u > -0.25 and v > -0.25 and u < m - 0.75 and v < n - 0.75):
-                continue
-            i, j = min(max(math.floor(v), 0), n - 2), min(max(math.floor(u), 0), m - 2)
-            t, s = v - i, u - j
-            cold = (1 - t) * ((1 - s) * spread_of[i, j] + s * spread_of[i, j + 1]) + t * (
-                (1 - s) * spread_of[i + 1, j] + s * spread_of[i + 1, j + 1]
-            )
-            if not cold < np.inf:
-                continue
-            w0, w1, w2, w3 = _weights(s)
-            v0, v1, v2, v3 = _weights(t)
-            S = (
-                v0 * (w0 * surface[i, j] + w1 * surface[i, j + 1] + w2 * surface[i, j + 2] + w3 * surface[i, j + 3])
-                + v1 * (w0 * surface[i + 1, j] + w1 * surface[i + 1, j + 1] + w2 * surface[i + 1, j + 2]
-                        + w3 * surface[i + 1, j + 3])
-                + v2 * (w0 * surface[i + 2, j] + w1 * surface[i + 2, j + 1] + w2 * surface[i + 2, j + 2]
-                        + w3 * surface[i + 2, j + 3])
-                + v3 * (w0 * surface[i + 3, j] + w1 * surface[i + 3, j + 1] + w2 * surface[i + 3, j + 2]
-                        + w3 * surface[i + 3, j + 3])
-            )  # fmt: skip
-            r = Z - S
-            residual[row, column] = r
-            if not abs(r) < gate:
-                continue
-            # The warm block's own plane, turned into the cold frame: its noise is not that of r.
-            sx, sy = blocks[1, row, column], blocks[2, row, column]
-            nx = -normal[0, 0] * sx - normal[0, 1] * sy + normal[0, 2]
-            ny = -normal[1, 0] * sx - normal[1, 1] * sy + normal[1, 2]
-            nz = -normal[2, 0] * sx - normal[2, 1] * sy + normal[2, 2]
-            a, b = nx / nz, ny / nz
-            X, Y, Z = X - centre[0], Y - centre[1], Z - centre[2]
-            J[0, column], J[1, column], J[2, column] = a, b, 1.0
-            J[3, column], J[4, column], J[5, column] = Y - b * Z, a * Z - X, b * X - a * Y
-            for e in range(extra):
-                G = flat[e]
-                J[6 + e, column] = (
-                    a * (G[0] * X + G[1] * Y + G[2] * Z)
-                    + b * (G[3] * X + G[4] * Y + G[5] * Z)
-                    + (G[6] * X + G[7] * Y + G[8] * Z)
-                )
-            w[column], difference[column] = 1.0 / (variance + cold), r
-            count += 1.0
-            # How far between two cold lines: there the spline averages their noise.
-            between += t * (1.0 - t)
-        _row_sums(J, w, difference, room, rows[row])
-        rows[row, -2], rows[row, -1] = count, between

@@ -8,16 +8,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
+from errormotion.methods.crossbeam_scan.registration.blocks import THIN, BlockMap
 from errormotion.methods.crossbeam_scan.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.registration.freedoms import (
     Freedoms,
     freedoms,
-    noise_information,
     refuse,
     scales,
 )
@@ -38,8 +36,6 @@ from errormotion.methods.crossbeam_scan.registration.start import Start, descend
 Array = NDArray[np.float64]
 Backend = Literal["height_map", "open3d_plane", "paper"]
 
-THIN = 4
-"""The start is found with every fourth block along both directions."""
 GATE = 5.0
 """Blocks further off than this many robust standard deviations are dirt, and left out."""
 LARGEST_SHIFT, LARGEST_TURN = 4e-3, 0.1
@@ -50,6 +46,8 @@ LARGEST_MISFIT = 0.02
 """Residuals may be this share of the surface's relief before the scans count as two artefacts."""
 NOISY = 10.0
 """Information counts beyond this many times what the slopes' noise makes of nothing."""
+NEAR = 0.01
+"""The noise is estimated once a step would change its variance by no more than this share."""
 _STEPS = 12
 
 
@@ -114,9 +112,10 @@ def register(
         from errormotion.methods.crossbeam_scan.registration import clouds
 
         pose, rms, steps = clouds.BACKENDS[registration](cold.scan, warm.scan)
-        gate = GATE * problem.evaluate(pose).scale()
-        sums = problem.evaluate(pose, gate)
-        found = _Found(State(pose, np.zeros(0)), sums, Noise(), gate, steps)
+        state = State.of(pose)
+        gate = GATE * problem.evaluate(state).scale()
+        sums = problem.evaluate(state, gate)
+        found = _Found(state, sums, Noise(), gate, steps)
         # What the height map still sees of this pose's error is the honest part of its covariance.
         missed = solve(*normal_equations(sums, found.noise), free.motions, free.radius)
     sums, state = found.sums, found.state
@@ -149,17 +148,13 @@ def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Fre
     """Return what both scans determine, from the surfaces alone: each laid on itself."""
     found = []
     for block_map, what in ((cold, "a cold scan"), (warm, "a warm scan")):
-        problem = Problem.of(block_map, block_map, THIN, extra)
-        sums = problem.evaluate(problem.rest)
-        information = sums.A.sum(axis=0) * (sums.used / float(np.sum(sums.A[:, 2, 2])))
-        X, Y = np.meshgrid(problem.x - problem.centre[0], problem.y - problem.centre[1])
-        known = np.isfinite(sums.residual)
-        noise = noise_information(X[known], Y[known], problem.stack[0][known] - problem.centre[2], extra.bases)
-        noise *= NOISY * block_map.slope_noise**2
-        free = freedoms(information[:6, :6], sums.used, noise[:6, :6])
+        of_slopes, of_noise = block_map.moments.information(extra.motions)
+        of_noise *= NOISY * block_map.slope_noise**2
+        blocks = block_map.moments.blocks
+        free = freedoms(of_slopes[:6, :6], blocks, of_noise[:6, :6])
         if loose == "refuse":
             refuse(free, what)
-        extra.refuse_undetermined(information - noise, sums.used, free)
+        extra.refuse_undetermined(of_slopes - of_noise, blocks, free)
         found.append(free)
     return max(found, key=lambda free: (len(free.loose), free.condition))
 
@@ -187,7 +182,7 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
     """Return where to start, or refuse scans that show no common surface."""
     thin = Problem.of(cold, warm, THIN)
     noise = 30 * cold.usual_variance**0.5
-    start = descend(thin, RigidTransform.identity(), free.motions, free.radius)
+    start = descend(thin, thin.rest, free.motions, free.radius)
     if not start.scale < noise:
         found = search(thin, free.motions, free.radius)
         start = found if found.scale < start.scale else start
@@ -197,13 +192,14 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
             f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) wherever one is laid on the other; "
             "check that both scans are of the same artefact, begin at the same place and have the same units"
         )
-    shift, turn = start.pose.apply(cold.centre) - cold.centre, start.pose.rotation.magnitude()
+    M = start.state.matrix
+    shift, turn = M[:, :3] @ cold.centre + M[:, 3] - cold.centre, start.state.turn
     if np.hypot(*shift[:2]) > LARGEST_SHIFT or turn > LARGEST_TURN:
         raise MethodError(
             f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
             f"{turn:.3f} rad; let both scans begin at the same place of the artefact"
         )
-    share = np.isfinite(thin.evaluate(start.pose).residual).sum() / np.isfinite(thin.stack[3]).sum()
+    share = np.isfinite(thin.evaluate(start.state).residual).sum() / np.isfinite(thin.stack[3]).sum()
     if share < LEAST_OVERLAP:
         raise MethodError(
             f"expected at least {LEAST_OVERLAP:.0%} of the warm scan to lie on the cold one, found {share:.0%}; "
@@ -223,13 +219,13 @@ def _relief(block_map: BlockMap) -> float:
 
 def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool) -> _Found:
     """Take Gauss-Newton steps with all blocks; the noise is estimated once the pose is near."""
-    state, noise, gate = State(start.pose, problem.rest.values), Noise(), GATE * start.scale
+    state, noise, gate = State(start.state.matrix, problem.rest.values), Noise(), GATE * start.scale
     near, steps = False, start.steps
     for _ in range(_STEPS):
         steps += 1
         sums = problem.evaluate(state, gate)
         if near:
-            noise = estimate_noise(problem, state, sums, gate, line_effects)
+            noise = estimate_noise(problem, state, sums, line_effects)
         H, h = problem.equations(sums, noise, state)
         move = solve(H, h, free.motions, free.radius)
         state = problem.stepped(state, move)
@@ -237,7 +233,7 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
         length = float(move @ H @ move) / noise.k
         if near and length < 0.1:
             break
-        near = near or length < 10.0
+        near = near or length < NEAR * sums.used
         gate = GATE * sums.scale()
     else:
         raise MethodError(

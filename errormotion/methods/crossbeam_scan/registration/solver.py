@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import kernels
 from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
+from errormotion.methods.crossbeam_scan.registration.comparison import accumulate, accumulate_shared, lag_sums
 from errormotion.methods.crossbeam_scan.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.registration.freedoms import scales
 
@@ -35,6 +34,8 @@ Array = NDArray[np.float64]
 NONE = Extra.of(None)
 LINE = [2, 1]
 """Columns of J that are the line effects: 1 and, but for its sign, Sy."""
+MANY = 10000
+"""More blocks than these are shared out to several threads."""
 LAGS = 2
 _NEIGHBOURS = (2 * LAGS + 1) ** 2
 _EM_STEPS = 25
@@ -65,42 +66,38 @@ class Problem:
     @property
     def rest(self) -> State:
         """No motion."""
-        return State(RigidTransform.identity(), np.zeros(len(self.extra.names)))
+        return State(np.eye(3, 4), np.zeros(len(self.extra.names)))
 
-    def evaluate(self, state: State | RigidTransform, gate: float = np.inf) -> Sums:
+    def evaluate(self, state: State, gate: float = np.inf) -> Sums:
         """Return residuals and sums at a state; blocks further off than ``gate`` (m) are left out of the sums."""
-        matrix, normal, bases = self.map(state)
-        n = 6 + len(bases)
-        residual = np.empty(self.stack.shape[1:])
+        matrix, normal = self.map(state)
+        n = 6 + len(self.extra.bases)
+        residual, weight = np.empty((2, *self.stack.shape[1:]))
         rows = np.empty((len(self.y), n * n + n + 3))
         surface = self.cold.surface
-        kernels.accumulate(
-            self.stack, self.x, self.y, matrix, normal, self.centre, bases, surface.coefficients, self.cold.variance,
-            surface.grid, gate, residual, rows,
+        work = accumulate_shared if residual.size > MANY else accumulate
+        work(
+            self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, surface.coefficients,
+            self.cold.variance, surface.grid, gate, residual, weight, rows,
         )  # fmt: skip
         A, g = rows[:, : n * n].reshape(-1, n, n), rows[:, n * n : n * n + n]
-        return Sums(residual, A, g, *rows[:, n * n + n :].T)
+        return Sums(residual, weight, A, g, *rows[:, n * n + n :].T)
 
-    def map(self, state: State | RigidTransform) -> tuple[Array, Array, Array]:
-        """Return what takes warm points to the cold frame (3, 4), what takes normals (3, 3), and the extra bases."""
-        if isinstance(state, RigidTransform):
-            matrix = np.ascontiguousarray(np.asarray(state.as_matrix(), dtype=float)[:3])
-            return matrix, matrix[:, :3].copy(), NONE.bases
-        matrix, normal, _ = self.map(state.pose)
-        if len(state.values):
-            stretch = self.extra.stretch(state.values)
-            matrix = stretch @ matrix
-            matrix[:, 3] += self.centre - stretch @ self.centre
-            normal = np.asarray(np.linalg.inv(matrix[:, :3]).T, dtype=float)
-        return np.ascontiguousarray(matrix), np.ascontiguousarray(normal), self.extra.bases
-
-    def moved(self, pose: RigidTransform, step: Array) -> RigidTransform:
-        """Return the pose after a further twist (6,) at the centre."""
-        return poses.displaced(step, self.centre) * pose
+    def map(self, state: State) -> tuple[Array, Array]:
+        """Return what takes warm points to the cold frame (3, 4), and what takes normals (3, 3)."""
+        if not state.values.any():
+            return state.matrix, np.ascontiguousarray(state.matrix[:, :3])
+        stretch = self.extra.stretch(state.values)
+        matrix = stretch @ state.matrix
+        matrix[:, 3] += self.centre - stretch @ self.centre
+        return matrix, np.ascontiguousarray(np.linalg.inv(matrix[:, :3]).T, dtype=float)
 
     def stepped(self, state: State, step: Array) -> State:
-        """Return the state after a further twist at the centre and extra values, (6 + k,)."""
-        return State(self.moved(state.pose, step[:6]), state.values + step[6:])
+        """Return the state after a further twist at the centre and extra values, (6 + k,), or after a twist (6,)."""
+        turn = rotation(step[3:6])
+        matrix = turn @ state.matrix
+        matrix[:, 3] += step[:3] + self.centre - turn @ self.centre
+        return State(matrix, state.values + step[6:] if len(step) > 6 else state.values)
 
     def equations(self, sums: Sums, noise: Noise, state: State) -> tuple[Array, Array]:
         """Return information and gradient of twist and extra parameters, with their priors, in units of 1 / k."""
@@ -116,15 +113,43 @@ class Problem:
 class State:
     """Where the warm scan is thought to be: a warm point p is at c + stretch (M p - c), c the problem's centre."""
 
-    pose: RigidTransform
+    matrix: Array
+    """M, (3, 4)."""
     values: Array
+
+    @classmethod
+    def of(cls, pose: RigidTransform, extra: int = 0) -> State:
+        """Return the state of a pose, extra values 0."""
+        return cls(np.array(pose.as_matrix()[:3], dtype=float, order="C"), np.zeros(extra))
+
+    @property
+    def pose(self) -> RigidTransform:
+        """M."""
+        return RigidTransform.from_matrix(np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]]))
+
+    @property
+    def turn(self) -> float:
+        """Angle of the rotation, rad."""
+        R = self.matrix[:, :3]
+        axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
+
+
+def rotation(v: Array) -> Array:
+    """Return the matrix (3, 3) of a rotation vector (3,), rad, after Rodrigues."""
+    angle = float(np.sqrt(v @ v))
+    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    half = np.sinc(angle / (2 * np.pi))
+    R: Array = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half * half * (K @ K)
+    return R
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Residuals at a pose, and for every row of blocks A = J^T W J, g = J^T W r, r^T W r, blocks, t (1 - t)."""
+    """Residuals at a pose, their weights W, and of every row A = J^T W J, g = J^T W r, r^T W r, blocks, t (1 - t)."""
 
     residual: Array
+    weight: Array
     A: Array
     g: Array
     square: Array
@@ -188,34 +213,32 @@ def inverse(H: Array, motions: Array) -> Array:
     return C
 
 
-def estimate_noise(problem: Problem, state: State, sums: Sums, gate: float, line_effects: bool = True) -> Noise:
+def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: bool = True) -> Noise:
     """Estimate k and the line effects from the residuals at the solution.
 
     The covariance needs the noise of slow patterns. Between two nodes the spline averages the cold noise, and
     neighbours share speckle: so k is the sum of the covariances of neighbouring residuals, up to two blocks apart, and
     the variances of the lines are raised by what the spline has averaged away.
     """
-    weight, slope = _weights(problem, state, sums, gate)
-    normalised = np.where(weight > 0, sums.residual, 0.0) * np.sqrt(weight)
     fitted = sums.A.shape[1]
-    k = _long_run(normalised, weight > 0, fitted)
-    tau = np.zeros(2)
+    k = _long_run(sums.residual, sums.weight, fitted)
     rows = sums.count >= 3
+    if not line_effects or np.count_nonzero(rows) < 8:
+        return Noise(k)
     C, u = sums.A[rows][:, LINE][:, :, LINE], sums.g[rows][:, LINE]
-    if line_effects and np.count_nonzero(rows) >= 8:
-        # Independent columns: the part of Sy that is no constant.
-        ridge = C + 1e-9 * np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(2)
-        effects = np.linalg.solve(ridge, u[..., None])[..., 0]
-        significant = _significant(effects, ridge, k, sums.used)
-        if significant:
-            white = np.sqrt(np.mean(np.linalg.inv(ridge).diagonal(axis1=1, axis2=2), axis=0))
-            tau = np.maximum(np.sqrt(np.mean(effects**2, axis=0)), np.sqrt(k) * white)
-            for _ in range(2):
-                tau = _maximised(C, u, k, tau)
-                noise = Noise(k, (float(tau[0]), float(tau[1])))
-                effect = np.einsum("rij,rj->ri", noise.gains(sums.A), sums.g[:, LINE])
-                rest = sums.residual - effect[:, :1] + effect[:, 1:] * slope
-                k = _long_run(np.where(weight > 0, rest, 0.0) * np.sqrt(weight), weight > 0, fitted)
+    # Independent columns: the part of Sy that is no constant.
+    ridge = C + 1e-9 * np.trace(C, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+    effects = np.linalg.solve(ridge, u[..., None])[..., 0]
+    if not _significant(effects, ridge, k, sums.used):
+        return Noise(k)
+    white = np.sqrt(np.mean(np.linalg.inv(ridge).diagonal(axis1=1, axis2=2), axis=0))
+    tau = np.maximum(np.sqrt(np.mean(effects**2, axis=0)), np.sqrt(k) * white)
+    slope = _slope(problem, state)
+    for _ in range(2):
+        tau = _maximised(C, u, k, tau)
+        noise = Noise(k, (float(tau[0]), float(tau[1])))
+        effect = np.einsum("rij,rj->ri", noise.gains(sums.A), sums.g[:, LINE])
+        k = _long_run(sums.residual - effect[:, :1] + effect[:, 1:] * slope, sums.weight, fitted)
     # Half of the jitter is the cold scan's, of which the spline shows only a part.
     averaged = 1.0 - _GAIN * float(sums.between.sum() / max(sums.count.sum(), 1))
     tau = tau * np.sqrt(2.0 / (1.0 + averaged))
@@ -240,30 +263,21 @@ def _significant(effects: Array, C: Array, k: float, blocks: int) -> bool:
     return bool(chi2 > freedoms + 4 * np.sqrt(2 * freedoms + of_k))
 
 
-def _weights(problem: Problem, state: State, sums: Sums, gate: float) -> tuple[Array, Array]:
-    """Return the blocks' weights, 0 where a block is not in the sums, and Sy with the sign of J's second column."""
-    known = np.isfinite(sums.residual) & (np.abs(sums.residual) < gate)
-    variance = np.where(known, problem.stack[3], np.inf)
-    cold = problem.cold.usual_variance
-    _, R, _ = problem.map(state)
-    normal = [-R[i, 0] * problem.stack[1] - R[i, 1] * problem.stack[2] + R[i, 2] for i in (1, 2)]
-    return np.where(known, 1.0 / (variance + cold), 0.0), -normal[0] / normal[1]
+def _slope(problem: Problem, state: State) -> Array:
+    """Return Sy of the blocks with the sign of J's second column."""
+    _, R = problem.map(state)
+    y, z = (-R[i, 0] * problem.stack[1] - R[i, 1] * problem.stack[2] + R[i, 2] for i in (1, 2))
+    slope: Array = -y / z
+    return slope
 
 
-def _long_run(r: Array, known: NDArray[np.bool_], fitted: int) -> float:
-    """Return the sum of covariances of r with its neighbours up to LAGS blocks away; zeros stand where not known."""
-    n, m = r.shape
-    total = 0.0
-    for i in range(LAGS + 1):
-        for j in range(-LAGS, LAGS + 1):
-            if i == 0 and j < 0:
-                continue
-            left, right = slice(max(0, -j), m - max(0, j)), slice(max(0, j), m - max(0, -j))
-            pairs = max(int(np.count_nonzero(known[: n - i, left] & known[i:, right])), 1)
-            covariance = float(np.sum(r[: n - i, left] * r[i:, right])) / pairs
-            total += covariance if i == j == 0 else 2 * covariance
-    count = max(int(np.count_nonzero(known)), 1)
-    alone = float(np.sum(r * r)) / count
+def _long_run(residual: Array, weight: Array, fitted: int) -> float:
+    """Return the sum of covariances of the normalised residuals with their neighbours up to LAGS blocks away."""
+    sums, pairs = np.empty((2, LAGS + 1, 2 * LAGS + 1))
+    lag_sums(residual, weight, LAGS, sums, pairs)
+    covariance = sums / np.maximum(pairs, 1.0)
+    count, alone = float(pairs[0, LAGS]), float(covariance[0, LAGS])
+    total = float(2 * covariance[1:].sum() + covariance[0].sum())
     # The fit has taken its parameters' share out of every block and each of its neighbours. Too few blocks make the sum
     # uncertain; it is never far below the variance itself.
-    return max(total / max(1.0 - _NEIGHBOURS * fitted / count, 0.5), 0.5 * alone)
+    return max(total / max(1.0 - _NEIGHBOURS * fitted / max(count, 1.0), 0.5), 0.5 * alone)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
 
-from errormotion.methods.crossbeam_scan.registration.solver import Noise, Problem, normal_equations, solve
+from errormotion.methods.crossbeam_scan.registration.solver import Noise, Problem, State, normal_equations, solve
 
 Array = NDArray[np.float64]
 
@@ -22,32 +21,31 @@ _STEPS = 25
 
 @dataclass(frozen=True)
 class Start:
-    """A pose, the robust scale of the residuals there (m), and the steps it took."""
+    """A state, the robust scale of the residuals there (m), and the steps it took."""
 
-    pose: RigidTransform
+    state: State
     scale: float
     steps: int
 
 
-def descend(problem: Problem, pose: RigidTransform, motions: Array, radius: float, steps: int = _STEPS) -> Start:
+def descend(problem: Problem, state: State, motions: Array, radius: float, steps: int = _STEPS) -> Start:
     """Take Gauss-Newton steps with the blocks that fit until they no longer move the surface by a nanometre."""
-    gate = np.inf
-    done = 0
+    gate, done, known = np.inf, 0, np.count_nonzero(np.isfinite(problem.stack[3]))
     for done in range(1, steps + 1):
-        sums = problem.evaluate(pose, gate)
-        if 2 * sums.used < np.count_nonzero(np.isfinite(problem.stack[3])) * 0.5:
+        sums = problem.evaluate(state, gate)
+        if 4 * sums.used < known:
             if gate < np.inf:
                 gate = np.inf
                 continue
-            return Start(pose, np.inf, done)
+            return Start(state, np.inf, done)
         step = solve(*normal_equations(sums, _WHITE), motions, radius)
         size = float(np.max(np.abs(step * [1, 1, 1, radius, radius, radius])))
         # A step beyond the surface's features leads nowhere.
-        pose = problem.moved(pose, step * min(1.0, 2e-3 / max(size, 1e-12)))
+        state = problem.stepped(state, step * min(1.0, 2e-3 / max(size, 1e-12)))
         gate = max(6 * sums.scale(), 1e-9)
         if size < 1e-8:
             break
-    return Start(pose, problem.evaluate(pose).scale(), done)
+    return Start(state, problem.evaluate(state).scale(), done)
 
 
 def search(problem: Problem, motions: Array, radius: float) -> Start:
@@ -56,17 +54,17 @@ def search(problem: Problem, motions: Array, radius: float) -> Start:
     for x in SHIFTS:
         for y in SHIFTS:
             for yaw in YAWS:
-                pose = problem.moved(RigidTransform.identity(), np.array([x, y, 0.0, 0.0, 0.0, yaw]))
+                state = problem.stepped(problem.rest, np.array([x, y, 0.0, 0.0, 0.0, yaw]))
                 for _ in range(2):
-                    sums = problem.evaluate(pose)
+                    sums = problem.evaluate(state)
                     if sums.used < 16:
                         break
                     H, h = normal_equations(sums, _WHITE)
                     level = np.zeros(6)
                     level[_LEVEL] = -np.linalg.solve(H[np.ix_(_LEVEL, _LEVEL)], h[_LEVEL])
-                    pose = problem.moved(pose, level)
+                    state = problem.stepped(state, level)
                 else:
-                    tried.append(Start(pose, problem.evaluate(pose).scale(), 3))
+                    tried.append(Start(state, problem.evaluate(state).scale(), 3))
     tried.sort(key=lambda start: start.scale)
-    ends = [descend(problem, start.pose, motions, radius) for start in tried[:_KEPT]]
+    ends = [descend(problem, start.state, motions, radius) for start in tried[:_KEPT]]
     return min(ends, key=lambda start: start.scale)
