@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -149,8 +149,9 @@ class _Campaign:
     ) -> None:
         self.profiler, self.move, self.settings, self.plan = profiler, move, settings, plan
         self.low, self.high = pass_ends(settings)
-        reach = settings.scan_length / 2 + settings.margin
-        self.windows = np.array(settings.positions) - reach, np.array(settings.positions) + reach
+        middles, half = np.array(settings.positions), settings.scan_length / 2
+        self.scans = middles - half, middles + half
+        self.windows = self.scans[0] - settings.margin, self.scans[1] + settings.margin
         self.origin = move.now()
         self.zero: float | None = None  # when the warm-up began, by the mover's clock
         self.next = 0
@@ -249,6 +250,8 @@ class _Campaign:
             with closing(listen(self.profiler, self.move, program, self.settings, self.low, self.high)) as listening:
                 for lines in listening:
                     part = lines.within(*self.windows)
+                    if lines.within(*self.scans) is not lines:  # points beside the artefacts are not missed
+                        part = replace(part, invalid={})
                     came, kept = came + lines.encoder.size, kept + part.encoder.size
                     reach = [
                         np.nanmin(lines.position, initial=reach[0]), np.nanmax(lines.position, initial=reach[1])

@@ -121,10 +121,11 @@ def measuring_pass(settings: Settings) -> Program:
     """Return the pass over all artefacts in +Y. It moves with the measuring feed only: the machine stays cold."""
     low, high = pass_ends(settings)
     count = len(settings.positions)
+    height = () if settings.scan_z is None else (Move(settings.scan_z, settings.warm_up_feed, "Z"),)
     return Program(
         PASS,
         f"measuring pass over {count} artefact{'s' if count > 1 else ''}",
-        _pass(low, high, settings),
+        (*height, *_pass(low, high, settings)),
     )
 
 

@@ -64,6 +64,9 @@ class Settings(PluginSettings):
     travel: tuple[Length, Length] | None = Field(
         default=None, description="ends of the axis: programs that leave them are refused"
     )
+    scan_z: Length | None = Field(
+        default=None, description="Z of the spindle for the scans, at which every pass begins; default: where it stands"
+    )
     encoder_pitch: Length = Field(default=1e-6, description="way per encoder count; negative where it counts backwards")
     encoder_zero: Length = Field(default=0.0, description="position of the axis where the encoder's count is 0")
 

@@ -80,6 +80,12 @@ def test_pocket_programs_lift_the_spindle_first():
         assert moved[:, 1].max() == pytest.approx(0.1 + 0.014 + 0.005)
 
 
+def test_a_pass_goes_to_the_height_of_the_scans_where_that_is_given():
+    moved = path_of(program_texts(SETTINGS.model_copy(update={"scan_z": 0.4}))["pass.nc"]).places
+    assert set(moved[1:, 2]) == {0.4}
+    assert " Z" not in program_texts(SETTINGS)["pass.nc"]
+
+
 def test_no_place_is_written_as_minus_zero():
     text = measuring_pass(Settings(positions=(0.033 - 1e-8, 0.2), warm_up=())).text()
     assert "Y0.000" in text
