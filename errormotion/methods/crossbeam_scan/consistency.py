@@ -246,19 +246,23 @@ class _Scans:
         return _greatest(k, cycles[told], excess, V)
 
     def relief(self, step: Moved, left: NDArray[np.intp]) -> float:
-        """Return by how much more likely the gains of a cycle are, all freedoms smooth, if one artefact stepped (log).
+        """Return by how much more likely all gains are, each freedom smooth, without one of one artefact (log).
 
         The artefact that moved and its neighbour at the end both look out of line; without the right one, the rest is
-        smooth.
+        as smooth as in the other cycles: for that, all cycles share one amplitude.
         """
-        _, _, gain, noise = self.gains(step.artefact, left)
-        s = int(np.flatnonzero(np.flatnonzero(self.there[:, step.artefact]) == step.since)[0])
-        both = np.stack([gain[s], np.where((left == step.artefact)[:, None], np.nan, gain[s])])
-        variance = np.broadcast_to(np.diagonal(noise[s], axis1=-2, axis2=-1), both.shape)
+        k = step.artefact
+        _, _, gain, noise = self.gains(k, left)
+        without = gain.copy()
+        without[np.flatnonzero(self.there[:, k]) == step.since, left == k] = np.nan
         places, order = self.position[left], _order(left)
-        each = [smooth(places, both[..., d], variance[..., d], places[:1], order=order) for d in range(6)]
-        all_in, one_out = np.sum([curve.log_likelihood for curve in each], axis=0)
-        return float(one_out - all_in)
+        likelihood = [
+            smooth(places, points[..., d], noise[..., d, d], places[:1], order=order, together=True).log_likelihood
+            for points in (gain, without)
+            for d in range(6)
+        ]
+        each = np.nanmax(likelihood, axis=-1)  # shared; NaN for a cycle with too few artefacts
+        return float(each[6:].sum() - each[:6].sum())
 
     def gains(self, k: int, left: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return what the artefacts left gain between the scans of artefact k.

@@ -166,7 +166,13 @@ def smooth(
     basis = _Basis.of(x, to, order, exact_zero)
 
     enough = different >= order
-    series = [_Series.of(basis, *row) for row in zip(y[enough], v[enough], known[enough], strict=True)]
+    designs: dict[bytes, _Design] = {}
+    series = []
+    for row in np.flatnonzero(enough):
+        key = known[row].tobytes() + v[row].tobytes()
+        if key not in designs:
+            designs[key] = _Design.of(basis, v[row], known[row])
+        series.append(_Series(designs[key], y[row]))
     groups = [series] if together else [[one] for one in series]
     for group in groups:
         _weigh(group)
@@ -290,9 +296,9 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
     return np.asarray(sum(terms) / factorial(q) ** 2)
 
 
-@dataclass
-class _Series:
-    """The points of one curve, and how likely each amplitude (squared) is.
+@dataclass(frozen=True)
+class _Design:
+    """What points at known places with known noise say of a curve, whatever their values.
 
     In units of its noise, a set of points is what a polynomial fits, and contrasts that no polynomial moves:
     uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the polynomial fitted, plus
@@ -300,23 +306,16 @@ class _Series:
     """
 
     known: NDArray[np.bool_]
-    contrast: Array  # (c,)
     gain: Array  # (c,)
     reach: Array  # (m, c), per amplitude
     own: Array  # variance of the curve about the polynomial fitted, per amplitude, (m,)
-    fitted: Array  # polynomial, (m,)
-    fit: Array  # weights of the points in it, (m, n)
+    fit: Array  # weights of the points in the polynomial fitted, (m, n)
     to_contrast: Array  # weights of the points in each contrast, (c, n)
     noise: Array  # variance of the polynomial by the noise of the points, (m,)
     unit: float  # log of the density of the contrasts over that of the points
-    amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
-    share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
-    best: float = np.nan
-    evidence: float = np.nan
-    best_likelihood: float = np.nan
 
     @classmethod
-    def of(cls, basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_]) -> _Series:
+    def of(cls, basis: _Basis, v: Array, known: NDArray[np.bool_]) -> _Design:
         sigma = np.sqrt(v[known])
         K, K_at = basis.K[np.ix_(known, known)] / np.outer(sigma, sigma), basis.K_at[:, known] / sigma
         T = basis.T[known] / sigma[:, None]
@@ -328,42 +327,49 @@ class _Series:
         H = np.linalg.solve(R[: T.shape[1]].T, basis.T_at.T).T  # of the fitted polynomial, (m, p)
         off = K_at - H @ inside.T @ K
         own = basis.own - np.einsum("mn,mn->m", K_at + off, H @ inside.T)
-        points = y[known] / sigma
-        return cls(
-            known,
-            rest.T @ points,
-            gain,
-            off @ rest,
-            own,
-            H @ inside.T @ points,
-            H @ inside.T / sigma,
-            rest.T / sigma,
-            (H**2).sum(axis=1),
-            -float(np.log(sigma).sum() + np.log(np.abs(np.diag(R))).sum()) - gain.size * np.log(2 * np.pi) / 2,
-        )
+        unit = -float(np.log(sigma).sum() + np.log(np.abs(np.diag(R))).sum()) - gain.size * np.log(2 * np.pi) / 2
+        return cls(known, gain, off @ rest, own, H @ inside.T / sigma, rest.T / sigma, (H**2).sum(axis=1), unit)
+
+
+@dataclass
+class _Series:
+    """The points of one curve, and how likely each amplitude (squared) is."""
+
+    design: _Design
+    y: Array
+    contrast: Array = field(init=False)  # (c,)
+    amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
+    share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
+    best: float = np.nan
+    evidence: float = np.nan
+    best_likelihood: float = np.nan
+
+    def __post_init__(self) -> None:
+        self.y = self.y[self.design.known]
+        self.contrast = self.design.to_contrast @ self.y
 
     def log_likelihood(self, amplitudes: Array) -> Array:
         """Return that of each amplitude, whatever the polynomial."""
-        grown = 1 + amplitudes[:, None] * self.gain
-        return np.asarray(self.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
+        grown = 1 + amplitudes[:, None] * self.design.gain
+        return np.asarray(self.design.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
 
     def mixture(self) -> tuple[Array, Array, Array]:
         """Return values (m,), variance (m,) and weights (m, n) over all amplitudes."""
-        A = self.amplitudes[:, None]
-        held = A / (1 + A * self.gain)  # of each contrast by each amplitude
-        curves = self.fitted + (held * self.contrast) @ self.reach.T
+        d, A = self.design, self.amplitudes[:, None]
+        held = A / (1 + A * d.gain)  # of each contrast by each amplitude
+        curves = d.fit @ self.y + (held * self.contrast) @ d.reach.T
         values = self.share @ curves
-        strength = self.reach**2 / self.gain
-        between = np.maximum(self.own - strength.sum(axis=1), 0.0)  # of a curve through all points, per amplitude
-        variance = self.noise + A * between + held @ strength.T
-        weights = np.zeros((values.size, self.known.size))
-        weights[:, self.known] = self.fit + (self.reach * (self.share @ held)) @ self.to_contrast
+        strength = d.reach**2 / d.gain
+        between = np.maximum(d.own - strength.sum(axis=1), 0.0)  # of a curve through all points, per amplitude
+        variance = d.noise + A * between + held @ strength.T
+        weights = np.zeros((values.size, d.known.size))
+        weights[:, d.known] = d.fit + (d.reach * (self.share @ held)) @ d.to_contrast
         return values, self.share @ (variance + (curves - values) ** 2), weights
 
 
 def _weigh(group: list[_Series]) -> None:
     """Give each curve of a group the amplitudes that matter, and their shares; none where nothing tells."""
-    gains = np.concatenate([one.gain for one in group]) if group else np.empty(0)
+    gains = np.concatenate([one.design.gain for one in group]) if group else np.empty(0)
     if not gains.size:
         return
     contrasts = np.concatenate([one.contrast for one in group])
