@@ -1,0 +1,412 @@
+"""Many runs identified as a graph of small tasks: in threads or processes here, or on a Dask cluster.
+
+A task takes paths and settings and leaves a file; no dataset travels. So the same tasks run anywhere that sees the same
+paths, a run that fails harms no other, and a batch that broke off goes on: what is there already is stepped over.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import platform
+import signal
+import threading
+import time
+import traceback as tracebacks
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from errormotion import __version__, datasets, plugins
+from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.runner import Progress, Quiet, settings_hash
+from errormotion.datasets import provenance
+from errormotion.datasets.storage import reading
+from errormotion.errors import DatasetError, ErrormotionError, RunError
+from errormotion.plugins import PluginSettings
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+log = logging.getLogger(__name__)
+_turn = threading.Lock()
+
+SCHEDULERS = ("threads", "processes", "sync")
+MARK = "identified_from"
+"""Attribute of a result: hashes of the raw dataset and of the settings, by which a batch knows its own again."""
+CPU_COUNT = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+PATIENCE = 15.0
+"""Seconds until a cluster that does not answer, or has no worker, is given up."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one run.
+
+    Attributes
+    ----------
+    raw : Path
+        The raw dataset, or the run folder that stands for it.
+    errors : Path or None
+        The error dataset; None where there is none.
+    reason : str
+        Why there is none.
+    seconds : float
+        How long it took.
+    stepped_over : bool
+        Whether the error dataset was there already.
+    traceback : str
+        Of a mistake in errormotion or in a plugin; empty for what a person can mend.
+    """
+
+    raw: Path
+    errors: Path | None = None
+    reason: str = ""
+    seconds: float = 0.0
+    stepped_over: bool = False
+    traceback: str = field(default="", repr=False)
+
+
+class Task(NamedTuple):
+    """What one task is told; small, and good for any machine that sees the same paths."""
+
+    raw: str
+    place: str
+    method_id: str
+    method_version: str
+    settings: str
+    version: str
+
+
+def identify_runs(
+    raws: Sequence[str | Path],
+    method_id: str,
+    settings: PluginSettings,
+    out: str | Path,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> list[Outcome]:
+    """Identify many runs; each gives one NetCDF file, named after it, in one folder.
+
+    Parameters
+    ----------
+    raws : sequence of path
+        Raw datasets and run folders; a folder of run folders stands for those of the method.
+    method_id : str
+        The method plugin.
+    settings : PluginSettings
+        For all of them.
+    out : path
+        The folder; it is made where it is missing. A result that is there from the same raw data, settings and method
+        is stepped over, any other is never overwritten.
+    scheduler : str, optional
+        ``threads``, ``processes``, ``sync`` (one after another), or the address of a Dask scheduler, such as
+        ``tcp://host:8786``. By default what :func:`choose_scheduler` takes.
+    workers : int, optional
+        Threads or processes; by default one for each processor. A cluster has the workers that it has.
+    progress : Progress, optional
+        Whom to tell.
+
+    Returns
+    -------
+    list of Outcome
+        In the order of the runs.
+
+    Raises
+    ------
+    RunError
+        The batch as a whole cannot be done: no run, a scheduler that is unknown or silent, workers with another
+        errormotion, Dask missing.
+    PluginError
+        There is no such method.
+    KeyboardInterrupt
+        The operator stopped it; what is done stays.
+    """
+    name, note = choose_scheduler(scheduler)
+    if workers is not None and (workers < 1 or name not in SCHEDULERS):
+        raise RunError(f"Expected at least one worker, and none told for a cluster, which has its own; found {workers}")
+    if note:
+        log.warning("%s", note)
+    method = plugins.get("methods", method_id)
+    found = list(_meant([Path(raw) for raw in raws], method_id))
+    wanted = [raw for raw, reason in found if not reason]
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: expected a folder, or a place where one can be made; {error.strerror}") from error
+    told = (method.info.id, method.info.version, settings.model_dump_json(), __version__)
+    tasks = [
+        Task(str(raw_of(raw).resolve()), str(out.resolve() / f"{name}.nc"), *told)
+        for raw, name in zip(wanted, _names(wanted), strict=True)
+    ]
+    outcomes = {raw: Outcome(raw, reason=reason) for raw, reason in found if reason}
+    paths = {task.raw: raw for task, raw in zip(tasks, wanted, strict=True)}
+    progress = progress or Quiet()
+
+    def done(outcome: Outcome) -> None:
+        raw = paths[str(outcome.raw)]
+        outcomes[raw] = replace(outcome, raw=raw, errors=out / outcome.errors.name if outcome.errors else None)
+        if outcome.reason:
+            log.error("%s: %s\n%s", raw, outcome.reason, outcome.traceback)
+        progress.advance(len(outcomes))
+        if failed := sum(bool(other.reason) for other in outcomes.values()):
+            progress.note(f"{failed} failed")
+
+    progress.stage("identifying", len(found))
+    try:
+        _work(tasks, name, workers, done)
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(f"{len(outcomes)} of {len(found)} runs are done; the same command goes on.") from error
+    return [outcomes[raw] for raw, _ in found]
+
+
+def choose_scheduler(wanted: str | None) -> tuple[str, str]:
+    """Return the scheduler to take, and what is to be said of it (empty where nothing is).
+
+    Processes are the default. Much of an identification is Python and HDF5, which threads can only do one at a time;
+    its kernels use all processors in any case. A process costs some seconds to start, as much as a few small runs.
+
+    Raises
+    ------
+    RunError
+        There is no such scheduler.
+    """
+    if wanted is not None and "://" not in wanted and wanted not in SCHEDULERS:
+        raise RunError(
+            f"Expected {', '.join(SCHEDULERS)} or the address of a Dask scheduler, such as tcp://host:8786; "
+            f"found '{wanted}'"
+        )
+    if wanted == "threads" and _takes_turns():
+        return wanted, (
+            "The threads identify one run at a time: numba has only its 'workqueue' layer here, which ends the process "
+            "when two threads use it at once. Take processes, or install OpenMP (libgomp, libomp) or TBB."
+        )
+    return wanted or ("processes" if CPU_COUNT > 1 else "sync"), ""
+
+
+def _takes_turns() -> bool:
+    """Whether numba's parallel kernels may be called from one thread at a time only."""
+    import numba
+
+    numba.get_num_threads()  # settles the layer
+    return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
+
+
+def raw_of(path: Path) -> Path:
+    """Return the raw dataset that a path means: a run folder stands for its raw store."""
+    return path / "raw.zarr" if (path / "run.json").exists() else path
+
+
+def is_runs_folder(path: Path) -> bool:
+    """Whether a path is a folder of run folders."""
+    return path.is_dir() and not (path / "run.json").exists() and any(path.glob("*/run.json"))
+
+
+def _meant(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
+    """Yield what is to be identified, each once, with the reason where it cannot be."""
+    seen: set[Path] = set()
+    for raw in raws:
+        for path, reason in _runs(raw, method_id) if is_runs_folder(raw) else [(raw, "")]:
+            path = path.parent if path.name == "raw.zarr" and (path.parent / "run.json").exists() else path
+            if path.resolve() not in seen:
+                seen.add(path.resolve())
+                yield path, reason
+    if not seen:
+        raise RunError("Expected at least one raw dataset, run folder or folder of run folders; found none")
+
+
+def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
+    """Return the runs of a method in a folder, with the reason where one cannot be identified."""
+    found: list[tuple[Path, str]] = []
+    others: set[str] = set()
+    for path in sorted(file.parent for file in folder.glob("*/run.json") if not file.parent.name.startswith(".")):
+        try:
+            data = RunFolder.open(path).data
+        except RunError as error:
+            found.append((path, str(error)))
+            continue
+        if (other := data["method"]["id"]) != method_id:
+            others.add(str(other))
+        elif data["acquired"]:
+            found.append((path, ""))
+        else:
+            go_on = f"'errormotion run --resume --runs {folder}' goes on with it"
+            found.append((path, f"{path}: its measurement is not complete ({data['status']}); {go_on}"))
+    if not found:
+        raise RunError(f"{folder}: expected runs of the method '{method_id}'; found {', '.join(sorted(others))}")
+    return found
+
+
+def _names(raws: Sequence[Path]) -> list[str]:
+    """Return a name for each: its own without the ending, behind those of its folders where several share it."""
+    parts = [(*raw.resolve().parts[1:-1], raw.resolve().name if raw_of(raw) != raw else raw.stem) for raw in raws]
+    depth = [1] * len(parts)
+    while True:
+        names = ["-".join(part[-deep:]) for part, deep in zip(parts, depth, strict=True)]
+        alike = [k for k, count in enumerate(map(Counter(names).get, names)) if count != 1]
+        if not alike:
+            return names
+        if all(depth[k] >= len(parts[k]) for k in alike):
+            same = " and ".join(str(raws[k]) for k in alike if names[k] == names[alike[0]])
+            raise RunError(f"{same}: both would become {names[alike[0]]}.nc; identify them into two folders")
+        for k in alike:
+            depth[k] += 1
+
+
+def _work(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
+    """Do all tasks, and tell each outcome when it is there."""
+    if scheduler == "sync":
+        for task in tasks:
+            done(_identify(*task))
+    elif scheduler in SCHEDULERS:
+        _here(tasks, scheduler, workers, done)
+    else:
+        _on_cluster(tasks, scheduler, done)
+
+
+def _here(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
+    """Work in threads or processes of this machine."""
+    try:
+        from dask.base import compute
+        from dask.callbacks import Callback
+        from dask.delayed import delayed
+    except ImportError as error:
+        raise _missing("dask") from error
+    told: set[str] = set()
+
+    def after(_key: Any, value: Any, *_: Any) -> None:
+        if isinstance(value, Outcome):
+            told.add(str(value.raw))
+            done(value)
+
+    graph = [delayed(_identify, pure=False)(*task) for task in tasks]
+    count = max(1, min(workers or CPU_COUNT, len(tasks)))
+    executor: Executor
+    if scheduler == "threads":
+        executor = ThreadPoolExecutor(count)
+    else:
+        executor = ProcessPoolExecutor(
+            count, multiprocessing.get_context("spawn"), _begin, (max(1, CPU_COUNT // count),)
+        )
+    try:
+        with executor, Callback(posttask=after):
+            compute(*graph, scheduler=scheduler, pool=executor, chunksize=1)
+    except BrokenProcessPool:
+        for task in tasks:
+            if task.raw not in told:
+                reason = (
+                    "a process died while it was at work (memory? fewer --workers take less); the same command goes on"
+                )
+                done(Outcome(Path(task.raw), reason=reason))
+
+
+def _begin(threads: int) -> None:
+    """Set up a process: its share of the processors, and Ctrl-C left to the process that started it."""
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _on_cluster(tasks: Sequence[Task], address: str, done: Callable[[Outcome], None]) -> None:
+    """Work on the machines of a Dask cluster."""
+    try:
+        from dask.delayed import delayed
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise _missing("distributed") from error
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise RunError(f"{address}: expected a Dask scheduler there; none answers ({error})") from error
+    with client:
+        _check_workers(client, address)
+        futures = client.compute([delayed(_identify, pure=False)(*task) for task in tasks])
+        task_of = dict(zip(futures, tasks, strict=True))
+        for future in as_completed(futures):
+            if future.status == "finished":
+                done(future.result())
+            else:  # the task did not even come to its own error: a worker died, or has no errormotion
+                reason = f"the cluster could not do it: {future.exception() or future.status}"
+                done(Outcome(Path(task_of[future].raw), reason=reason))
+
+
+def _check_workers(client: Client, address: str) -> None:
+    """Refuse a cluster without workers, or whose workers have another errormotion."""
+    try:
+        client.wait_for_workers(1, timeout=PATIENCE)
+    except TimeoutError as error:
+        raise RunError(
+            f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'"
+        ) from error
+    versions: Any = client.get_versions(packages=["errormotion"])
+    wrong = [
+        f"{worker} has {found['packages'].get('errormotion') or 'none'}"
+        for worker, found in versions["workers"].items()
+        if found["packages"].get("errormotion") != __version__
+    ]
+    if wrong:
+        raise RunError(
+            f"{address}: expected errormotion {__version__} on every worker; {', '.join(wrong)}. Install it there"
+        )
+
+
+def _missing(package: str) -> RunError:
+    return RunError(
+        f"Several runs at once need the package '{package}', which is not installed: "
+        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' identifies one after another."
+    )
+
+
+def _identify(raw: str, place: str, method_id: str, method_version: str, settings: str, version: str) -> Outcome:
+    """Do one task; whatever goes wrong becomes an outcome."""
+    began = time.perf_counter()
+    reason = trace = ""
+    stepped_over = False
+    try:
+        stepped_over = _identify_or_raise(Task(raw, place, method_id, method_version, settings, version))
+    except ErrormotionError as error:
+        reason = str(error)
+    except Exception as error:  # noqa: BLE001 - a plugin that breaks on one run must not take the others with it
+        reason, trace = f"{type(error).__name__}: {error}", tracebacks.format_exc()
+    errors = None if reason else Path(place)
+    return Outcome(Path(raw), errors, reason, time.perf_counter() - began, stepped_over, trace)
+
+
+def _identify_or_raise(task: Task) -> bool:
+    """Leave the errors of one raw dataset at its place; return whether they were there already."""
+    method = plugins.get("methods", task.method_id)
+    for what, wanted, found in (
+        ("errormotion", task.version, __version__),
+        (f"the method {task.method_id}", task.method_version, method.info.version),
+    ):
+        if wanted != found:
+            raise RunError(f"{platform.node()}: expected {what} in version {wanted}; found {found}. Install it there")
+    settings = method.Settings.model_validate_json(task.settings)
+    plain = provenance.plain(settings.model_dump(mode="json"))
+    place = Path(task.place)
+    with reading(task.raw), datasets.load(task.raw) as dataset:
+        mark = {
+            "raw": datasets.hash_dataset(dataset),
+            "settings": settings_hash(plain, task.method_id, task.method_version),
+        }
+        if place.exists():
+            if datasets.load(place).attrs.get(MARK) == json.dumps(mark):
+                return True
+            raise DatasetError(
+                f"{place}: exists already, from other raw data, other settings or another version of the method, and "
+                "a result is never overwritten; give another folder to --out"
+            )
+        with _turn if _takes_turns() else nullcontext():
+            errors = method().identify(dataset, settings)
+    datasets.validate(errors)
+    datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), place)
+    return False
