@@ -1,0 +1,55 @@
+"""``errormotion program``."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"
+CFRAME = ROOT / "examples" / "virtual_cframe" / "campaign.toml"
+
+
+def test_programs_of_every_test_are_written_each_in_its_folder(run, answer, tmp_path):
+    said = answer("program", GANTRY, "--out", tmp_path / "nc")
+    files = sorted(path.relative_to(tmp_path).as_posix() for path in (tmp_path / "nc").rglob("*.nc"))
+    assert files == [
+        *(f"nc/pose/pocket_{k}.nc" for k in (1, 2)),
+        "nc/scan/pass.nc",
+        *(f"nc/scan/warm_up_{k}.nc" for k in range(1, 5)),
+    ]
+    assert sorted(Path(row["file"]).relative_to(tmp_path).as_posix() for row in said["programs"]) == files
+    text = (tmp_path / "nc" / "scan" / "pass.nc").read_bytes()
+    assert text.startswith(b"%\r\n(pass.nc: measuring pass over 4 artefacts)\r\n")
+
+
+def test_one_test_goes_straight_into_the_folder(run, tmp_path):
+    shown = run("program", GANTRY, "--test", "pose", "--out", tmp_path).stdout
+    assert "spindle 182 mm above where it was cut" in shown
+    assert (tmp_path / "pocket_2.nc").exists()
+
+
+def test_no_file_is_replaced(run, tmp_path):
+    (tmp_path / "pocket_2.nc").write_text("mine")
+    found = run("program", GANTRY, "--test", "pose", "--out", tmp_path, code=1)
+    assert "pocket_2.nc is there already" in found.stderr
+    assert (tmp_path / "pocket_2.nc").read_text() == "mine"
+    assert not (tmp_path / "pocket_1.nc").exists()
+
+
+def test_methods_without_programs_are_refused(run, tmp_path):
+    found = run("program", CFRAME, "--out", tmp_path, code=1)
+    assert "spindle_drift has no NC programs" in found.stderr
+
+
+def test_an_unknown_test_names_those_there_are(run, tmp_path):
+    assert (
+        "expected one of the tests pose, scan; found 'scans'"
+        in run("program", GANTRY, "--test", "scans", "--out", tmp_path, code=1).stderr
+    )
+
+
+def test_a_program_out_of_travel_writes_nothing(run, tmp_path):
+    for name in ("bench.toml", "campaign.toml"):
+        text = (GANTRY.parent / name).read_text().replace('travel = ["-900 mm"', 'travel = ["-600 mm"')
+        (tmp_path / name).write_text(text)
+    found = run("program", tmp_path / "campaign.toml", "--out", tmp_path / "nc", code=1)
+    assert "would go from Y-633.000" in found.stderr
+    assert not (tmp_path / "nc").exists()
