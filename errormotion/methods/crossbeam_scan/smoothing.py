@@ -55,16 +55,19 @@ class Smooth:
     weights : ndarray, (..., m, n)
         The curve is ``weights @ values`` of the points; 0 for a point that is NaN.
     amplitude : ndarray, (...)
-        Of the white noise, best by evidence, in units of the value per place**(order - 1/2); 0: a polynomial.
+        Of the white noise, best by evidence, in units of the value per place**(order - 1/2) of the more likely order;
+        0: a polynomial.
     evidence : ndarray, (...)
         Log of the likelihood of that amplitude over that of a polynomial; 0 where a polynomial is enough.
     log_likelihood : ndarray, (...)
         Of that amplitude, comparable between points at the same ``places`` with others of them left out. Curves that
         share an amplitude share this and the evidence.
+    rough : ndarray, (...)
+        Probability of the lower order.
     used : ndarray of int, (...)
         Points that are not NaN.
     order : int
-        Of the integration.
+        The higher of the two.
     """
 
     values: Array
@@ -73,6 +76,7 @@ class Smooth:
     amplitude: Array
     evidence: Array
     log_likelihood: Array
+    rough: Array
     used: NDArray[np.int64]
     order: int
 
@@ -120,6 +124,7 @@ def smooth(
     exact_zero: bool = False,
     together: bool = False,
     order: int | None = None,
+    rougher: bool = True,
 ) -> Smooth:
     """Return smooth curves through points, with their variance.
 
@@ -137,6 +142,8 @@ def smooth(
         Whether all curves share one amplitude.
     order : {1, 2, 3}, optional
         3 where not given, or less where even the fullest curve has too few points for evidence.
+    rougher : bool
+        Whether the order below counts too, by its evidence, about the same polynomial.
 
     Returns
     -------
@@ -163,28 +170,22 @@ def smooth(
         order = int(np.clip(different.max(initial=0) - 1, 1, ORDER))
     if order not in (1, 2, 3):
         raise MethodError(f"Curves have order 1, 2 or 3; found {order}.")
-    basis = _Basis.of(x, to, order, exact_zero)
+    rows = np.flatnonzero(different >= order)
+    orders = (order, order - 1) if rougher and order > 1 else (order,)
+    ways = [_series(_Basis.of(x, to, order, q, exact_zero), y, v, known, rows) for q in orders]
 
-    enough = different >= order
-    designs: dict[bytes, _Design] = {}
-    series = []
-    for row in np.flatnonzero(enough):
-        key = known[row].tobytes() + v[row].tobytes()
-        if key not in designs:
-            designs[key] = _Design.of(basis, v[row], known[row])
-        series.append(_Series(designs[key], y[row]))
-    groups = [series] if together else [[one] for one in series]
-    for group in groups:
-        _weigh(group)
-
-    curves = np.full((len(y), to.size), np.nan)
-    spread, W = np.full_like(curves, np.nan), np.full((len(y), to.size, n), np.nan)
-    amplitude, evidence, likelihood = np.full((3, len(y)), np.nan)
-    for k, one in zip(np.flatnonzero(enough), series, strict=True):
-        if one.amplitudes.size:
-            curves[k], spread[k], W[k] = one.mixture()
-            amplitude[k] = one.best * basis.span ** (0.5 - order)
-            evidence[k], likelihood[k] = one.evidence, one.best_likelihood
+    curves, spread = np.full((2, len(y), to.size), np.nan)
+    W = np.full((len(y), to.size, n), np.nan)
+    amplitude, evidence, likelihood, rough = np.full((4, len(y)), np.nan)
+    for some in [range(rows.size)] if together else [[k] for k in range(rows.size)]:
+        share = _weigh_all([[way[k] for k in some] for way in ways])
+        for k in some if share.size else ():
+            each = [way[k] for way in ways]
+            best = max(each, key=lambda one: one.best_likelihood)
+            row = rows[k]
+            curves[row], spread[row], W[row] = _mixed(share, [one.mixture() for one in each])
+            amplitude[row], evidence[row], likelihood[row] = best.amplitude, best.evidence, best.best_likelihood
+            rough[row] = share[1:].sum()
     return Smooth(
         curves.reshape(*batch, to.size),
         spread.reshape(*batch, to.size),
@@ -192,6 +193,7 @@ def smooth(
         amplitude.reshape(batch),
         evidence.reshape(batch),
         likelihood.reshape(batch),
+        rough.reshape(batch),
         known.sum(axis=-1).reshape(batch),
         order,
     )
@@ -242,6 +244,7 @@ def smooth_twists(
         np.stack([one.amplitude for one in each], axis=batch),
         np.stack([one.evidence for one in each], axis=batch),
         np.stack([one.log_likelihood for one in each], axis=batch),
+        np.stack([one.rough for one in each], axis=batch),
         np.stack([one.used for one in each], axis=batch),
         min(one.order for one in each),
     )
@@ -269,7 +272,7 @@ def _check(x: Array, y: Array, v: Array, to: Array, exact_zero: bool) -> None:
 class _Basis:
     """Polynomials and covariances of integrated noise of amplitude 1, places over their span."""
 
-    span: float
+    unit: float  # of amplitudes
     T: Array  # polynomials at the points, (n, p)
     K: Array  # covariance of the points, (n, n)
     T_at: Array  # (m, p)
@@ -277,15 +280,15 @@ class _Basis:
     own: Array  # variance at the places asked for, (m,)
 
     @classmethod
-    def of(cls, x: Array, to: Array, order: int, exact_zero: bool) -> _Basis:
+    def of(cls, x: Array, to: Array, free: int, order: int, exact_zero: bool) -> _Basis:
         start = 0.0 if exact_zero else min(x.min(initial=np.inf), to.min(initial=np.inf))
         span = float(np.ptp(x)) if x.size > 1 else 0.0
         span = span or abs(float(x.max(initial=1.0))) or 1.0
         u, w = (x - start) / span, np.maximum(to - start, 0.0) / span
-        powers = np.arange(int(exact_zero), order)
+        powers = np.arange(int(exact_zero), free)
         own = w ** (2 * order - 1) / ((2 * order - 1) * factorial(order - 1) ** 2)
         K, K_at = _integrated(u, u, order), _integrated(w, u, order)
-        return cls(span, u[:, None] ** powers, K, w[:, None] ** powers, K_at, own)
+        return cls(span ** (0.5 - order), u[:, None] ** powers, K, w[:, None] ** powers, K_at, own)
 
 
 def _integrated(s: Array, t: Array, order: int) -> Array:
@@ -337,10 +340,11 @@ class _Series:
 
     design: _Design
     y: Array
+    amplitude_unit: float
     contrast: Array = field(init=False)  # (c,)
     amplitudes: Array = field(default_factory=lambda: np.empty(0))  # squared
     share: Array = field(default_factory=lambda: np.empty(0))  # of each amplitude
-    best: float = np.nan
+    amplitude: float = np.nan
     evidence: float = np.nan
     best_likelihood: float = np.nan
 
@@ -367,11 +371,30 @@ class _Series:
         return values, self.share @ (variance + (curves - values) ** 2), weights
 
 
-def _weigh(group: list[_Series]) -> None:
-    """Give each curve of a group the amplitudes that matter, and their shares; none where nothing tells."""
-    gains = np.concatenate([one.design.gain for one in group]) if group else np.empty(0)
-    if not gains.size:
-        return
+def _series(basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_], rows: NDArray[np.intp]) -> list[_Series]:
+    """Return the points of the curves of some rows; curves whose points are alike share the design."""
+    designs: dict[bytes, _Design] = {}
+    series = []
+    for row in rows:
+        key = known[row].tobytes() + v[row].tobytes()
+        if key not in designs:
+            designs[key] = _Design.of(basis, v[row], known[row])
+        series.append(_Series(designs[key], y[row], basis.unit))
+    return series
+
+
+def _weigh_all(ways: list[list[_Series]]) -> Array:
+    """Return how likely each order is for the curves of a group, (order,); nothing where nothing tells."""
+    if not sum(one.contrast.size for one in ways[0]):
+        return np.empty(0)
+    log = np.array([_weigh(group) for group in ways])
+    share = np.exp(log - log.max())
+    return np.asarray(share / share.sum())
+
+
+def _weigh(group: list[_Series]) -> float:
+    """Give each curve of a group the amplitudes that matter and their shares; return the log evidence of all."""
+    gains = np.concatenate([one.design.gain for one in group])
     contrasts = np.concatenate([one.contrast for one in group])
     low, high = _BELOW / gains.max(), _ABOVE * (np.maximum(contrasts**2, 1.0) / gains).max()
 
@@ -388,8 +411,17 @@ def _weigh(group: list[_Series]) -> None:
     none = float(likelihood(np.zeros(1))[0])
     for one in group:
         one.amplitudes, one.share = chosen, share / share.sum()
-        one.best, one.best_likelihood = (np.sqrt(amplitudes[top]), log[top]) if top else (0.0, none)
+        one.amplitude = np.sqrt(amplitudes[top]) * one.amplitude_unit if top else 0.0
+        one.best_likelihood = log[top] if top else none
         one.evidence = one.best_likelihood - none
+    return float(log[top] + np.log(np.exp(log - log[top]).mean()))
+
+
+def _mixed(share: Array, parts: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return values, variance and weights of a mixture of curves."""
+    curves, spread, weights = (np.stack(part) for part in zip(*parts, strict=True))
+    values = share @ curves
+    return values, share @ (spread + (curves - values) ** 2), np.einsum("q,qmn->mn", share, weights)
 
 
 def _spaced(low: float, high: float, n: int) -> Array:

@@ -37,7 +37,7 @@ def wavy(n, sigma, seed=0):
 
 def test_order_two_is_the_cubic_smoothing_spline_of_the_same_amplitude():
     x, y = wavy(30, 0.1)
-    curve = smooth(x, y, np.full(30, 0.1**2), x, order=2)
+    curve = smooth(x, y, np.full(30, 0.1**2), x, order=2, rougher=False)
     # Evidence on thirty points leaves a narrow range of amplitudes: their mean is that of the best within a few percent
     # of the band.
     spline = make_smoothing_spline(x, y, lam=0.1**2 / curve.amplitude**2)
@@ -49,7 +49,7 @@ def test_curve_and_band_are_those_of_the_gaussian_process_averaged_over_its_evid
     x, y = wavy(9, 0.05)
     to = np.array([0.0, 0.33, 0.71, 1.2])
     variance = 0.05**2 * np.linspace(0.5, 2, 9)
-    curve = smooth(x, y, variance, to)
+    curve = smooth(x, y, variance, to, rougher=False)
 
     # The same by brute force: a wide prior instead of the free parabola, covariance of integrated noise by quadrature.
     s = (np.arange(4000) + 0.5) / 4000 * 1.2
