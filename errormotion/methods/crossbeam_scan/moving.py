@@ -26,6 +26,10 @@ WARNING = 30.0
 """So long before a pass is due the operator is told, s."""
 
 
+STANDS = 4
+"""So many times in a row a virtual machine may be listened to in vain; one that keeps a pace is slow to come."""
+
+
 class Mover(Protocol):
     """What moves the axis.
 
@@ -69,7 +73,7 @@ class Controlled:
         self._control = controller
         self.virtual = hasattr(controller, "elapse")
         self._deadline = float("inf")
-        self._asked = float("nan")
+        self._asked, self._stood = float("nan"), 0
 
     def now(self) -> float:
         """Return the time of the machine."""
@@ -84,7 +88,7 @@ class Controlled:
         begun = self.now()
         duration = float(answer.get("duration", program.seconds()))
         self._deadline = begun + lead_in + duration * 1.1 + SLACK
-        self._asked = float("nan")
+        self._asked, self._stood = float("nan"), 0
         if listening:
             return begun
         while self._place() == before:
@@ -99,10 +103,11 @@ class Controlled:
             self._pass(left)
 
     def may_still_come(self) -> bool:
-        """Whether the program runs; a virtual machine whose time stands still while it is listened to does not."""
+        """Whether the program runs; a virtual machine whose time stands still again and again does not."""
         now = self.now()
-        stands, self._asked = self.virtual and now == self._asked, now
-        return not stands and bool(self._control.state().get("running", True)) and now < self._deadline
+        self._stood = self._stood + 1 if self.virtual and now == self._asked else 0
+        self._asked = now
+        return self._stood < STANDS and bool(self._control.state().get("running", True)) and now < self._deadline
 
     def finish(self) -> None:
         """Wait until no program runs.
