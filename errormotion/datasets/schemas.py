@@ -303,7 +303,7 @@ RAW_SCHEMAS = (
     RawSchema(
         "errormotion.raw.crossbeam_scan/1",
         "profiler pose",
-        "pocket_radius",
+        "scan",
         (
             Row(
                 "height",

@@ -157,6 +157,10 @@ def moved_raw(raw: xr.Dataset, vectors: Any, pose: RigidTransform) -> xr.Dataset
         elif kind == "covariance":
             both = np.kron(np.eye(2), Q)
             moved[name] = array.copy(data=both @ array.values @ both.T)
+        elif kind == "pose":
+            data = np.eye(4)
+            data[:3, :3], data[:3, 3] = Q @ array.values[:3, :3], Q @ array.values[:3, 3]
+            moved[name] = array.copy(data=data)
         else:
             axis = "xyz".index(kind)
             require(bool(np.allclose(Q[axis], np.eye(3)[axis])), f"the motion of the subject turns the axis {kind}")

@@ -23,7 +23,7 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = {
 }
 
 #: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.
-Vector = Literal["point", "direction", "x", "y", "z", "covariance"]
+Vector = Literal["pose", "point", "direction", "x", "y", "z", "covariance"]
 
 
 def with_query(address: str, query: str) -> str:
@@ -146,7 +146,8 @@ class MethodSubject:
         same reference state. ``truth`` is interpolated along its numeric coordinate to the places of the result.
     raw_vectors : mapping of str to str
         How the variables of the raw dataset move with the frame: ``point`` and ``direction`` (last dimension x y z),
-        ``covariance`` (last two dimensions: point, then direction), ``x`` ``y`` ``z`` (that coordinate of a point;
+        ``covariance`` (last two dimensions: point, then direction), ``pose`` (a matrix (4, 4) from a part's own frame
+        into one along the axes of this; its origin is a direction), ``x`` ``y`` ``z`` (that coordinate of a point;
         ``motion`` must then keep this axis). All others are taken as numbers that no frame changes. Empty where the
         raw data hold no vectors.
     settings : mapping

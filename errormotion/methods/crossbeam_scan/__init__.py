@@ -4,7 +4,8 @@ Measuring: ``schedule`` and ``programs`` (what happens when, as NC programs), ``
 ``pocket`` (scans for the profiler's pose), ``live`` (what it shows meanwhile).
 Identifying: ``cutting`` (scans out of the record), ``registration`` and ``registrations`` (warm scans on cold ones),
 ``strain`` and ``carriage`` (to the six errors of the carriage), ``judgement`` (artefacts that moved), ``curves``
-(smooth curves), ``identification`` (all of it); ``edges``, ``calibration`` and ``pose_errors`` (the profiler's own pose).
+(smooth curves), ``identification`` (all of it); ``edges``, ``calibration`` and ``pose_errors`` (the profiler's own
+pose).
 """
 
 from errormotion.methods.crossbeam_scan.method import CrossbeamScan

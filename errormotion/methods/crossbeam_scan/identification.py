@@ -76,7 +76,7 @@ def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
 
 def rig_of(raw: xr.Dataset) -> Rig:
     """Return how the profiler hangs on the carriage, as a raw dataset states it."""
-    matrix = np.asarray(raw["profiler_pose"].values, dtype=float)
+    matrix = np.asarray(raw["profiler_pose"].transpose("row", "column").values, dtype=float)
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(matrix[:3, :3]) < 0:
         raise MethodError("profiler_pose: expected a rotation in its first three rows and columns; found none")
 
@@ -165,7 +165,8 @@ def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
     if len(lost):
         where = sorted({f"{place[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
         notes.append(
-            f"{len(lost)} of {reason[1:].size} warm scans gave no errors (at {', '.join(where)}); `reason` says why."
+            f"{len(lost)} of {reason[1:].size} warm scans gave no errors (at {', '.join(where)}); the table of "
+            "registrations says why."
         )
     if rig.pose_covariance is None:
         notes.append("The pose of the profiler is taken as exact: the raw dataset states no pose_covariance.")

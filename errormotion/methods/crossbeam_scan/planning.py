@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import transform_covariance
-from errormotion.methods.crossbeam_scan import strain
+from errormotion.methods.crossbeam_scan import calibration, strain
 from errormotion.methods.crossbeam_scan.carriage import Rig
-from errormotion.methods.crossbeam_scan.chain import carriage_adjoint, carriage_errors
+from errormotion.methods.crossbeam_scan.chain import carriage_adjoint, carriage_errors, pose_twists
 from errormotion.methods.crossbeam_scan.pose_errors import given, given_covariance
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
@@ -32,10 +32,18 @@ Array = NDArray[np.float64]
 EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
 """Errors (m, rad) of which a wrong pose and lever take their share in a plan."""
 _CELLS = 100
+PLATE = 2e-3
+"""How far beside the pocket the plate is looked at, m: a mean of a hundred points of each line."""
+_OPEN = 1e12
 
 
 def plan(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros whose covariance is the one to expect, over (time, position).
+    """Return an error dataset of zeros with the covariance to expect, of the procedure that the settings name."""
+    return _plan_pose(info, settings) if settings.procedure == "profiler_pose" else _plan_scans(info, settings)
+
+
+def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
+    """Return what to expect of scans, over (time, position).
 
     Raises
     ------
@@ -109,3 +117,71 @@ def registration_covariance(settings: Settings) -> Array:
     out = np.zeros((9, 9))
     out[:used, :used] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     return out
+
+
+def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
+    """Return what to expect of scans of a pocket: edges on the rim, and the plate beside it.
+
+    Raises
+    ------
+    MethodError
+        The scans leave a parameter of the pose open.
+    """
+    nominal = given(settings.profiler_pose or PoseSettings())
+    centre = np.array([*calibration.parameters(nominal), settings.pocket_radius])
+    J = np.transpose(
+        [
+            (_pocket(settings, centre + step) - _pocket(settings, centre - step)) / (2 * step.max())
+            for step in np.diag([1e-6] * 3 + [1e-7] * 4)
+        ]
+    )
+    information = J.T @ J
+    information[6, 6] += 1 / max(settings.pocket_radius_uncertainty, 1e-9) ** 2
+    if settings.angle_prior is not None:
+        information[range(3), range(3)] += 1 / settings.angle_prior**2
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    if np.linalg.cond(information * np.outer(scale, scale)) > _OPEN:
+        raise MethodError(
+            "These scans of the pocket leave the pose of the profiler open: expected two lifts of the spindle at least "
+            f"(pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
+        )
+    covariance = (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
+    at_profiler = pose_twists(nominal, -nominal.translation)
+    return build_errors(
+        np.zeros((1, 6)),
+        (at_profiler.T @ covariance @ at_profiler)[None],
+        dims=("beam",),
+        coords={"beam": ["profiler"]},
+        component="beam",
+        machine="plan",
+        frame="tool",
+        functional_point=np.asarray(nominal.translation),
+        reference="planned, not measured",
+        method=info.id,
+        method_version=info.version,
+        provenance=provenance.make(settings, None, None, steps=["plan"]),
+    )
+
+
+def _pocket(settings: Settings, parameters: Array) -> Array:
+    """Return what the fit of a pocket would see with (a, b, g, dx, dy, dz, r), in units of its noise."""
+    layout, radius = settings.layout, settings.pocket_radius
+    nominal = given(settings.profiler_pose or PoseSettings())
+    pose = calibration.pose(*parameters[:6])
+    lines = np.arange(-0.9 * radius, 0.9 * radius, settings.line_pitch)
+    half = np.sqrt(radius**2 - lines**2)
+    out = []
+    for lift in settings.pocket_lifts:
+        # On the rim and on the plate as a profiler at its nominal pose would see them.
+        for x, sigma, seen in ((half, layout.edge, "rim"), (half + PLATE, settings.height_noise / 10, "plate")):
+            for side in (-1, 1):
+                there = np.stack([side * x, lines, np.zeros_like(x)], axis=-1)
+                stage = np.stack([np.zeros_like(x), np.zeros_like(x), np.full_like(x, lift)], axis=-1)
+                p = nominal.inv().apply(there - stage)
+                along = p[:, 1] / (nominal.rotation.inv().apply([0.0, 1.0, 0.0])[1])
+                stage[:, 1] += along
+                p = nominal.inv().apply(there - stage)
+                P = pose.apply(p) + stage
+                way = np.hypot(P[:, 0], P[:, 1]) - parameters[6] if seen == "rim" else P[:, 2]
+                out.append(way / sigma)
+    return np.concatenate(out)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.registration import BlockMap, Registration, prepare, register
@@ -258,6 +257,7 @@ def _keep_maps(maps: Maps | None, cold: BlockMap, warm: BlockMap, result: Regist
     rows, columns = _thin(warm)
     if (rows.size, columns.size) != maps.surface.shape:
         return
-    before = Problem.of(cold, warm).evaluate(RigidTransform.identity()).residual
+    problem = Problem.of(cold, warm)
+    before = problem.evaluate(problem.rest).residual
     maps.before[cycle] = before[rows][:, columns]
     maps.after[cycle] = result.residual[rows][:, columns]

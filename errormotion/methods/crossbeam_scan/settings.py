@@ -33,6 +33,7 @@ class Layout(PluginSettings):
     wavelength: tuple[Length, Length] = Field(default=(28e-3, 36e-3), description="of the waves along x and y")
     width: Length = Field(default=40e-3, gt=0, description="length of a profile")
     points: int = Field(default=3200, ge=16, description="points of a profile")
+    edge: Length = Field(default=2.5e-6, gt=0, description="standard deviation of a pocket's edge in one line")
     jitter_z: Length = Field(default=0.5e-6, ge=0, description="standard deviation of a line's height")
     jitter_y: Length = Field(default=2e-6, ge=0, description="standard deviation of a line's place along the feed")
 
