@@ -249,6 +249,9 @@ class _Record:
             return f"pass {cycle} was not made"
         if cycle == int(self._cycle.max()):
             return f"{what}: the record ends in pass {cycle}"
+        reach = float(np.nanmax(self._place[self._cycle == cycle], initial=-np.inf))
+        if reach < self._positions.max() + self._length * (0.5 - END):
+            return f"{what}: pass {cycle} was cut off at {reach:.3f} m"
         return f"{what} in pass {cycle}"
 
     def _load(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:

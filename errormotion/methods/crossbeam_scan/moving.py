@@ -159,7 +159,10 @@ class Operated:
                 "that: the profiler waits for the motion."
             )
         else:
-            self._bench.ask(f"{ended}start {what}, and confirm at the moment it begins to move.")
+            self._bench.ask(
+                f"{ended}start {what}, and confirm at the moment it begins to move. In a campaign that goes on "
+                "after an interruption the program may be longer than that: stop it when the time is over."
+            )
         self._running = program.name
         self._deadline = time.time() + OPERATOR_SECONDS + program.seconds()
         return time.time()

@@ -199,6 +199,11 @@ def test_half_a_record_says_what_lacks():
         scans.scan(2, 0)
 
 
+def test_a_pass_that_was_cut_off_between_others_says_where():
+    with pytest.raises(MethodError, match=r"there is no line of it: pass 1 was cut off at 0\.400 m"):
+        Scans(record([a_pass(0), a_pass(1, high=0.4), a_pass(2)])).scan(1, 1)
+
+
 def test_a_broken_pass_says_where_it_broke_and_why():
     text = interruption(1, 0.42, "keyence_ljx: no data for 1 s; is it on, is the cable in?")
     raw = record([a_pass(0), a_pass(1, high=0.42), a_pass(2)], invalid=json.dumps({"blind spot": 12, text: 1}))
