@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import platform
 import signal
+import sys
 import threading
 import time
 import traceback as tracebacks
@@ -19,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -155,7 +156,9 @@ def identify_runs(
 
     def done(outcome: Outcome) -> None:
         raw = paths[str(outcome.raw)]
-        outcomes[raw] = replace(outcome, raw=raw, errors=out / outcome.errors.name if outcome.errors else None)
+        reason = outcome.reason.replace(str(outcome.raw), str(raw_of(raw))).replace(str(out.resolve()), str(out))
+        errors = out / outcome.errors.name if outcome.errors else None
+        outcomes[raw] = replace(outcome, raw=raw, errors=errors, reason=reason)
         if outcome.reason:
             log.error("%s: %s\n%s", raw, outcome.reason, outcome.traceback)
         progress.advance(len(outcomes))
@@ -331,7 +334,7 @@ def _on_cluster(tasks: Sequence[Task], address: str, done: Callable[[Outcome], N
         _check_workers(client, address)
         futures = client.compute([delayed(_identify, pure=False)(*task) for task in tasks])
         task_of = dict(zip(futures, tasks, strict=True))
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             if future.status == "finished":
                 done(future.result())
             else:  # the task did not even come to its own error: a worker died, or has no errormotion
@@ -408,5 +411,18 @@ def _identify_or_raise(task: Task) -> bool:
         with _turn if _takes_turns() else nullcontext():
             errors = method().identify(dataset, settings)
     datasets.validate(errors)
-    datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), place)
+    with _locks_of_its_own():
+        datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), place)
     return False
+
+
+@contextmanager
+def _locks_of_its_own() -> Iterator[None]:
+    """Keep xarray on a worker from asking the cluster for a lock: for a file composed in memory there is none."""
+    if "distributed" not in sys.modules:
+        yield
+        return
+    from dask import config
+
+    with _turn, config.set(scheduler="synchronous"):
+        yield

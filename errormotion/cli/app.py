@@ -78,17 +78,26 @@ def run(
 @app.command()
 @guarded
 def identify(
-    raw: Annotated[Path, typer.Argument(help="A raw dataset: NetCDF file, Zarr folder, or run folder.")],
+    raw: Annotated[
+        list[Path], typer.Argument(help="Raw datasets: NetCDF files, Zarr folders, run folders, or a folder of those.")
+    ],
     method: Annotated[str, typer.Option(help="The id of a method plugin.")],
-    out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist.")],
+    out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist. For several runs: a folder.")],
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Of several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
+    ] = None,
     json_: Json = False,
 ) -> None:
-    """Turn a raw dataset into an error dataset."""
+    """Turn a raw dataset into an error dataset; or many of them."""
     from errormotion.cli import data
 
-    data.identify(raw, method, out, set_ or [], settings, json_)
+    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
 
 
 @app.command("import")

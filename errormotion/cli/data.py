@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
 
 from errormotion import datasets, plugins
+from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
@@ -13,16 +17,64 @@ from errormotion.cli.summary import last_values, notes_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 
+if TYPE_CHECKING:
+    from errormotion.campaign.batch import Outcome
+
 
 def identify(
-    raw: Path, method_id: str, out: Path, assignments: list[str], settings_file: Path | None, as_json: bool
+    raws: list[Path],
+    method_id: str,
+    out: Path,
+    assignments: list[str],
+    settings_file: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    as_json: bool,
 ) -> None:
-    """Identify a raw dataset with a method and write the errors."""
-    if out.exists():
+    """Identify one raw dataset into a file, or several into a folder."""
+    from errormotion.campaign import batch
+
+    several = len(raws) > 1 or scheduler or workers or batch.is_runs_folder(raws[0])
+    if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
+    if not several:
+        _identify_one(batch.raw_of(raws[0]), method_id, settings, out, as_json)
+        return
+    scheduler, note = batch.choose_scheduler(scheduler)
+    if note:
+        typer.echo(note, err=True)
+    with Bars(as_json) as bars:
+        outcomes = batch.identify_runs(
+            raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
+        )
+    _tell(outcomes, out, scheduler, as_json)
+
+
+def _tell(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
+    """Print what became of many runs; one that failed decides the exit code."""
+    failed = [outcome for outcome in outcomes if outcome.reason]
+    if as_json:
+        keys = ("raw", "errors", "reason", "seconds", "stepped_over")
+        runs = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
+        show_json({"ok": not failed, "scheduler": scheduler, "runs": runs})
+    else:
+        stepped_over = sum(outcome.stepped_over for outcome in outcomes)
+        made = len(outcomes) - len(failed) - stepped_over
+        show(f"{out}: {made} identified, {stepped_over} there already, {len(failed)} failed")
+        for outcome in failed:
+            name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
+            show(f"  failed: {name}{outcome.reason}")
+    broken = any(outcome.traceback for outcome in failed)
+    if broken:
+        typer.echo(f"The tracebacks are in {log_file()}.", err=True)
+    if failed:
+        raise typer.Exit(INTERNAL if broken else ERROR)
+
+
+def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: bool) -> None:
     method = plugins.get("methods", method_id)
-    settings = read_settings(method.Settings, settings_file, assignments)
-    with Bars(as_json) as bars, reading(raw_of(raw)), datasets.load(raw_of(raw)) as dataset:
+    with Bars(as_json) as bars, reading(raw), datasets.load(raw) as dataset:
         bars.stage("identifying")
         errors = method().identify(dataset, settings)
     datasets.validate(errors)
@@ -40,11 +92,6 @@ def identify(
         )
     for note in notes:
         show(f"  note: {note}")
-
-
-def raw_of(path: Path) -> Path:
-    """Return the raw dataset that a path means: a run folder stands for its raw store."""
-    return path / "raw.zarr" if (path / "run.json").exists() else path
 
 
 def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:

@@ -1,0 +1,280 @@
+"""Many runs give the same errors wherever they are identified; what breaks, breaks alone."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+
+from errormotion import datasets, plugins
+from errormotion.campaign import batch, runner
+from errormotion.campaign.batch import Outcome, identify_runs
+from errormotion.campaign.files import CampaignPlan
+from errormotion.errors import PluginError, RunError
+from errormotion.plugins import PluginSettings
+from errormotion.twin import Event, VirtualMachine
+
+Identify = Callable[..., list[Outcome]]
+COUNT = 4
+
+
+def settings(average: float = 2.0) -> PluginSettings:
+    made: PluginSettings = plugins.get("methods", "spindle_drift").Settings(average=average)
+    return made
+
+
+@pytest.fixture(scope="module")
+def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Four records of a minute, and one that was cut off between them."""
+    folder = tmp_path_factory.mktemp("raw")
+    machine = VirtualMachine("cframe", seed=1)
+    machine.start([Event(0.0, 15000.0, None)])
+    t = np.arange(0.25, 60.0, 0.5)
+    good = [datasets.save(machine.raw_spindle_drift(t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
+    cut = folder / "cut.nc"
+    cut.write_bytes(good[0].read_bytes()[:5000])
+    return [*good[:2], cut, *good[2:]]
+
+
+@pytest.fixture
+def identify(raws: list[Path], tmp_path: Path) -> Identify:
+    """Identify the records, one after another unless told otherwise."""
+
+    def call(chosen: list[Path] | None = None, **keywords: object) -> list[Outcome]:
+        options: dict[str, object] = {"scheduler": "sync"} | keywords
+        return identify_runs(chosen or raws, "spindle_drift", settings(), tmp_path / "out", **options)  # type: ignore[arg-type]
+
+    return call
+
+
+def local_cluster(workers: int) -> LocalCluster:
+    """A scheduler at a tcp:// address and its worker processes; ports as they are free, no dashboard."""
+    return LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},
+    )
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[LocalCluster]:
+    """A cluster of two."""
+    with local_cluster(2) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def reference(raws: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Outcome]:
+    """The records identified one after another."""
+    return identify_runs(raws, "spindle_drift", settings(), tmp_path_factory.mktemp("sync"), scheduler="sync")
+
+
+def same_as(reference: list[Outcome], outcomes: list[Outcome]) -> None:
+    """Every error dataset is the same to the last bit, and the one bad record failed, alone and in its place."""
+    assert [outcome.raw for outcome in outcomes] == [outcome.raw for outcome in reference]
+    assert [bool(outcome.reason) for outcome in outcomes] == [False, False, True, False, False]
+    assert "truncated" in outcomes[2].reason
+    assert outcomes[2].errors is None
+    for outcome, wanted in zip(outcomes, reference, strict=True):
+        if outcome.errors and wanted.errors:
+            assert datasets.load(outcome.errors).identical(datasets.load(wanted.errors))
+            assert outcome.seconds > 0
+
+
+def test_batch_finds_what_the_method_finds(reference: list[Outcome], raws: list[Path]) -> None:
+    with datasets.load(raws[0]) as raw:
+        direct = plugins.get("methods", "spindle_drift")().identify(raw, settings())
+    assert reference[0].errors is not None
+    errors = datasets.load(reference[0].errors)
+    errors.attrs.pop(batch.MARK)
+    for name in direct.variables:
+        np.testing.assert_array_equal(errors[name].values, direct[name].values)
+    assert errors.attrs["provenance"] == direct.attrs["provenance"]
+
+
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_threads_and_processes_give_the_same_bits(reference: list[Outcome], identify: Identify, scheduler: str) -> None:
+    same_as(reference, identify(scheduler=scheduler, workers=2))
+
+
+def test_cluster_gives_the_same_bits(reference: list[Outcome], identify: Identify, cluster: LocalCluster) -> None:
+    address = str(cluster.scheduler_address)
+    assert address.startswith("tcp://")
+    same_as(reference, identify(scheduler=address))
+    assert all(outcome.stepped_over for outcome in identify(scheduler=address) if not outcome.reason)
+
+
+def test_cluster_with_another_version_is_refused(
+    identify: Identify, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(batch, "__version__", "99.0")
+    with pytest.raises(RunError, match=r"expected errormotion 99\.0 on every worker; tcp://.* has 0\."):
+        identify(scheduler=str(cluster.scheduler_address))
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_worker_that_came_later_with_another_version_refuses_its_task(
+    identify: Identify, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch, "__version__", "99.0")
+    monkeypatch.setattr(batch, "_check_workers", lambda *_: None)
+    outcomes = identify(scheduler=str(cluster.scheduler_address))
+    assert all("expected errormotion in version 99.0" in outcome.reason for outcome in outcomes)
+
+
+def test_cluster_that_is_not_there_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 0.3)
+    with pytest.raises(RunError, match="none answers"):
+        identify(scheduler="tcp://127.0.0.1:9")
+
+
+def test_cluster_without_workers_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "PATIENCE", 2.0)
+    with (
+        local_cluster(0) as empty,
+        pytest.raises(RunError, match="has no workers; start some with 'dask worker"),
+    ):
+        identify(scheduler=str(empty.scheduler_address))
+
+
+def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+    class Impatient(runner.Quiet):
+        def advance(self, done: float) -> None:
+            if done == 2:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; the same command goes on"):
+        identify(progress=Impatient())
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    assert sorted(path.name for path in before) == ["run0.nc", "run1.nc"]
+    outcomes = identify()
+    assert [outcome.stepped_over for outcome in outcomes] == [True, True, False, False, False]
+    assert all(path.stat().st_mtime_ns == then for path, then in before.items())
+
+
+def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+    (first,) = identify(raws[:1])
+    assert first.errors is not None
+    before = first.errors.read_bytes()
+    (other,) = identify_runs(raws[:1], "spindle_drift", settings(4.0), tmp_path / "out", scheduler="sync")
+    assert "never overwritten" in other.reason
+    (tmp_path / "other").mkdir()
+    changed = tmp_path / "other" / "run0.nc"
+    changed.write_bytes(raws[1].read_bytes())
+    (other,) = identify([changed])
+    assert "never overwritten" in other.reason
+    assert first.errors.read_bytes() == before
+
+
+def test_plugin_that_breaks_on_one_run_harms_no_other(
+    raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method = plugins.get("methods", "spindle_drift")
+    whole = method.identify
+    noise = []
+
+    def broken(self: object, raw: object, chosen: object) -> object:
+        noise.append(raw)
+        if len(noise) == 2:
+            raise KeyError("oops")
+        return whole(self, raw, chosen)
+
+    monkeypatch.setattr(method, "identify", broken)
+    outcomes = identify([raws[0], raws[1], raws[3]])
+    assert [outcome.reason for outcome in outcomes] == ["", "KeyError: 'oops'", ""]
+    assert "Traceback" in outcomes[1].traceback
+
+
+def test_process_that_dies_is_told(raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "_identify", lambda *_: os._exit(1))
+    (outcome,) = identify(raws[:1], scheduler="processes", workers=1)
+    assert "a process died" in outcome.reason
+
+
+def test_names_tell_runs_apart(tmp_path: Path) -> None:
+    for folder in ("a/x", "b/x", "c"):
+        (tmp_path / folder).mkdir(parents=True)
+    raws = [tmp_path / "a/x/raw.nc", tmp_path / "b/x/raw.nc", tmp_path / "c/raw.nc", tmp_path / "c/other.nc"]
+    assert batch._names(raws) == ["a-x-raw", "b-x-raw", "c-raw", "other"]
+    with pytest.raises(RunError, match=r"both would become .*raw\.nc"):
+        batch._names([tmp_path / "c/raw.nc", tmp_path / "c/raw.zarr"])
+
+
+def test_run_that_is_named_twice_is_identified_once(raws: list[Path], identify: Identify) -> None:
+    assert len(identify([raws[0], raws[0], raws[0].parent / ".." / raws[0].parent.name / raws[0].name])) == 1
+
+
+def test_folder_of_runs_means_those_of_the_method(plan: Callable[..., CampaignPlan], tmp_path: Path) -> None:
+    first, second = runner.run(plan('name = "a"\nsettings = {count = 500}', 'name = "b"\nsettings = {count = 500}'))
+    ramp = plugins.get("methods", "ramp").Settings()
+    runs = first.path.parent
+    second.save(acquired=False, status="interrupted")
+    (runs / "torn").mkdir()
+    (runs / "torn" / "run.json").write_text("{")
+    outcomes = identify_runs([runs], "ramp", ramp, tmp_path / "out", scheduler="sync")
+    assert [outcome.raw for outcome in outcomes] == [first.path, second.path, runs / "torn"]
+    assert outcomes[0].errors == tmp_path / "out" / f"{first.path.name}.nc"
+    assert outcomes[0].errors.exists()
+    assert "not complete (interrupted): 'errormotion run --resume" in outcomes[1].reason.replace(";", ":")
+    assert "is no JSON" in outcomes[2].reason
+    again = identify_runs([first.path, first.raw], "ramp", ramp, tmp_path / "out", scheduler="sync")
+    assert [outcome.stepped_over for outcome in again] == [True]
+    (runs / "torn" / "run.json").unlink()
+    with pytest.raises(RunError, match="expected runs of the method 'spindle_drift'; found ramp"):
+        identify_runs([runs], "spindle_drift", settings(), tmp_path / "none", scheduler="sync")
+
+
+def test_mistakes_are_told_before_anything_is_done(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="found 'thread'"):
+        identify(scheduler="thread")
+    with pytest.raises(RunError, match="at least one worker"):
+        identify(scheduler="threads", workers=0)
+    with pytest.raises(RunError, match="cluster, which has its own"):
+        identify(scheduler="tcp://127.0.0.1:9", workers=2)
+    with pytest.raises(RunError, match="at least one raw dataset"):
+        identify_runs([], "spindle_drift", settings(), tmp_path, scheduler="sync")
+    with pytest.raises(PluginError, match="Did you mean 'spindle_drift'"):
+        identify_runs(raws, "spindel_drift", settings(), tmp_path, scheduler="sync")
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(RunError, match="expected a folder"):
+        identify()
+
+
+@pytest.mark.parametrize(("package", "scheduler"), [("dask", "threads"), ("distributed", "tcp://127.0.0.1:9")])
+def test_without_dask_it_says_what_to_install(
+    identify: Identify, monkeypatch: pytest.MonkeyPatch, package: str, scheduler: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package if package == "distributed" else "dask.base", None)
+    with pytest.raises(RunError, match=rf"'{package}', which is not installed: pip install 'errormotion\[cluster\]'"):
+        identify(scheduler=scheduler)
+
+
+def test_one_after_another_needs_no_dask() -> None:
+    script = (
+        "import sys, errormotion.campaign.batch as b; print([n for n in ('dask', 'distributed') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_threads_take_turns_where_numba_is_not_safe(raws: list[Path], tmp_path: Path) -> None:
+    """With its 'workqueue' layer numba ends the process when two threads call a parallel kernel at once."""
+    command = ["identify", *map(str, raws), "--method", "spindle_drift", "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-m", "errormotion", *command, "--scheduler", "threads", "--workers", "4"],
+        env=os.environ | {"NUMBA_THREADING_LAYER": "workqueue", "XDG_STATE_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "one run at a time" in done.stderr
+    assert "4 identified, 0 there already, 1 failed" in done.stdout
+    assert f"failed: {raws[2]}: is truncated" in done.stdout
+    assert done.returncode == 1
