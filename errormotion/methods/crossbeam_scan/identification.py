@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 _METRES = {"units": "m"}
+_SPOILT = 10.0
+"""EYY that is so many times less certain than EXY and EZY is worth a note."""
 _STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]
 
 
@@ -120,6 +122,8 @@ def _dataset(
         values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan
         reason[gone] = MOVED
     notes = [*_notes(reason, place, rig), *trust.notes, *mended]
+    if settings.strain == "free":
+        notes += _pitch_note(own)
     for note in notes:
         log.warning(note)
     curve = curves(axis, found, rig, place, time[1:], warm, trust.wrong)
@@ -173,6 +177,18 @@ def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
     if not rig.lever_uncertainty.any():
         notes.append("The lever is taken as exact: the raw dataset states no lever_uncertainty.")
     return notes
+
+
+def _pitch_note(own: Array) -> list[str]:
+    """Return what to do where the pitch, told by the relief alone, spoils EYY over the lever."""
+    u = np.sqrt(np.nanmedian(np.diagonal(own[1:], axis1=-2, axis2=-1), axis=(0, 1)))
+    if not u[1] > _SPOILT * u[[0, 2]].max():
+        return []
+    return [
+        f"EYY is known to {u[1] * 1e6:.1f} um only (standard uncertainty): the pitch EAY ({u[3] * 1e6:.1f} urad) is told "
+        "by the artefacts' relief alone and acts over the lever. Both together are known far better, so move the "
+        "errors to the tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' says more."
+    ]
 
 
 def _extras(
