@@ -94,6 +94,6 @@ def _chained(twist: Array, covariance: Array, rig: Rig) -> tuple[Array, Array]:
 
 def _safe(C: Array) -> Array:
     """Return matrices that have a Cholesky factor: tiny where there is nothing."""
-    known = np.isfinite(C).all(axis=(-2, -1))
+    known = np.asarray(np.isfinite(C).all(axis=(-2, -1)))
     unit = np.full(6, 1e-12)
     return np.where(known[..., None, None], C, 0.0) + np.diag(unit**2)

@@ -117,7 +117,7 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     """
     pitch = float(x[1] - x[0])
     low, high = np.nanpercentile(height, [2, 98]) if np.isfinite(height).any() else (np.nan, np.nan)
-    deep = height < (low + high) / 2
+    deep = np.asarray(height < (low + high) / 2)
     inside = _spans(deep)
     if high - low < 0.2e-3 or inside.sum() < 10:
         raise MethodError(

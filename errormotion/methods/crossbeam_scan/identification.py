@@ -109,7 +109,7 @@ def _dataset(
     rows = [cold[0], *warm]
     time = cycle_times(found.time, rows)
     place = np.asarray(raw["position"].values, dtype=float)
-    reference = np.isfinite(axis.values[cold][:, :, 0]).any(axis=0)
+    reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
     values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
     values[0] = np.where(reference[:, None], 0.0, np.nan)  # whichever cold scan the others are laid on
     own[0] = np.where(reference[:, None, None], 0.0, np.nan)
@@ -185,9 +185,9 @@ def _pitch_note(own: Array) -> list[str]:
     if not u[1] > _SPOILT * u[[0, 2]].max():
         return []
     return [
-        f"EYY is known to {u[1] * 1e6:.1f} um only (standard uncertainty): the pitch EAY ({u[3] * 1e6:.1f} urad) is told "
-        "by the artefacts' relief alone and acts over the lever. Both together are known far better, so move the "
-        "errors to the tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' says more."
+        f"EYY is known to {u[1] * 1e6:.1f} um only (standard uncertainty): the pitch EAY ({u[3] * 1e6:.1f} urad) is "
+        "told by the artefacts' relief alone and acts over the lever. Both together are known far better, so move "
+        "the errors to the tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' says more."
     ]
 
 
