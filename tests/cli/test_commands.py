@@ -103,6 +103,40 @@ def test_identify_writes_errors_once(run: Run, answer: Answer, raw: Path, tmp_pa
     assert "never overwritten" in again.stderr
 
 
+def test_identify_takes_many_runs_and_tells_those_that_fail(
+    run: Run, answer: Answer, raw: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "cut.nc").write_bytes(raw.read_bytes()[:5000])
+    command = ("identify", "raw.nc", "cut.nc", "--method", "spindle_drift", "--out", "results", "--scheduler", "sync")
+    text = run(*command, code=1).stdout
+    assert text.startswith("results: 1 identified, 0 there already, 1 failed\n  failed: cut.nc: is truncated")
+    found = answer(*command, code=1)
+    assert found["ok"] is False
+    assert found["scheduler"] == "sync"
+    assert [entry["stepped_over"] for entry in found["runs"]] == [True, False]
+    assert [entry["errors"] for entry in found["runs"]] == ["results/raw.nc", None]
+    assert [entry["raw"] for entry in found["runs"]] == ["raw.nc", "cut.nc"]
+    assert "truncated" in found["runs"][1]["reason"]
+    alone = answer("identify", "raw.nc", "--method", "spindle_drift", "--out", "results", "--scheduler", "sync")
+    assert alone["ok"] is True
+    wrong = run("identify", "raw.nc", "cut.nc", "--method", "spindle_drift", "--out", "raw.nc", code=1)
+    assert "raw.nc: expected a folder" in wrong.stderr
+
+
+def test_mistake_of_ours_in_one_of_many_runs_names_the_log(
+    run: Run, raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise KeyError("oops")
+
+    monkeypatch.setattr(plugins.get("methods", "spindle_drift"), "identify", broken)
+    result = run("identify", raw, "--method", "spindle_drift", "--out", "all", "--scheduler", "sync", code=70)
+    log = tmp_path / "state" / "errormotion" / "errormotion.log"
+    assert str(log) in result.stderr
+    assert "KeyError: 'oops'" in result.stdout
+    assert "Traceback" in log.read_text()
+
+
 def test_settings_come_from_a_file_and_single_ones_over_it(run: Run, raw: Path, tmp_path: Path) -> None:
     (tmp_path / "settings.toml").write_text('average = "4 s"\nnoise = "stated"\n')
     options = ("--settings", "settings.toml", "--set", "average='2 s'", "--set", "layout.rate=1.5 kHz")
