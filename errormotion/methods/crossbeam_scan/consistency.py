@@ -243,8 +243,7 @@ class _Scans:
         N = np.nan_to_num(np.concatenate([self.cold[None], self.noise]))
         V = np.einsum("idtn,jetn,tnde->idje", share, share, N)
         V = V.reshape(excess.size, excess.size) + np.diag(np.maximum(doubt[told], 0.0).ravel())
-        told_by = np.isfinite(gain[told][:, others]).all(axis=-1).sum(axis=-1) - _order(left)
-        return _greatest(k, cycles[told], excess, V, doubt[told], told_by)
+        return _greatest(k, cycles[told], excess, V)
 
     def relief(self, step: Moved, left: NDArray[np.intp]) -> float:
         """Return by how much more likely all gains are, each freedom smooth, without one of one artefact (log).
@@ -290,18 +289,11 @@ def _order(left: NDArray[np.intp]) -> int:
     return min(ORDER, left.size - 2)
 
 
-def _greatest(
-    k: int, cycles: NDArray[np.intp], excess: Array, V: Array, doubt: Array, told_by: NDArray[np.intp]
-) -> Moved:
-    """Return the most significant step, by generalised least squares for a step before each of the cycles.
-
-    How smooth a gain is, is known from few artefacts. Where this ``doubt``, and not the noise, makes up the variance V
-    of the excess, the score is judged by F with that few degrees of freedom (after Welch and Satterthwaite).
-    """
+def _greatest(k: int, cycles: NDArray[np.intp], excess: Array, V: Array) -> Moved:
+    """Return the most significant step, by generalised least squares for a step before each of the cycles."""
     unit = np.sqrt(np.diag(V))
     inverse = np.linalg.inv(V / np.outer(unit, unit)) / np.outer(unit, unit)
     pull = (inverse @ excess.ravel()).reshape(-1, 6)
-    doubtful = (doubt / (unit**2).reshape(-1, 6)) ** 2
     found = []
     for i, since in enumerate(cycles):
         block = slice(6 * i, 6 * i + 6)
@@ -310,10 +302,8 @@ def _greatest(
         covariance = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
         step = covariance @ pull[i]
         score = float(step @ pull[i])
-        weight = np.abs(step * pull[i])
-        freedom = told_by[i] * weight.sum() / max(float(weight @ doubtful[i]), 1e-9 * weight.sum())
-        found.append(Moved(k, int(since), step, covariance, score, float(stats.f.sf(score / 6, 6, freedom))))
-    return min(found, key=lambda step: step.probability)
+        found.append(Moved(k, int(since), step, covariance, score, float(stats.chi2.sf(score, 6))))
+    return max(found, key=lambda step: step.score)
 
 
 def _checked(
