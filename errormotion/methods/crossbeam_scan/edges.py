@@ -117,7 +117,7 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     """
     pitch = float(x[1] - x[0])
     low, high = np.nanpercentile(height, [2, 98]) if np.isfinite(height).any() else (np.nan, np.nan)
-    deep = np.asarray(height < (low + high) / 2)
+    deep = height < (low + high) / 2
     inside = _spans(deep)
     if high - low < 0.2e-3 or inside.sum() < 10:
         raise MethodError(
@@ -127,7 +127,7 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     trim = max(round(TRIM / pitch), 3)
     first, last = np.argmax(deep, axis=1), x.size - 1 - np.argmax(deep[:, ::-1], axis=1)
     index = np.arange(x.size)
-    beside = ~deep.any(axis=1)[:, None] | (index < first[:, None] - trim) | (index > last[:, None] + trim)
+    beside = ~np.any(deep, axis=1, keepdims=True) | (index < first[:, None] - trim) | (index > last[:, None] + trim)
     seen = np.isfinite(height)
     begin, end = np.argmax(seen, axis=1), x.size - 1 - np.argmax(seen[:, ::-1], axis=1)
     within = (index >= begin[:, None] + trim) & (index <= end[:, None] - trim)
