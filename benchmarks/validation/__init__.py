@@ -1,0 +1,1 @@
+"""The parts of ``make validate``, one module for each method."""

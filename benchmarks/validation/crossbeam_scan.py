@@ -1,0 +1,271 @@
+"""Crossbeam scan: whole virtual campaigns, from the profiler's pose to the curves, each of a machine of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.datasets import DOF
+from errormotion.kinematics.poses import displaced
+from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan.calibration import PARAMETERS, parameters
+from errormotion.methods.crossbeam_scan.registration import prepare, register
+from errormotion.methods.crossbeam_scan.registrations import bound
+from errormotion.methods.crossbeam_scan.settings import Layout, PoseSettings, Settings
+from errormotion.methods.crossbeam_scan.strain import FEED as FEED_NAMES
+from errormotion.twin import VirtualMachine
+from errormotion.twin.artefacts import swept
+from errormotion.twin.crossbeam import LEVER, LIFT
+from errormotion.twin.profiler import Disturbances, Profiler
+
+TITLE = "Crossbeam scan"
+SEEDS = 150
+Z95 = 1.959964
+
+TIMES = np.array([0.0, 1800.0, 4200.0, 9000.0])
+PLACES = np.array([-0.6, -0.2, 0.2, 0.6])
+POINTS, PITCH, LINES, FEED = 800, 25e-6, 400, 70e-6
+FINE_POINTS, FINE_PITCH = 1600, 12.5e-6
+LEVER_SIGMA = 1e-3
+TOOL = np.add(LEVER, [0.0, 0.0, LIFT])
+"""Where a profiler hangs by its drawing, from the carriage, m."""
+STRAINS = ("free", "guided")
+REGISTRATIONS = (
+    ("white noise, rigid", Disturbances.white(), False),
+    ("white noise, drift free", Disturbances.white(), True),
+    ("all disturbances, drift free", Disturbances(), True),
+)
+"""Name, what is wrong with the profiler, and whether the drift along the feed is a parameter."""
+METHOD = CrossbeamScan()
+
+Seed = dict[str, np.ndarray]
+
+
+def section(seeds: int) -> Iterator[str]:
+    """Yield the lines of the section."""
+    campaigns = gathered(campaign, seeds)
+    yield from (
+        f"{seeds} virtual gantries. Each has its profiler's pose found from two simulated scans of a pocket, a lever "
+        f"drawn {LEVER_SIGMA * 1e3:g} mm (k = 1) off the stated one, and {PLACES.size} artefacts scanned cold and "
+        f"{TIMES.size - 1} times warm, {POINTS} points {PITCH * 1e6:g} um apart by {LINES} lines {FEED * 1e6:g} um "
+        "apart, with all that is wrong with the virtual profiler: noise, jitter of the lines along both directions, "
+        "speckle, stray light, outliers and gaps. The carriage turns along each scan as its axis does. "
+        "The results of one gantry share pose, lever and cold scans, so every interval behind a coverage (+-, 95 %) "
+        "is that of the mean over gantries.",
+        "",
+    )
+    for strain in STRAINS:
+        yield from (f"### Errors of the axis, strain = {strain!r}", "", *errors_table(campaigns, strain), "")
+    yield from ("### Smooth curves", "", *curves_table(campaigns), "")
+    yield from ("### Pose of the profiler", "", *pose_table(campaigns), "")
+    yield from ("### Registration", "", *registration_table(gathered(registration, seeds)))
+
+
+def gathered(work: Callable[[int], Seed], seeds: int) -> Seed:
+    """Return the results of all seeds, stacked, computed in as many processes as there are processors."""
+    os.environ |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+        found = list(pool.map(work, range(seeds)))
+    return {name: np.array([one[name] for one in found]) for name in found[0]}
+
+
+# ------------------------------------------------------------------ one seed
+
+
+def campaign(seed: int) -> Seed:
+    """Return how far a campaign is off and what it says of that: pose, errors, errors at the tool, curves."""
+    machine = VirtualMachine("gantry", seed=seed)
+    beam = machine.crossbeam
+    posed = METHOD.identify(machine.raw_pocket_scan(seed=10_000 + seed), Settings(procedure="profiler_pose"))
+    pose, covariance = posed["profiler_pose"].values, posed["pose_covariance"].values
+    true_pose, found_pose = (parameters(RigidTransform.from_matrix(matrix)) for matrix in (beam.pose, pose))
+    out = {"pose": found_pose - true_pose, "pose_covariance": covariance}
+
+    raw = machine.raw_crossbeam_scan(
+        TIMES, PLACES, seed=seed, profiler=Profiler(POINTS, PITCH), profiles=LINES, feed=FEED, pose=pose
+    )
+    off = np.random.default_rng([seed, 2]).normal(0, LEVER_SIGMA, 3)
+    metres = {"units": "m"}
+    raw["pose_covariance"] = (("p", "p_"), covariance)
+    raw["lever"] = ("direction", beam.lever + off, metres)
+    raw["lever_uncertainty"] = ("direction", np.full(3, LEVER_SIGMA), metres)
+    truth = machine.truth_crossbeam(TIMES, PLACES)
+    for strain in STRAINS:
+        errors = METHOD.identify(raw, Settings(strain=strain))
+        for name, ours, true in (("", errors, truth), ("_tool", errors.em.at(TOOL), truth.em.at(TOOL))):
+            out[f"{strain}{name}"] = (ours.em.twist().values - true.em.twist().values)[1:]
+            out[f"{strain}{name}_covariance"] = ours["covariance"].values[1:]
+        place, moment = errors["place"].values, errors["moment"].values[1:]
+        along = errors["smooth_position"].values[1:] - beam.twist(TIMES[1:, None], place)
+        over = errors["smooth_time"].values[1:] - beam.twist(moment[:, None], PLACES)
+        out |= {f"{strain}_position": along, f"{strain}_position_u": errors["smooth_position_u"].values[1:]}
+        out |= {f"{strain}_time": over, f"{strain}_time_u": errors["smooth_time_u"].values[1:]}
+    return out
+
+
+def registration(seed: int) -> Seed:
+    """Return errors of three registrations at the real pitch of the points, and what they and the bound say of them.
+
+    White noise and the six freedoms, white noise and the drift along the feed besides, all disturbances and both.
+    """
+    rng = np.random.default_rng([seed, 3])
+    artefact, y = swept(), (np.arange(LINES) - (LINES - 1) / 2) * FEED
+    stands = displaced(rng.normal(0, [0.2e-3] * 3 + [3e-3] * 3)).as_matrix()
+    moved = np.concatenate([rng.normal(0, 20e-6, 6), np.zeros(3)])
+    out: Seed = {}
+    for name, wrong, drift in REGISTRATIONS:
+        profiler = Profiler(FINE_POINTS, FINE_PITCH, disturbances=wrong)
+        maps = []
+        for cycle, motion in enumerate((np.zeros(6), moved[:6])):
+            places = y + rng.uniform(-0.5, 0.5) * FEED
+            steps = np.tile(np.eye(4), (LINES, 1, 1))
+            steps[:, 1, 3] = places
+            poses = stands @ displaced(motion).as_matrix() @ steps
+            maps.append(prepare(profiler.scan(artefact, poses, key=(seed, cycle)), profiler.x, places))
+        found = register(*maps, point=np.zeros(3), extra=dict.fromkeys(FEED_NAMES, np.inf) if drift else None)
+        error = np.zeros(9)
+        error[: 6 + found.extra.size] = np.concatenate([found.twist, found.extra]) - moved[: 6 + found.extra.size]
+        covariance = np.zeros((9, 9))
+        covariance[: len(found.joint_covariance), : len(found.joint_covariance)] = found.joint_covariance
+        out |= {name: error, f"{name}_covariance": covariance}
+        out[f"{name}_bound"] = bound(maps[0], wrong.noise, with_drift=drift)
+    return out
+
+
+# ------------------------------------------------------------------ tables
+
+
+def errors_table(found: Seed, strain: str) -> Iterable[str]:
+    """Return coverage and spread of the six errors, at the carriage and at the tool."""
+    scores = {
+        name: found[f"{strain}{name}"] / np.sqrt(np.diagonal(found[f"{strain}{name}_covariance"], axis1=-2, axis2=-1))
+        for name in ("", "_tool")
+    }
+    yield (
+        "| error | coverage of 95 % intervals | spread/stated | bias/stated | stated (k = 1) | "
+        "at the tool: coverage | stated |"
+    )
+    yield "|---|---|---|---|---|---|---|"
+    for k, name in enumerate(DOF):
+        here, tool = scores[""][..., k], scores["_tool"][..., k]
+        u, u_tool = (np.sqrt(found[f"{strain}{at}_covariance"][..., k, k]) for at in ("", "_tool"))
+        yield (
+            f"| {name}Y | {coverage(here)} | {rms(here):.3f} | {np.nanmean(here):+.3f} | {quantity(u, k)} | "
+            f"{coverage(tool)} | {quantity(u_tool, k)} |"
+        )
+    lost = np.isnan(scores[""][..., 0]).mean()
+    yield ""
+    yield (
+        f"All six together, NEES/6: {mean_of(nees(found[strain], found[f'{strain}_covariance']))} (1 is right). "
+        f"Scans without a result, or left out because the artefact was held to have moved: {lost:.2%}."
+    )
+
+
+def curves_table(found: Seed) -> Iterable[str]:
+    """Return the coverage of the smooth curves, point by point."""
+    yield "Point by point along the curves; a curve over position knows of the error only where the artefacts stand."
+    yield ""
+    yield "| error | over position, free | guided | over time, free | guided |"
+    yield "|---|---|---|---|---|"
+    for k, name in enumerate(DOF):
+        cells = [
+            coverage(found[f"{strain}_{over}"][..., k] / found[f"{strain}_{over}_u"][..., k])
+            for over in ("position", "time")
+            for strain in STRAINS
+        ]
+        yield f"| {name}Y | " + " | ".join(cells) + " |"
+
+
+def pose_table(found: Seed) -> Iterable[str]:
+    """Return coverage and efficiency of the profiler's pose."""
+    expected = METHOD.plan(Settings(procedure="profiler_pose", profiler_pose=PoseSettings(dz=LIFT)))
+    bounds = np.sqrt(np.diagonal(expected["covariance"].values[0]))[[3, 4, 5, 0, 1, 2]]
+    error, u = found["pose"], np.sqrt(np.diagonal(found["pose_covariance"], axis1=-2, axis2=-1))
+    yield (
+        "Two scans of a circular pocket, 16 mm apart in height. The bound is that of a plan: an edge that scatters by "
+        f"{Layout().edge * 1e6:g} um in each line."
+    )
+    yield ""
+    yield "| parameter | coverage of 95 % intervals | spread/stated | bias/stated | stated (k = 1) | spread/bound |"
+    yield "|---|---|---|---|---|---|"
+    for k, name in enumerate(PARAMETERS):
+        score = error[:, k] / u[:, k]
+        yield (
+            f"| {name} | {coverage(score)} | {rms(score):.3f} | {score.mean():+.3f} | "
+            f"{quantity(u[:, k], (k + 3) % 6)} | {rms(error[:, k]) / bounds[k]:.2f} |"
+        )
+    yield ""
+    yield f"All six together, NEES/6: {mean_of(nees(error, found['pose_covariance']))}."
+
+
+def registration_table(found: Seed) -> Iterable[str]:
+    """Return efficiency and coverage of the registration by itself."""
+    yield (
+        f"Two scans of {FINE_POINTS} points {FINE_PITCH * 1e6:g} um apart by {LINES} lines, moved by 20 um and 20 urad "
+        "(k = 1). The bound is that of white noise in every point of both scans; line jitter has a higher one."
+    )
+    yield ""
+    header = [f"{name}: spread/bound | coverage | stated" for name, _, _ in REGISTRATIONS]
+    yield "| freedom | " + " | ".join(header) + " |"
+    yield "|---" + "|---" * 3 * len(REGISTRATIONS) + "|"
+    for k, freedom in enumerate((*DOF, *FEED_NAMES)):
+        cells = []
+        for name, _, drift in REGISTRATIONS:
+            if k >= 6 and not drift:
+                cells += ["", "", ""]
+                continue
+            error, u = found[name][:, k], np.sqrt(found[f"{name}_covariance"][:, k, k])
+            limit = np.sqrt(found[f"{name}_bound"][:, k, k])
+            shown = f"{u.mean() * 1e6:.4f} /1e6" if k >= 6 else quantity(u, k)
+            cells += [f"{rms(error / limit):.2f}", coverage(error / u), shown]
+        yield f"| {freedom} | " + " | ".join(cells) + " |"
+    together = []
+    for name, _, drift in REGISTRATIONS:
+        n = 9 if drift else 6
+        ratio = nees(found[name][:, :n], found[f"{name}_covariance"][:, :n, :n])
+        together.append(f"{name} {mean_of(ratio)}")
+    yield ""
+    yield "All freedoms together, NEES/n: " + ", ".join(together) + "."
+
+
+# ------------------------------------------------------------------ figures
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def quantity(u: np.ndarray, freedom: int) -> str:
+    """Return the middle of standard uncertainties, of a length for the first three freedoms."""
+    size, unit = np.nanmedian(u), "m" if freedom < 3 else "rad"
+    return f"{size * 1e6:.2f} u{unit}" if size > 0.5e-6 else f"{size * 1e9:.1f} n{unit}"
+
+
+def coverage(score: np.ndarray) -> str:
+    """Return the share of errors within 1.96 standard uncertainties, seeds first, and its 95 % interval over seeds."""
+    inside = np.where(np.isfinite(score), np.abs(score) <= Z95, np.nan).reshape(len(score), -1)
+    share, of_seed = np.nanmean(inside), np.nanmean(inside, axis=1)
+    return f"{share:.1%} +- {Z95 * np.nanstd(of_seed, ddof=1) / np.sqrt(len(of_seed)):.1%}"
+
+
+def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the squared error in units of the covariance, per freedom, by seed (seed, rest)."""
+    scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    e = np.where(np.isfinite(error), error / scale, 0.0)
+    C = np.where(
+        np.isfinite(covariance), covariance / (scale[..., :, None] * scale[..., None, :]), np.eye(scale.shape[-1])
+    )
+    ratio = np.einsum("...i,...i->...", e, np.linalg.solve(C, e[..., None])[..., 0]) / scale.shape[-1]
+    return np.where(np.isfinite(error).all(axis=-1), ratio, np.nan).reshape(len(error), -1)
+
+
+def mean_of(values: np.ndarray) -> str:
+    """Return the mean of (seed, rest) with its 95 % interval over seeds."""
+    of_seed = np.nanmean(values, axis=1)
+    return f"{np.nanmean(values):.2f} +- {Z95 * np.nanstd(of_seed, ddof=1) / np.sqrt(len(of_seed)):.2f}"
