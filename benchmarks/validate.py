@@ -1,145 +1,59 @@
 """Monte Carlo validation: does every estimate hold the truth as often as it says, and is it as good as it can be?
 
-``make validate`` runs it and writes ``docs/validation.md``. Truth comes from the virtual machine; the bound is the
+``make validate`` runs it and writes ``docs/validation.md``; ``make validate ARGS="crossbeam_scan --seeds 50"`` runs one
+part and leaves the sections of the others as they stand. Truth comes from the virtual machine; the bound is the
 Cramer-Rao bound of each estimator's own model. Coverage over S seeds is itself a draw: its standard deviation is
-sqrt(0.05 * 0.95 / S), stated beside it.
+sqrt(0.05 * 0.95 / S) where nothing is shared, stated beside it.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from pathlib import Path
 
-import numpy as np
+from validation import crossbeam_scan, spindle_drift
 
 from errormotion import __version__
-from errormotion.methods.spindle_drift import SpindleDrift
-from errormotion.methods.spindle_drift.beams import circles_and_line, fisher_bound, likelihood_fit, sphere_reading
-from errormotion.twin import Event, VirtualMachine
 
 PAGE = Path(__file__).parent.parent / "docs" / "validation.md"
-FREEDOMS = ("EX", "EY", "EZ", "EA", "EB")
-TIMES = np.array([0.0, 300.0, 900.0, 1800.0, 3600.0, 5400.0, 6000.0])
-Z95 = 1.959964
+PARTS = {"spindle_drift": spindle_drift, "crossbeam_scan": crossbeam_scan}
+INTRODUCTION = """\
+# Validation
+
+Every figure on this page comes from a run of `make validate`; none is typed in. The truth is that of the
+[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' models.
+A ratio of 1 means that no unbiased estimator can do better.
+"""
 
 
-def drift(seeds: int) -> list[str]:
-    """Coverage of the drift's intervals, each seed with a beam detection of its own."""
-    method = SpindleDrift()
-    miss, sigma = [], []
-    for seed in range(seeds):
-        machine = VirtualMachine("cframe", seed=seed)
-        machine.start([Event(0.0, 15000.0)])
-        beams = method.identify(machine.raw_beam_detection(seed=10_000 + seed))
-        known = tuple(beams[name].values for name in ("beam_origin", "beam_direction", "beam_covariance"))
-        raw = machine.raw_spindle_drift(TIMES, seed=seed, beams=known, expansion=True)
-        raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
-        errors = method.identify(raw)
-        twist = np.asarray(machine.truth_spindle(TIMES, errors.attrs["functional_point"]).em.twist())
-        truth = (twist - twist[0])[:, :5]
-        miss.append(np.asarray(errors.em.twist())[1:, :5] - truth[1:])
-        sigma.append(np.sqrt(np.diagonal(errors["covariance"].values[1:], axis1=1, axis2=2))[:, :5])
-    score = np.array(miss) / np.array(sigma)
-    chance = np.sqrt(0.05 * 0.95 / seeds)
-    rows = [
-        "| freedom | coverage of 95 % intervals | at single instants | spread/stated | bias/stated | stated (k = 1) |",
-        "|---|---|---|---|---|---|",
-    ]
-    for k, name in enumerate(FREEDOMS):
-        inside = np.abs(score[:, :, k]) <= Z95
-        unit, scale = ("nm", 1e9) if k < 3 else ("nrad", 1e9)
-        rows.append(
-            f"| {name} | {inside.mean():.1%} | {inside.mean(axis=0).min():.1%} to {inside.mean(axis=0).max():.1%} | "
-            f"{np.sqrt(np.mean(score[:, :, k] ** 2)):.3f} | {score[:, :, k].mean():+.3f} | "
-            f"{np.mean(sigma, axis=(0, 1))[k] * scale:.1f} {unit} |"
-        )
-    return [
-        f"{seeds} virtual machines, {TIMES.size - 1} instants of a warm-up each; every machine with its own beam "
-        "detection, and with a frame whose true expansion differs from its drawing. The instants of one machine share "
-        f"their reference state, beams and frame, so that the coverage has a standard deviation of up to {chance:.1%}. "
-        "The sensors have been on for four hours: 0.5 nm of their warm-up is left, which no uncertainty holds.",
-        "",
-        *rows,
-    ]
-
-
-def beams(seeds: int) -> list[str]:
-    """Spread of the beam detection against the Cramer-Rao bound, the paper's construction beside it."""
-    rng = np.random.default_rng(0)
-    radius, noise = 5e-3, 0.5e-6
-    u0, p0 = np.array([-1.0, 0, 0]), np.array([6e-3, 0, 0.01])
-    scans = np.array([[0.0, 1, 0], [0, 0, 1]] * 3)
-    depths = np.repeat([0.2e-3, 1e-3, 1.8e-3], 2)
-    centre = (p0 + (depths + radius)[:, None] * u0)[:, None] + np.linspace(-1e-3, 1e-3, 101)[:, None] * scans[:, None]
-    ours, stated, paper, bounds = [], [], [], []
-    for _ in range(seeds):
-        u = u0 + np.array([0.0, *rng.normal(0, 5e-3, 2)])
-        u /= np.linalg.norm(u)
-        p = p0 + rng.normal(0, 1e-4, 3)
-        readings = sphere_reading(p, u, centre, radius)[0] + rng.normal(0, noise, centre.shape[:2])
-        found = likelihood_fit(readings, centre, radius, p0, u0)
-        bound = np.sqrt(np.diag(fisher_bound(p, u, centre, radius, noise)))
-        miss = np.concatenate([found.origin - p, found.direction - u])
-        ours.append(miss / bound)
-        stated.append(miss / np.sqrt(np.diag(found.covariance)))
-        geometric = circles_and_line(readings, centre, scans, radius, u0)
-        paper.append(np.concatenate([geometric[0] - p, geometric[1] - u]) / bound)
-        bounds.append(bound)
-    names = (
-        *("origin along the beam", "origin across, first", "origin across, second"),
-        *("direction along", "direction across, first", "direction across, second"),
-    )
-    units = [("um", 1e6)] * 3 + [("urad", 1e6)] * 3
-    rows = [
-        "| parameter | bound (k = 1) | likelihood fit/bound | circles and line/bound | coverage of 95 % intervals |",
-        "|---|---|---|---|---|",
-    ]
-    ratio, construction = (np.sqrt(np.mean(np.square(part), axis=0)) for part in (ours, paper))
-    for k in (0, 1, 2, 4, 5):
-        unit, scale = units[k]
-        rows.append(
-            f"| {names[k]} | {np.mean(bounds, axis=0)[k] * scale:.3f} {unit} | "
-            f"{ratio[k]:.3f} | {construction[k]:.3f} | "
-            f"{np.mean(np.abs(stated) <= Z95, axis=0)[k]:.1%} |"
-        )
-    return [
-        f"{seeds} seeds; six scans of 101 steps over a sphere of 5 mm radius, {noise * 1e6:g} um noise a step, beams "
-        f"0.1 mm and 5 mrad off. The ratio of spreads has a standard deviation of {1 / np.sqrt(2 * seeds):.1%}.",
-        "",
-        *rows,
-    ]
+def sections(page: Path) -> dict[str, str]:
+    """Return the sections of a page as it stands, by title."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    found = re.split(r"^## (.+)\n", text, flags=re.MULTILINE)[1:]
+    return {title: body.strip("\n") for title, body in zip(found[::2], found[1::2], strict=True)}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=2000)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}; all where none is named")
+    parser.add_argument("--seeds", type=int, help="virtual machines; each part has its own default")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
-    start = time.perf_counter()
-    lines = [
-        "# Validation",
-        "",
-        "Every figure on this page comes from one run of `make validate`; none is typed in. The truth is that of the",
-        "[virtual machine](explanation/virtual-machine.md); bounds are Cramer-Rao bounds of the estimators' models.",
-        "A ratio of 1 means that no unbiased estimator can do better.",
-        "",
-        "## Spindle drift",
-        "",
-        "### Drift",
-        "",
-        *drift(options.seeds),
-        "",
-        "### Beam detection",
-        "",
-        *beams(options.seeds),
-        "",
-        f"errormotion {__version__}, {options.seeds} seeds.",
-        "",
-    ]
-    options.out.write_text("\n".join(lines), encoding="utf-8")
-    print("\n".join(lines))
-    print(f"written to {options.out} in {time.perf_counter() - start:.0f} s")
+    if unknown := set(options.parts) - set(PARTS):
+        parser.error(f"expected parts of {', '.join(PARTS)}; found {', '.join(sorted(unknown))}")
+    found = sections(options.out)
+    for name in options.parts or PARTS:
+        part, start = PARTS[name], time.perf_counter()
+        seeds = options.seeds or part.SEEDS
+        lines = [*part.section(seeds), "", f"errormotion {__version__}, {seeds} seeds."]
+        found[part.TITLE] = "\n".join(lines)
+        print(f"## {part.TITLE}\n\n{found[part.TITLE]}\n\n{time.perf_counter() - start:.0f} s\n", flush=True)
+    shown = [part.TITLE for part in PARTS.values() if part.TITLE in found]
+    page = INTRODUCTION + "".join(f"\n## {title}\n\n{found[title]}\n" for title in shown)
+    options.out.write_text(page, encoding="utf-8")
+    print(f"written to {options.out}")
 
 
 if __name__ == "__main__":
