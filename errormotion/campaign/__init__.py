@@ -6,5 +6,6 @@
 ``recorder``  the thread that writes while the method measures
 ``folder``    a run folder and its ``run.json``
 ``journal``   the run's ``log.jsonl``
+``batch``     many runs identified as a graph of small tasks, here or on a cluster
 ``runner``    test by test: acquire, identify, report; and going on after an interruption
 """
