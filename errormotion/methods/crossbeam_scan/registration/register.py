@@ -186,6 +186,11 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
     if not start.scale < noise:
         found = search(thin, free.motions, free.radius)
         start = found if found.scale < start.scale else start
+    if np.isinf(start.scale):
+        raise MethodError(
+            f"expected two scans of one place, found the cold one at {_extent(cold)} and the warm one at "
+            f"{_extent(warm)}; make both begin at the same place, and count their places from the same zero"
+        )
     if not start.scale < noise and not start.scale < LARGEST_MISFIT * (relief := _relief(cold)):
         raise MethodError(
             f"expected two scans of one artefact moved by at most 2 mm and 0.05 rad, found surfaces that stay "
@@ -199,13 +204,20 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
             f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
             f"{turn:.3f} rad; let both scans begin at the same place of the artefact"
         )
-    share = np.isfinite(thin.evaluate(start.state).residual).sum() / np.isfinite(thin.stack[3]).sum()
-    if share < LEAST_OVERLAP:
+    if start.overlap < LEAST_OVERLAP:
         raise MethodError(
-            f"expected at least {LEAST_OVERLAP:.0%} of the warm scan to lie on the cold one, found {share:.0%}; "
-            "scan the same piece of the artefact"
+            f"expected at least {LEAST_OVERLAP:.0%} of the warm scan to lie on the cold one, found {start.overlap:.0%}"
+            "; scan the same piece of the artefact"
         )
     return start
+
+
+def _extent(block_map: BlockMap) -> str:
+    """Return where a scan lies, in words."""
+    return " and ".join(
+        f"{name} from {places[0] * 1e3:.1f} to {places[-1] * 1e3:.1f} mm"
+        for name, places in (("x", block_map.x), ("y", block_map.y))
+    )
 
 
 def _relief(block_map: BlockMap) -> float:

@@ -12,6 +12,8 @@ from errormotion.methods.crossbeam_scan.registration.solver import Noise, Proble
 Array = NDArray[np.float64]
 
 SHIFTS = np.linspace(-2e-3, 2e-3, 5)
+SETTLED = 1e-7
+"""Steps that move the surface by less than this, m, end the descent: the next would be a thousandth of it."""
 YAWS = np.linspace(-0.05, 0.05, 5)
 _WHITE = Noise()
 _LEVEL = [2, 3, 4]
@@ -26,10 +28,12 @@ class Start:
     state: State
     scale: float
     steps: int
+    overlap: float = 0.0
+    """Share of the known warm blocks that have cold surface beneath them."""
 
 
 def descend(problem: Problem, state: State, motions: Array, radius: float, steps: int = _STEPS) -> Start:
-    """Take Gauss-Newton steps with the blocks that fit until they no longer move the surface by a nanometre."""
+    """Take Gauss-Newton steps with the blocks that fit until they no longer move the surface by the noise."""
     gate, done, known = np.inf, 0, np.count_nonzero(np.isfinite(problem.stack[3]))
     for done in range(1, steps + 1):
         sums = problem.evaluate(state, gate)
@@ -43,9 +47,10 @@ def descend(problem: Problem, state: State, motions: Array, radius: float, steps
         # A step beyond the surface's features leads nowhere.
         state = problem.stepped(state, step * min(1.0, 2e-3 / max(size, 1e-12)))
         gate = max(6 * sums.scale(), 1e-9)
-        if size < 1e-8:
+        if size < SETTLED:
             break
-    return Start(state, problem.evaluate(state).scale(), done)
+    sums = problem.evaluate(state)
+    return Start(state, sums.scale(), done, np.count_nonzero(np.isfinite(sums.residual)) / known)
 
 
 def search(problem: Problem, motions: Array, radius: float) -> Start:
@@ -67,4 +72,4 @@ def search(problem: Problem, motions: Array, radius: float) -> Start:
                     tried.append(Start(state, problem.evaluate(state).scale(), 3))
     tried.sort(key=lambda start: start.scale)
     ends = [descend(problem, start.state, motions, radius) for start in tried[:_KEPT]]
-    return min(ends, key=lambda start: start.scale)
+    return min(ends, key=lambda start: start.scale, default=Start(problem.rest, np.inf, 0))
