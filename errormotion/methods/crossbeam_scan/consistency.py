@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 
 #: artefacts without which their neighbours say nothing
 FEWEST = 4
+#: order of the curves that predict an artefact from the others: seven artefacts do not tell in one cycle how rough a
+#: guide is, and with order 3 one whose curvature jumps about would alarm nearly always
+CAUTIOUS = 2
 #: probability of any false alarm in a campaign
 FALSE_ALARM = 0.01
 
@@ -68,9 +71,9 @@ class Moved:
     covariance : ndarray, (6, 6)
         Of the step.
     score : float
-        Chi-squared of the step, with six degrees of freedom.
+        Chi-squared of the step in its six freedoms.
     probability : float
-        That a score is as high without a cause.
+        That a score is as high without a cause, for the few artefacts that tell how smooth the rest is.
     """
 
     artefact: int
@@ -229,7 +232,7 @@ class _Scans:
         row = np.arange(s)
         for d in range(6):
             known = np.where(others, gain[..., d], np.nan)
-            curve = smooth(self.position[left], known, noise[..., d, d], self.position[[k]], order=_order(left))
+            curve = smooth(self.position[left], known, noise[..., d, d], self.position[[k]], order=CAUTIOUS)
             W = curve.weights[:, 0]
             excess[:, d] = gain[:, ~others, d][:, 0] - curve.values[:, 0]
             doubt[:, d] = curve.variance[:, 0] - (W**2 * np.nan_to_num(noise[..., d, d])).sum(axis=-1)
@@ -243,7 +246,8 @@ class _Scans:
         N = np.nan_to_num(np.concatenate([self.cold[None], self.noise]))
         V = np.einsum("idtn,jetn,tnde->idje", share, share, N)
         V = V.reshape(excess.size, excess.size) + np.diag(np.maximum(doubt[told], 0.0).ravel())
-        return _greatest(k, cycles[told], excess, V)
+        spare = np.isfinite(gain[told][:, others]).all(axis=-1).sum(axis=-1) - CAUTIOUS
+        return _greatest(k, cycles[told], excess, V, np.maximum(doubt[told], 0.0), spare)
 
     def relief(self, step: Moved, left: NDArray[np.intp]) -> float:
         """Return by how much more likely all gains are, each freedom smooth, without one of one artefact (log).
@@ -289,11 +293,19 @@ def _order(left: NDArray[np.intp]) -> int:
     return min(ORDER, left.size - 2)
 
 
-def _greatest(k: int, cycles: NDArray[np.intp], excess: Array, V: Array) -> Moved:
-    """Return the most significant step, by generalised least squares for a step before each of the cycles."""
+def _greatest(
+    k: int, cycles: NDArray[np.intp], excess: Array, V: Array, doubt: Array, spare: NDArray[np.intp]
+) -> Moved:
+    """Return the most significant step, by generalised least squares for a step before each of the cycles.
+
+    How smooth a gain is, is known from the few artefacts to spare. As far as this doubt, and not the noise, makes up
+    the variance V of the excess, the score is judged by F with so few degrees of freedom (after Welch and
+    Satterthwaite, freedoms weighted by what they add to the score).
+    """
     unit = np.sqrt(np.diag(V))
     inverse = np.linalg.inv(V / np.outer(unit, unit)) / np.outer(unit, unit)
     pull = (inverse @ excess.ravel()).reshape(-1, 6)
+    doubtful = (doubt / (unit**2).reshape(-1, 6)) ** 2
     found = []
     for i, since in enumerate(cycles):
         block = slice(6 * i, 6 * i + 6)
@@ -302,7 +314,9 @@ def _greatest(k: int, cycles: NDArray[np.intp], excess: Array, V: Array) -> Move
         covariance = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
         step = covariance @ pull[i]
         score = float(step @ pull[i])
-        found.append(Moved(k, int(since), step, covariance, score, float(stats.chi2.sf(score, 6))))
+        weight = np.abs(step * pull[i])
+        degrees = spare[i] * weight.sum() / max(float(weight @ doubtful[i]), 1e-9 * float(weight.sum()))
+        found.append(Moved(k, int(since), step, covariance, score, float(stats.f.sf(score / 6, 6, degrees))))
     return max(found, key=lambda step: step.score)
 
 

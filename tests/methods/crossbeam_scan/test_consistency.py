@@ -117,8 +117,9 @@ def test_step_is_measured_with_its_covariance():
         off = found.step - jump
         score.append(off @ np.linalg.solve(found.covariance, off))
         assert found.probability < 1e-4
-    # chi-squared of 120 freedoms over 20: 6 +- 0.8; less, since the band of the curves is a little wide
-    assert 3 < np.mean(score) < 8
+    # Chi-squared of 120 freedoms over 20 would be 6 +- 0.8. It is less, since the axis is smoother than the curves of
+    # low order that predict it: the covariance is on the safe side by up to a factor of two in the standard deviation.
+    assert 6 / 4 < np.mean(score) < 8
 
 
 def test_clean_campaigns_stay_quiet():
@@ -126,6 +127,20 @@ def test_clean_campaigns_stay_quiet():
     alarms = sum(bool(moved(cycles, places, *campaign(seed, cycles, places)[:2])) for seed in range(200))
     # 2 expected at 1 percent; 6 or more come once in 60 runs of an exact test, and this one is on the safe side
     assert alarms <= 5
+
+
+def test_rough_guide_is_not_taken_for_moved_artefacts():
+    # White noise integrated twice, a new one each cycle, and hardly any noise of the scans: curvature that jumps about.
+    rng = np.random.default_rng(4)
+    fine = np.linspace(PLACES[0], PLACES[-1], 281)
+    alarms = 0
+    for _ in range(20):
+        rough = np.cumsum(np.cumsum(rng.normal(size=(9, 6, fine.size)), axis=-1), axis=-1)
+        gains = np.moveaxis(rough[..., ::40], -1, 1)
+        errors = np.cumsum(gains, axis=0) + rng.normal(size=(9, 8, 6))
+        alarms += bool(moved(CYCLES, PLACES, errors * 1e-8, np.broadcast_to(1e-16 * np.eye(6), (9, 8, 6, 6))))
+    # order 3 would alarm in nearly all
+    assert alarms <= 3
 
 
 def test_several_artefacts_are_found_the_worst_first():
