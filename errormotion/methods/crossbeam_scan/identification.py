@@ -107,7 +107,7 @@ def _dataset(
     mended: list[str],
 ) -> xr.Dataset:
     rows = [cold[0], *warm]
-    time = cycle_times(found.time, rows)
+    time = cycle_times(found.time, rows, _planned(raw, len(found.time)))
     place = np.asarray(raw["position"].values, dtype=float)
     reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
     values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
@@ -150,17 +150,33 @@ def _dataset(
     return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
 
 
-def cycle_times(scan_time: Array, rows: list[int]) -> Array:
-    """Return the time of every cycle, s since the warm-up began: the middle of its scans; the cold one is 0."""
+def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:
+    """Return the time of every cycle, s since the warm-up began: the middle of its scans; the cold one is 0.
+
+    A cycle without a scan is put between its neighbours, or behind the last one, as it was ``planned`` (cycle,); evenly
+    where no plan is known.
+    """
     time = np.array([np.nanmean(scan_time[c]) if np.isfinite(scan_time[c]).any() else np.nan for c in rows])
     first = max(time[0], 0.0) if np.isfinite(time[0]) else 0.0
     time[0] = 0.0
     time[1:] -= first
-    unknown = np.isnan(time)
-    time[unknown] = np.interp(np.flatnonzero(unknown), np.flatnonzero(~unknown), time[~unknown])
+    plan = np.arange(len(rows), dtype=float) if planned is None else planned[rows]
+    known = np.flatnonzero(np.isfinite(time))
+    last = known[-1]
+    pace = 1.0 if planned is not None else time[last] / max(last, 1)
+    behind = time[last] + pace * np.maximum(plan - plan[last], 0.0)
+    time = np.where(np.isfinite(time), time, np.interp(plan, plan[known], time[known]) + behind - time[last])
     if np.any(np.diff(time) <= 0):
         raise MethodError(f"time: expected cycles one after the other; found {np.round(time, 1).tolist()} s")
     return time
+
+
+def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
+    """Return when every cycle was to be, s: as a raw dataset states it for scans, or else by its warm-up times."""
+    name = next((name for name in ("time", "warm_up") if name in raw.variables and raw[name].dims == ("cycle",)), None)
+    if name is None or raw.sizes["cycle"] < cycles:
+        return None
+    return np.asarray(raw[name].values, dtype=float)
 
 
 def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
