@@ -151,13 +151,13 @@ class _Record:
         self._check_units()
 
     def _check_units(self) -> None:
-        """Refuse an encoder pitch that puts no line, or all lines, into a scan."""
+        """Refuse an encoder pitch that puts no line, a few of them, or all into a scan."""
         known = self._place[np.isfinite(self._place)]
         inside = (np.abs(known[:, None] - self._positions) <= self._length / 2).any(axis=1)
         step = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else np.nan
         where = ", ".join(f"{y:g}" for y in self._positions)
         pitch = float(self._raw["encoder_pitch"])
-        if inside.any() and not step < FINEST_PITCH:
+        if inside.any() and not (step < FINEST_PITCH or step > self._length / FEWEST_LINES):
             return
         found = (
             f"{step * 1e6:.3g} um from line to line"
