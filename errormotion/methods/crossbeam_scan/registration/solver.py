@@ -237,8 +237,10 @@ def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: boo
     for _ in range(2):
         tau = _maximised(C, u, k, tau)
         noise = Noise(k, (float(tau[0]), float(tau[1])))
-        effect = np.einsum("rij,rj->ri", noise.gains(sums.A), sums.g[:, LINE])
-        k = _long_run(sums.residual - effect[:, :1] + effect[:, 1:] * slope, sums.weight, fitted)
+        gains = noise.gains(sums.A)
+        effect = np.einsum("rij,rj->ri", gains, sums.g[:, LINE])
+        taken = float(np.mean(np.einsum("rij,rji->r", gains[rows], C) / sums.count[rows]))
+        k = _long_run(sums.residual - effect[:, :1] + effect[:, 1:] * slope, sums.weight, fitted, taken)
     # Half of the jitter is the cold scan's, of which the spline shows only a part.
     averaged = 1.0 - _GAIN * float(sums.between.sum() / max(sums.count.sum(), 1))
     tau = tau * np.sqrt(2.0 / (1.0 + averaged))
@@ -271,13 +273,17 @@ def _slope(problem: Problem, state: State) -> Array:
     return slope
 
 
-def _long_run(residual: Array, weight: Array, fitted: int) -> float:
-    """Return the sum of covariances of the normalised residuals with their neighbours up to LAGS blocks away."""
+def _long_run(residual: Array, weight: Array, fitted: int, of_line: float = 0.0) -> float:
+    """Return the sum of covariances of the normalised residuals with their neighbours up to LAGS blocks away.
+
+    ``fitted`` parameters have been taken out of all blocks, and line effects the share ``of_line`` out of each line.
+    """
     sums, pairs = np.empty((2, LAGS + 1, 2 * LAGS + 1))
     lag_sums(residual, weight, LAGS, sums, pairs)
     covariance = sums / np.maximum(pairs, 1.0)
     count, alone = float(pairs[0, LAGS]), float(covariance[0, LAGS])
     total = float(2 * covariance[1:].sum() + covariance[0].sum())
-    # The fit has taken its parameters' share out of every block and each of its neighbours. Too few blocks make the sum
-    # uncertain; it is never far below the variance itself.
-    return max(total / max(1.0 - _NEIGHBOURS * fitted / max(count, 1.0), 0.5), 0.5 * alone)
+    # The fit has taken its parameters' share out of every block and each of its neighbours, the line effects theirs out
+    # of the neighbours in line. Too few blocks make the sum uncertain; it is never far below the variance itself.
+    left = 1.0 - _NEIGHBOURS * fitted / max(count, 1.0) - (2 * LAGS + 1) * of_line
+    return max(total / max(left, 0.5), 0.5 * alone)
