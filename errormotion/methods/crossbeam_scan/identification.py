@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.carriage import Carriage, Rig, carriage
 from errormotion.methods.crossbeam_scan.chain import SOURCES
 from errormotion.methods.crossbeam_scan.curves import curves
 from errormotion.methods.crossbeam_scan.cutting import Scans
-from errormotion.methods.crossbeam_scan.judgement import MOVED, judge
+from errormotion.methods.crossbeam_scan.judgement import MOVED, Trust, judge
 from errormotion.methods.crossbeam_scan.registrations import Maps, Registrations, register_all
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     cold = cold_cycles(raw, scans.cycles)
     found = register_all(scans, cold, float(raw["height_noise"]), settings)
     rig = rig_of(raw)
-    axis = carriage(found, places, rig, guide=settings.guide_uncertainty if settings.strain == "guided" else None)
+    axis = carriage(found, places, rig, guide=None)
     warm = [c for c in range(scans.cycles) if c not in cold]
     if not warm:
         raise MethodError(f"Expected warm scans after the cold ones; found {scans.cycles} cycles, all of them cold")
@@ -65,7 +65,13 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
         raise MethodError(
             f"Not one of {len(warm) * places.size} warm scans could be laid on its cold one: " + "; ".join(reasons[:3])
         )
-    return _dataset(raw, settings, method, version, found, axis, rig, cold, warm, scans.notes)
+    rows = [cold[0], *warm]
+    time = cycle_times(found.time, rows, _planned(raw, scans.cycles))
+    trust = judge(axis, found, settings, places, time[1:], cold, warm)  # each by itself: a guide joins neighbours
+    if settings.strain == "guided":
+        gone = trust.wrong & (settings.moved == "exclude")
+        axis = carriage(found.without(gone), places, rig, guide=settings.guide_uncertainty)
+    return _dataset(raw, settings, method, version, found, axis, rig, trust, cold, rows, time, scans.notes)
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
@@ -102,12 +108,13 @@ def _dataset(
     found: Registrations,
     axis: Carriage,
     rig: Rig,
+    trust: Trust,
     cold: list[int],
-    warm: list[int],
+    rows: list[int],
+    time: Array,
     mended: list[str],
 ) -> xr.Dataset:
-    rows = [cold[0], *warm]
-    time = cycle_times(found.time, rows, _planned(raw, len(found.time)))
+    warm = rows[1:]
     place = np.asarray(raw["position"].values, dtype=float)
     reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
     values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
@@ -116,7 +123,6 @@ def _dataset(
     influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
     reason = found.reason[rows]
     reason[0, reference] = ""
-    trust = judge(axis, found, settings, place, time[1:], cold, warm)
     if settings.moved == "exclude":
         gone = trust.wrong[rows]
         values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -82,6 +82,12 @@ class Registrations:
     quality: dict[str, Array]
     time: Array
     maps: list[Maps | None] = field(default_factory=list)
+
+    def without(self, gone: NDArray[np.bool_]) -> Registrations:
+        """Return these with NaN for some, (cycle, artefact)."""
+        twist, covariance = self.twist.copy(), self.covariance.copy()
+        twist[gone], covariance[gone] = np.nan, np.nan
+        return replace(self, twist=twist, covariance=covariance)
 
 
 @dataclass
