@@ -12,6 +12,9 @@ from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import load_bench
 from errormotion.cli.output import show, show_json, table
 
+MOST_NUMBERS = 12
+"""Longer readings are summed up on the screen."""
+
 log = logging.getLogger(__name__)
 
 
@@ -70,5 +73,14 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{k} {_short(v)}" for k, v in value.items())
     if isinstance(value, list):
-        return ", ".join(_short(v) for v in value)
+        if len(value) > MOST_NUMBERS:
+            return _summary(value)
+        return ", ".join(_short(v) for v in value) or "none"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _summary(values: list[Any]) -> str:
+    numbers = np.array([v for v in values if isinstance(v, int | float)], dtype=float)
+    known = numbers[np.isfinite(numbers)]
+    between = f", {known.min():.6g} to {known.max():.6g}" if known.size else ""
+    return f"{len(values)} values, {known.size} known{between}"

@@ -303,13 +303,86 @@ def test_a_profiler_may_wait_for_the_program() -> None:
 def test_where_nothing_moves_nothing_comes() -> None:
     with gantry(PERFECT, FAST) as (controller, device):
         with pytest.raises(InstrumentTimeoutError, match="no data"):
-            device.read()
+            measure(controller, device, 1, block=1)
         controller.run_program("G1 Y2 F1500\nM30")
         with pytest.raises(InstrumentTimeoutError, match="no data"):
             measure(controller, device, 5, block=5)  # of the four that there are
         assert controller.state()["running"]
         finish(controller)
         assert device.counts().encoder == 2000
+
+
+def test_a_profile_by_command_shows_where_the_axis_stands_and_moves_nothing() -> None:
+    with gantry(PERFECT + "&artefacts=0.1") as (controller, device):
+        assert np.isnan(device.read()).all()  # nothing is there
+        controller.run_program("G0 Y110.0004\nM30")
+        finish(controller)
+        before, counts = controller.state(), device.counts()
+        heights = [device.read() for _ in range(2)]
+        assert controller.state() == before
+        after = device.counts()
+    assert (after.trigger - counts.trigger, after.encoder) == (2, counts.encoder) == (2, 110000)
+    crossbeam, y = VirtualMachine("gantry", seed=3).crossbeam, np.array([0.1100004, 0.1100014])
+    lines = crossbeam.lines(crossbeam.carriage(0.0, y, 0.1, "axis"), crossbeam.artefact_pose(3, 0.1))
+    truth = PROFILER.scan(swept(), lines)[0]
+    assert np.isfinite(truth).mean() > 0.5
+    assert all(same(each, truth, STEP / 2 + 1e-12) for each in heights)
+
+
+def test_profiles_by_command_have_noise_of_their_own() -> None:
+    with gantry(SMALL + "&disturbances=white&artefacts=0.1") as (controller, device):
+        controller.run_program("G0 Y110\nM30")
+        finish(controller)
+        change = device.read() - device.read()
+    # the difference of two: white noise of 0.5 um and rounding to 0.1 um in both; 60 points or so: 9 % one sigma
+    assert np.nanstd(change) == pytest.approx(np.sqrt(2) * np.hypot(0.5e-6, STEP / np.sqrt(12)), rel=0.4)
+
+
+def test_profiles_by_command_before_and_within_a_scan_leave_it_as_it_is() -> None:
+    whole = one_scan(SMALL + "&artefacts=0.1", 60, 140, 160)
+    with gantry(SMALL + "&artefacts=0.1") as (controller, device):
+        device.read()
+        first, stream, found = scan(controller, device, 60, 140, 50), device.stream(1), []
+        for number in range(110 + 1):
+            if number == 40:
+                device.trigger()
+            found.append(next(stream))
+        stream.close()
+    rest = Pass(found, [])
+    encoder = np.concatenate([first.encoder, rest.encoder])
+    (before,) = np.flatnonzero(np.diff(encoder) == 0)  # the profile at whose place it was taken
+    assert np.delete(encoder, before + 1).tolist() == whole.encoder.tolist()
+    heights = np.delete(np.concatenate([first.heights, rest.heights]), before + 1, axis=0)
+    assert np.array_equal(heights, whole.heights, equal_nan=True)
+
+
+def heard(profiler: str, timeout: float) -> tuple[Pass, int]:
+    """A pass with a rest of 5 s, heard by somebody who asks anew after a silence; how often that was."""
+    found, silences = Pass([], []), 0
+    with gantry(profiler, LJXSettings(timeout=timeout)) as (controller, device):
+        controller.run_program("G1 Y5.3 F1500\nG4 P5\nG1 Y30\nM30")
+        while len(found.blocks) < 60:
+            stream = device.stream(1)
+            try:
+                while len(found.blocks) < 60:
+                    found.blocks.append(next(stream))
+                    found.times.append(controller.state()["time"])
+            except InstrumentTimeoutError:
+                silences += 1
+                assert silences < 200
+            stream.close()
+    return found, silences
+
+
+def test_at_a_pace_a_rest_longer_than_the_time_limit_passes_while_somebody_listens() -> None:
+    """At a pace of 10 the rest takes 0.5 s, ten times the time limit."""
+    calm, silences = heard(PERFECT + "&artefacts=none", 10.0)
+    assert silences == 0
+    paced, silences = heard(PERFECT + "&artefacts=none&pace=10", 0.05)
+    assert silences > 0
+    assert paced.encoder.tolist() == calm.encoder.tolist() == list(range(500, 30001, 500))
+    assert paced.times[10:] == pytest.approx(calm.times[10:], abs=1e-9)  # behind the rest
+    assert np.ptp(calm.times[9:11]) > 5.0
 
 
 def test_at_a_pace_the_machine_moves_in_real_time() -> None:

@@ -15,8 +15,9 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings, codec
 from errormotion.instruments.line_profiler.keyence_ljx.driver import STREAM
 from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.simulators.keyence_ljx import SimulatedLJX
-from errormotion.instruments.simulators.profile_sources import SweptSurface
+from errormotion.instruments.simulators.profile_sources import Lines, SweptSurface
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.serving import TcpServer
 
@@ -55,6 +56,50 @@ def ramp() -> Iterator[SimulatedLJX]:
 def reach(device: SimulatedLJX) -> str:
     """The address of a simulator as that of a real device."""
     return f"{device.url}?stream={device.urls[STREAM].rpartition(':')[2]}"
+
+
+class Waiting:
+    """A feed without an encoder that moves: a profile comes where a trigger by command brings one."""
+
+    def __init__(self, obeys: bool) -> None:
+        self._obeys = obeys
+        self._due = threading.Event()
+
+    def count(self) -> int:
+        return 4711
+
+    def begin(self) -> None:
+        self._due.clear()
+
+    def trigger(self) -> None:
+        if self._obeys:
+            self._due.set()
+
+    def lines(self, layout: codec.StreamLayout) -> Iterator[Lines | None]:
+        while True:
+            if self._due.is_set():
+                self._due.clear()
+                yield Lines(np.array([4711]), np.full((1, layout.points), 1e-3), np.zeros(1))
+            yield None
+
+    def handed_over(self, profiles: int) -> None:
+        pass
+
+    def end(self) -> None:
+        pass
+
+
+def requests(device: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int = -1, code: int = 0x80) -> list[int]:
+    """Opcodes of all requests from now on; one of them is refused."""
+    seen: list[int] = []
+    obey = device._obey
+
+    def noted(opcode: int, arguments: bytes) -> tuple[int, bytes]:
+        seen.append(opcode)
+        return (code, b"") if opcode == refused else obey(opcode, arguments)
+
+    monkeypatch.setattr(device, "_obey", noted)
+    return seen
 
 
 # ------------------------------------------------------------------ asking
@@ -141,6 +186,83 @@ def test_a_wrong_start_code_is_refused(ramp: SimulatedLJX) -> None:
 def test_a_profile_is_what_lies_below_it_to_the_z_unit(ramp: SimulatedLJX) -> None:
     with KeyenceLJX(reach(ramp)) as profiler:
         assert profiler.read() == pytest.approx(STEP * np.arange(80), abs=1e-15)
+
+
+def test_reading_once_triggers_once_behind_the_start_of_the_stream(
+    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with KeyenceLJX(reach(ramp)) as profiler:
+        seen = requests(ramp, monkeypatch)
+        profiler.read()
+    assert seen == [codec.PREPARE_STREAM, codec.START_STREAM, codec.TRIGGER, codec.STOP_STREAM]
+
+
+def test_a_stream_is_never_triggered_by_command(ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch) -> None:
+    with KeyenceLJX(reach(ramp)) as profiler:
+        seen = requests(ramp, monkeypatch)
+        take(profiler, 3, 20)
+    assert codec.TRIGGER not in seen
+    assert codec.START_STREAM in seen
+
+
+def test_a_profiler_that_runs_freely_may_refuse_the_trigger(
+    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with KeyenceLJX(reach(ramp)) as profiler:
+        seen = requests(ramp, monkeypatch, refused=codec.TRIGGER)
+        assert profiler.read() == pytest.approx(STEP * np.arange(80), abs=1e-15)
+        assert codec.TRIGGER in seen
+        assert profiler.program() == 0
+
+
+def test_a_profiler_that_waits_is_read_by_a_trigger(ramp: SimulatedLJX) -> None:
+    ramp._feed = Waiting(obeys=True)
+    with KeyenceLJX(reach(ramp), FAST) as profiler:
+        for _ in range(2):
+            assert profiler.read() == pytest.approx(np.full(80, 1e-3), abs=1e-12)
+        assert profiler.counts().trigger == 2
+        with pytest.raises(InstrumentTimeoutError, match="no data"):
+            take(profiler, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("refused", "says"),
+    [(-1, "one by command brought none"), (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this")],
+)
+def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
+    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int, says: str
+) -> None:
+    ramp._feed = Waiting(obeys=False)
+    with KeyenceLJX(reach(ramp), FAST) as profiler:
+        requests(ramp, monkeypatch, refused=refused)
+        with pytest.raises(InstrumentTimeoutError, match=says) as caught:
+            profiler.read()
+        assert "waits for its trigger (it has counted 0 triggers, its encoder is at 4711)" in str(caught.value)
+        assert "Move the axis" in str(caught.value)
+        assert profiler.program() == 0  # it is not lost
+
+
+def test_counts_that_cannot_be_had_are_left_out_of_the_message(
+    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ramp._feed = Waiting(obeys=False)
+    with KeyenceLJX(reach(ramp), FAST) as profiler:
+        requests(ramp, monkeypatch, refused=codec.GET_COUNTS)
+        with pytest.raises(InstrumentTimeoutError, match="waits for its trigger, and one by command"):
+            profiler.read()
+
+
+def test_a_profiler_that_falls_silent_at_the_trigger_is_lost(
+    ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ramp._feed = Waiting(obeys=False)
+    with KeyenceLJX(reach(ramp), FAST) as profiler:
+        ramp.fault = parse_fault(parse_address("sim://cframe/p?fault=silence&fault_at=9"), ramp.faults)
+        monkeypatch.setattr(ramp._feed, "trigger", lambda: setattr(ramp, "_mute", True))
+        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+            profiler.read()
+        with pytest.raises(InstrumentError, match="is lost"):
+            profiler.program()
 
 
 def test_blocks_follow_one_another_without_a_gap_with_their_counts(ramp: SimulatedLJX) -> None:

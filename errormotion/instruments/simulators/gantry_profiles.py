@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,13 +10,14 @@ import numpy as np
 
 from errormotion.errors import BenchError, InstrumentError
 from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
-from errormotion.instruments.simulators.profile_sources import Lines
+from errormotion.instruments.simulators.profile_sources import Clock, Lines
 from errormotion.instruments.simulators.virtual_world import VirtualWorld
 from errormotion.instruments.transports import Address
 from errormotion.twin.paths import Path
 
 EMPTY = 128  # profiles at once over nothing
 PACED = 8  # profiles at once at a pace
+REST = 0.1  # s without a profile in which the axis moves on nevertheless; longer, and it rests or goes back
 DISTURBANCES = ("none", "white", "full")
 _ROUNDING = 1e-6  # counts
 
@@ -29,6 +31,11 @@ class GantryProfiles:
     default: one every 200 mm), ``pocket`` (position of the axis over a circular pocket that the machine has cut, m;
     default: no pocket), ``disturbances`` (``none``, ``white`` or ``full``), ``encoder_pitch`` (m for one count, 1e-6),
     ``encoder_step`` (counts from profile to profile, 70), ``encoder_start`` (count at Y = 0).
+
+    A trigger by command takes one profile where the axis is, at the time of the last profile.
+
+    At a pace the world's time goes on while a program that was begun brings no profile, as that of a real machine;
+    who gives up meanwhile and streams again later has missed nothing but the rest.
 
     Parameters
     ----------
@@ -64,24 +71,30 @@ class GantryProfiles:
         self._began = 0.0
         self._times: list[float] = []  # of all profiles of the stream
         self._taken = 0
+        self._rested = 0.0  # time up to which nothing came, at a pace
+        self._triggers = threading.Semaphore(0)
+        self._by_command = 0  # profiles that were triggered so
         trial = Profiler(8, 1e-4, disturbances=self._disturbances)  # compiled before anybody waits for it
         for target in self._table.targets[:1]:
             self._table.scan(target, trial, np.zeros(2), np.array([[0.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]), (0,))
 
     @property
     def seen(self) -> float:
-        """Time of the last profile that the reader has handed over, s."""
-        return self._times[self._taken - 1] if self._taken else self._began
+        """Time of the last profile that the reader has handed over, s, or up to which none came."""
+        return max(self._times[self._taken - 1] if self._taken else self._began, self._rested)
 
     def count(self) -> int:
         """Return what the encoder shows now."""
-        y = float(self._world.path.place(self._world.time)[1])
-        return int(np.floor(y / self._pitch + _ROUNDING)) + self._start
+        return self._counted(self._world.path.place(self._world.time))
+
+    def _counted(self, place: Array) -> int:
+        return int(np.floor(float(place[1]) / self._pitch + _ROUNDING)) + self._start
 
     def begin(self) -> None:
         """Follow the axes from now on."""
         self._times, self._taken = [], 0
-        self._began = self._world.time
+        self._began = self._rested = self._world.time
+        self._triggers = threading.Semaphore(0)
         self._world.begin_triggered(self)
 
     def handed_over(self, profiles: int) -> None:
@@ -92,20 +105,50 @@ class GantryProfiles:
         """Let the world's clock stand where the reader is."""
         self._world.end_triggered(self)
 
+    def trigger(self) -> None:
+        """Have one profile taken where the axis is."""
+        self._triggers.release()
+
     def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
         """Yield the profiles of what the machine runs, and of what it will be told to run."""
         after = self._began
         path = None
         while True:
+            yield from self._commanded(layout)
             if path is self._world.path:
                 yield None
                 continue
-            path, begin = self._world.path, self.seen
+            path, clock = self._world.path, Clock(lambda: self._world.pace, self.seen)
             for lines in self._along(path, layout, after):
-                for part in self._parts(lines, begin):
+                for part in self._parts(lines):
+                    yield from self._commanded(layout)
+                    while (now := clock.now) < part.times[-1]:
+                        if (end := float(part.times[0]) - REST) > self._last:
+                            self._rested = max(self._rested, min(now, end))
+                        yield None
+                        yield from self._commanded(layout)
                     self._times += part.times.tolist()
                     yield part
-                    begin = self._times[-1]
+
+    @property
+    def _last(self) -> float:
+        return self._times[-1] if self._times else self._began
+
+    def _commanded(self, layout: StreamLayout) -> Iterator[Lines]:
+        """Yield a profile for each trigger by command that has come."""
+        from errormotion.twin.profiler import Profiler
+
+        while self._triggers.acquire(blocking=False):
+            times = np.array([max(self._last, self._rested)])
+            places = self._world.path.place(times)
+            profiler, heights = Profiler(layout.points, layout.x_pitch, disturbances=self._disturbances), None
+            self._by_command += 1
+            for _, target in self._table.runs(places[:, 1]):
+                if target is not None:
+                    key = (self._world.seed, self._by_command)
+                    heights = self._table.scan(target, profiler, self._world.warm_time(times), places, key)
+            self._times += times.tolist()
+            yield Lines(np.array([self._counted(places[0])]), heights, times)
 
     def _along(self, path: Path, layout: StreamLayout, after: float) -> Iterator[Lines]:
         """Yield the profiles on a path after a time."""
@@ -130,16 +173,16 @@ class GantryProfiles:
                         key = (*of_scan, round(target.position * 1e9), number)
                         warm = self._world.warm_time(times[part])
                         heights = self._table.scan(target, profiler, warm, places[part], key)[new]
-                    yield Lines(counts[part][new], heights, after, times[part][new])
+                    yield Lines(counts[part][new], heights, times[part][new])
 
-    def _parts(self, lines: Lines, begin: float) -> Iterator[Lines]:
+    def _parts(self, lines: Lines) -> Iterator[Lines]:
         """Yield profiles in small blocks where there is a pace, else as they are."""
         n = lines.times.size
         size = n if self._world.pace is None else PACED
         for low in range(0, n, size):
             part = slice(low, min(low + size, n))
             heights = None if lines.heights is None else lines.heights[part]
-            yield Lines(lines.encoder[part], heights, begin, lines.times[part])
+            yield Lines(lines.encoder[part], heights, lines.times[part])
 
 
 def _disturbances(address: Address) -> Any:

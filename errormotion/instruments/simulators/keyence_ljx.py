@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import time
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from errormotion.instruments.transports.serving import TcpServer
 NO_HEIGHT = -(1 << 19) + 1  # raw 0x80001, invalid
 CONNECTING = 0.2  # s
 BATCH = 16  # profiles sent at once when running freely
-IDLE = 0.02  # s from look to look whether the machine moves
+IDLE = 0.01  # s from look to look whether a profile is due
 TEMPERATURES = (3512, 4108, 2967)  # hundredths of a degC
 WRONG_START, NOT_PREPARED, NO_CONNECTION, NOT_NOW = 0xA3, 0xA1, 0xA0, 0x80
 UNKNOWN_REQUEST, WRONG_ARGUMENT = 0x41, 0x42  # (m)
@@ -89,7 +88,7 @@ class SimulatedLJX(SimulatedDevice):
         )
         rate, pace = address.number("rate", 1000.0), self.world.pace
         at_once = BATCH if pace is None else max(1, round(0.01 * rate * pace))
-        return FreeRunning(source, start=start, step=step, rate=rate, at_once=at_once)
+        return FreeRunning(source, start=start, step=step, rate=rate, at_once=at_once, pace=lambda: self.world.pace)
 
     @property
     def layout(self) -> StreamLayout:
@@ -173,6 +172,8 @@ class SimulatedLJX(SimulatedDevice):
             case codec.STOP_STREAM:
                 self._ended.set()
                 self._feed.end()
+            case codec.TRIGGER if self._streaming:
+                self._feed.trigger()
             case codec.TRIGGER | codec.START_MEASURING | codec.STOP_MEASURING | codec.CLEAR_MEMORY | codec.LASER:
                 pass
             case _:
@@ -224,15 +225,9 @@ class SimulatedLJX(SimulatedDevice):
 
     def _send_all(self, layout: StreamLayout) -> bool:
         """Send profiles until told to stop; False where the stream breaks down."""
-        clock = None  # wall time and simulated time from which on a pace is kept
         for lines in self._feed.lines(layout):
             if lines is None:
-                clock = None
                 self._ended.wait(IDLE)
-            elif self.world.pace is not None:
-                clock = clock or (time.monotonic(), lines.begin)
-                due = clock[0] + (lines.times[-1] - clock[1]) / self.world.pace
-                self._ended.wait(max(0.0, due - time.monotonic()))
             if self._ended.is_set():
                 break
             if lines is None:

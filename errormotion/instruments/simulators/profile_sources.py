@@ -6,6 +6,7 @@ anything that tells the heights along its line. The feed of a machine's axis is 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -28,15 +29,12 @@ class Lines:
         Counts, without overflow.
     heights : ndarray, float64, (n, point), or None
         m; NaN where there is none. None: there is nothing at all.
-    begin : float
-        Simulated time from which on they were taken, s.
     times : ndarray, float64, (n,)
         When, s.
     """
 
     encoder: Array
     heights: Array | None
-    begin: float
     times: Array
 
 
@@ -50,13 +48,38 @@ class Feed(Protocol):
         """Begin a stream; InstrumentError where that cannot be now."""
 
     def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
-        """Yield the profiles of a stream; None where nothing is to come for now."""
+        """Yield the profiles of a stream when they are due; None where nothing is to come for now."""
+
+    def trigger(self) -> None:
+        """Have one profile taken now, where nothing else takes them; called while a stream runs."""
 
     def handed_over(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
 
     def end(self) -> None:
         """End the stream. Idempotent."""
+
+
+class Clock:
+    """Simulated time that keeps a pace.
+
+    Parameters
+    ----------
+    pace : callable
+        Returns simulated seconds per second; None where nobody waits for real time.
+    begin : float
+        Simulated time now, s.
+    """
+
+    def __init__(self, pace: Callable[[], float | None], begin: float = 0.0) -> None:
+        self._pace, self._begin = pace, begin
+        self._since = time.monotonic()
+
+    @property
+    def now(self) -> float:
+        """Simulated time, s; without a pace everything is due."""
+        pace = self._pace()
+        return np.inf if pace is None else self._begin + pace * (time.monotonic() - self._since)
 
 
 class ProfileSource(Protocol):
@@ -92,13 +115,25 @@ class FreeRunning:
         Profiles per simulated second.
     at_once : int
         Profiles in a block.
+    pace : callable
+        Of the `Clock`.
     """
 
-    def __init__(self, source: ProfileSource, *, start: int, step: int, rate: float, at_once: int) -> None:
+    def __init__(
+        self,
+        source: ProfileSource,
+        *,
+        start: int,
+        step: int,
+        rate: float,
+        at_once: int,
+        pace: Callable[[], float | None],
+    ) -> None:
         self._source = source
         self._start, self._step = start, step
         self._rate = rate
         self._at_once = at_once
+        self._pace = pace
         self._first = 0  # number of the stream's first profile
         self._sent = self._taken = 0
 
@@ -111,15 +146,21 @@ class FreeRunning:
         self._first += self._taken or self._sent
         self._sent = self._taken = 0
 
-    def lines(self, layout: StreamLayout) -> Iterator[Lines]:
+    def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
         """Yield profiles without end."""
+        clock = Clock(self._pace)
         while True:
             numbers = np.arange(self._at_once, dtype=np.int64)
             counts = self.count() + self._step * numbers
             times = (self._sent + numbers + 1) / self._rate
             heights = np.array([self._source.profile(int(count), layout.points, layout.x) for count in counts])
+            while clock.now < times[-1]:
+                yield None
             self._sent += self._at_once
-            yield Lines(counts, heights, 0.0, times)
+            yield Lines(counts, heights, times)
+
+    def trigger(self) -> None:
+        """Do nothing: profiles come anyhow."""
 
     def handed_over(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from errormotion.errors import InstrumentError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.line_profiler.keyence_ljx import codec
 from errormotion.instruments.line_profiler.keyence_ljx.codec import (
@@ -185,10 +186,46 @@ class KeyenceLJX(Driver):
     # ------------------------------------------------------------------ measuring
 
     def read(self) -> np.ndarray[Any, Any]:
-        """Return the heights of one profile, m, (point,); NaN where there is none."""
-        for profiles in self.stream(block=1):
-            return np.asarray(profiles.heights[0])
-        raise InstrumentError(f"{self.name}: the stream ended before its first profile")
+        """Take one profile and return its heights, m, (point,); NaN where there is none.
+
+        A profiler that waits for its encoder is triggered by command; one that runs freely may refuse that.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No profile within the time limit: it waits for its trigger, or is silent altogether.
+        """
+        refused: list[InstrumentError] = []
+        try:
+            with closing(self._stream(1, lambda: refused.extend(self._refusals()))) as stream:
+                return np.asarray(next(stream).heights[0])
+        except InstrumentTimeoutError as error:
+            if self._lost is not None:  # it answers no command either
+                raise
+            raise InstrumentTimeoutError(self._untriggered(refused)) from error
+
+    def _refusals(self) -> list[InstrumentError]:
+        """Trigger one profile; return why that is refused."""
+        try:
+            self.trigger()
+        except InstrumentError as error:
+            if self._lost is not None:
+                raise
+            return [error]
+        return []
+
+    def _untriggered(self, refused: list[InstrumentError]) -> str:
+        try:
+            counts = self.counts()
+            counted = f" (it has counted {counts.trigger} triggers, its encoder is at {counts.encoder})"
+        except InstrumentError:
+            counted = ""
+        by_command = f"the one by command was refused: {refused[0]}" if refused else "one by command brought none"
+        return (
+            f"{self.name}: expected a profile within {self.settings.timeout:g} s, none came: the profiler waits for "
+            f"its trigger{counted}, and {by_command}. Move the axis whose encoder triggers it, or have its program "
+            "take profiles continuously; check that its laser is on and that it measures."
+        )
 
     def stream(self, block: int | None = None) -> Iterator[Profiles]:
         """Yield blocks of profiles until the caller stops; leaving the loop stops the stream.
@@ -212,6 +249,10 @@ class KeyenceLJX(Driver):
         InstrumentError
             The profiler ends the stream.
         """
+        yield from self._stream(block)
+
+    def _stream(self, block: int | None, begun: Callable[[], None] | None = None) -> Generator[Profiles]:
+        """Yield blocks as `stream`; ``begun`` is called once the profiler streams."""
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder, StreamDecoder
         from errormotion.instruments.streaming import Reader
 
@@ -226,6 +267,8 @@ class KeyenceLJX(Driver):
         self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)
         try:
             self.command(codec.START_STREAM, struct.pack("<Ii", codec.PREPARE_STREAM, layout.start_code))
+            if begun is not None:
+                begun()
             first = 0
             while True:
                 if self._reader is not reader:
