@@ -128,6 +128,7 @@ def _dataset(
         values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan
         reason[gone] = MOVED
     notes = [*_notes(reason, place, rig), *trust.notes, *mended]
+    notes += found.notes
     if settings.strain == "free":
         notes += _pitch_note(own)
     for note in notes:

@@ -28,6 +28,8 @@ Scan = tuple[NDArray[np.float32], Array, Array, float]
 
 log = logging.getLogger(__name__)
 
+COARSE = 1.5
+"""Bending of a block over the noise of a point, beyond which registrations are said to be doubtful."""
 MAP_SIZE = 40
 """Differences of surfaces are kept thinned to about so many places along both directions."""
 
@@ -71,6 +73,8 @@ class Registrations:
         Of each scan, s.
     maps : list of Maps or None
         By artefact.
+    notes : list of str
+        What to know of them.
     """
 
     cold: NDArray[np.int64]
@@ -82,6 +86,7 @@ class Registrations:
     quality: dict[str, Array]
     time: Array
     maps: list[Maps | None] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def without(self, gone: NDArray[np.bool_]) -> Registrations:
         """Return these with NaN for some, (cycle, artefact)."""
@@ -156,6 +161,7 @@ def _artefact(
                 found.twist[cycle, k] = 0.0
                 found.covariance[cycle, k] = 0.0
                 found.cold_share[cycle, k] = 0.0
+                found.notes += _coarse(cold, k)
                 found.quality["noise_found"][cycle, k] = cold.noise
                 found.quality["points_used"][cycle, k] = cold.points.sum()
                 continue
@@ -167,6 +173,17 @@ def _artefact(
             found.reason[cycle, k] = str(error)
             log.warning("cycle %d, artefact %d: %s", cycle, k, error)
     return maps
+
+
+def _coarse(cold: BlockMap, artefact: int) -> list[str]:
+    """Return what to say of points that are too far apart for the relief."""
+    if cold.bending < COARSE * cold.noise:
+        return []
+    return [
+        f"Artefact {artefact + 1}: blocks of 16 points and 4 lines are bent by {cold.bending * 1e6:.1f} um, where the "
+        f"noise is {cold.noise * 1e6:.1f} um; the uncertainty of its registrations may be stated too small. Take points "
+        "and lines closer to one another, or a smoother artefact."
+    ]
 
 
 def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:

@@ -91,6 +91,17 @@ class BlockMap:
         """The surface between the blocks, as a spline."""
         return Surface.through(self.height, self.x, self.y)
 
+    @property
+    def bending(self) -> float:
+        """Standard deviation of a block's points about its plane because the surface is curved, m.
+
+        Beyond 1.5 times the noise the blocks are too large for the surface: what lies between them is not known to the
+        covariance that a registration states.
+        """
+        along_x, along_y = np.diff(self.height, 2, axis=1), np.diff(self.height, 2, axis=0)
+        # x^2 / 2 over a width h has the variance h^4 / 720.
+        return float(np.sqrt((np.mean(along_x**2) + np.mean(along_y**2)) / 720.0))
+
     @cached_property
     def usual_variance(self) -> float:
         """Median variance of a block's height, m^2."""
