@@ -174,6 +174,7 @@ def _pocket(settings: Settings, parameters: Array) -> Array:
     for lift in settings.pocket_lifts:
         # On the rim and on the plate as a profiler at its nominal pose would see them.
         for x, sigma, seen in ((half, layout.edge, "rim"), (half + PLATE, settings.height_noise / 10, "plate")):
+            sides = []
             for side in (-1, 1):
                 there = np.stack([side * x, lines, np.zeros_like(x)], axis=-1)
                 stage = np.stack([np.zeros_like(x), np.zeros_like(x), np.full_like(x, lift)], axis=-1)
@@ -182,6 +183,9 @@ def _pocket(settings: Settings, parameters: Array) -> Array:
                 stage[:, 1] += along
                 p = nominal.inv().apply(there - stage)
                 P = pose.apply(p) + stage
-                way = np.hypot(P[:, 0], P[:, 1]) - parameters[6] if seen == "rim" else P[:, 2]
-                out.append(way / sigma)
+                sides.append(np.hypot(P[:, 0], P[:, 1]) - parameters[6] if seen == "rim" else P[:, 2])
+            left, right = sides
+            # A line that jitters in height takes both sides of the plate along.
+            both = np.hypot(sigma / np.sqrt(2), layout.jitter_z if seen == "plate" else 0.0)
+            out += [(left + right) / 2 / both, (left - right) / np.sqrt(2) / sigma]
     return np.concatenate(out)
