@@ -258,6 +258,14 @@ def test_bench_probe_reads_every_instrument(run: Run, answer: Answer, tmp_path: 
     assert "FAILED: InstrumentError" in table[4]
 
 
+def test_bench_probe_reads_a_profiler_that_waits_for_its_encoder(run: Run) -> None:
+    profiler, control = run("bench", "probe", ROOT / "examples" / "virtual_gantry" / "bench.toml").stdout.splitlines()[
+        2:
+    ]
+    assert profiler.endswith("800 values, 0 known")  # the axis stands between two artefacts
+    assert control.endswith("alarms none")
+
+
 def test_example_is_the_campaign_that_the_demo_runs() -> None:
     for name in ("bench.toml", "campaign.toml"):
         example = ROOT / "examples" / "virtual_cframe" / name
