@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.registration import BlockMap, Registration, prepare, register
 from errormotion.methods.crossbeam_scan.registration.solver import Problem
-from errormotion.methods.crossbeam_scan.strain import FEED
+from errormotion.methods.crossbeam_scan.strain import DRIFT, FEED
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
@@ -181,8 +181,8 @@ def _coarse(cold: BlockMap, artefact: int) -> list[str]:
         return []
     return [
         f"Artefact {artefact + 1}: blocks of 16 points and 4 lines are bent by {cold.bending * 1e6:.1f} um, where the "
-        f"noise is {cold.noise * 1e6:.1f} um; the uncertainty of its registrations may be stated too small. Take points "
-        "and lines closer to one another, or a smoother artefact."
+        f"noise is {cold.noise * 1e6:.1f} um; the uncertainty of its registrations may be stated too small. Take "
+        "points and lines closer to one another, or a smoother artefact."
     ]
 
 
@@ -208,7 +208,7 @@ def _lay(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
     extra: dict[str, float] = {}
     if settings.registration == "height_map":
         if settings.strain != "rigid":
-            extra |= dict.fromkeys(FEED, np.inf)
+            extra |= dict.fromkeys(FEED, DRIFT)
         if settings.scale_uncertainty > 0:
             extra |= dict.fromkeys(("scale_x", "scale_z"), settings.scale_uncertainty)
         if settings.expansion_uncertainty > 0:
@@ -258,7 +258,9 @@ def bound(cold: BlockMap, noise: float, *, with_drift: bool) -> Array:
     J, weight = J[:, :used], cold.points[known] / (2 * noise**2)
     scale = 1 / np.linalg.norm(J, axis=0)
     C = np.zeros((9, 9))
-    C[:used, :used] = np.linalg.inv((J * weight[:, None]).T @ J * np.outer(scale, scale)) * np.outer(scale, scale)
+    information = (J * weight[:, None]).T @ J
+    information[range(6, used), range(6, used)] += DRIFT**-2
+    C[:used, :used] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     return C
 
 
