@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 FEED = ("feed_x", "feed_y", "feed_z")
 """Parameters of the registration that take the drift along a scan."""
 DRIFT = 1e-3
-"""Standard deviation of their prior, 1: a millimetre per metre, far more than any carriage drifts. It is there so that an
-artefact of little relief gives a large uncertainty and no refusal."""
+"""Standard deviation of their prior, 1: a millimetre per metre, far more than any carriage drifts. It is there so that
+an artefact of little relief gives a large uncertainty and no refusal."""
 # Metres and radians of one size, so that the normal equations are well scaled.
 _UNIT = np.array([1e-6] * 3 + [1e-5] * 3)
 # (rotation, displacement, sign): EA = dEZ/dY, EC = -dEX/dY
