@@ -123,13 +123,20 @@ def identify(path: str, strain: str) -> None:
     from errormotion.methods.crossbeam_scan import CrossbeamScan
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-    raw = load(path)
+    raw, hashing = load(path), [0.0]
+    hash_dataset = provenance.hash_dataset
+
+    def timed(ds: xr.Dataset) -> str:
+        begun = time.perf_counter()
+        found = hash_dataset(ds)
+        hashing[0] += time.perf_counter() - begun
+        return found
+
+    provenance.hash_dataset = timed
     before, start, used = peak_memory(), time.perf_counter(), time.process_time()
     errors = CrossbeamScan().identify(raw, Settings(strain=strain))
     answer = {"seconds": time.perf_counter() - start, "processor": time.process_time() - used, "peak": peak_memory()}
-    start = time.perf_counter()
-    provenance.hash_dataset(raw)
-    answer |= {"hash": time.perf_counter() - start, "before": before}
+    answer |= {"hash": hashing[0], "before": before}
     start = time.perf_counter()
     plain_read(raw)
     answer["read"] = time.perf_counter() - start
@@ -159,10 +166,10 @@ def report(variant: str, size: float, answer: dict, campaign: Campaign, tool: np
     truth = campaign.truth[1:] + np.concatenate([lever, np.zeros_like(lever)], axis=1)
     miss = found - truth[:, None]
     print(
-        f"  {variant}: {answer['seconds']:.1f} s wall, {answer['processor']:.1f} s of processors, of which "
-        f"{answer['hash']:.1f} s the hash for the provenance; a plain read of the same takes {answer['read']:.1f} s "
-        f"({size / answer['read']:.2f} GB/s). Peak memory {answer['peak'] / 2**20:.0f} MiB, of which "
-        f"{answer['before'] / 2**20:.0f} MiB before the first scan"
+        f"  {variant}: {answer['seconds']:.1f} s wall, {answer['processor']:.1f} s of processors, "
+        f"{answer['hash']:.1f} s of the wall for the hash of the provenance; a plain read of the same takes "
+        f"{answer['read']:.1f} s ({size / answer['read']:.2f} GB/s). Peak memory {answer['peak'] / 2**20:.0f} MiB, "
+        f"of which {answer['before'] / 2**20:.0f} MiB before the first scan"
     )
     shift, turn = (np.sqrt(np.mean(miss[..., part] ** 2, axis=(0, 1))) for part in (slice(3), slice(3, 6)))
     print(
