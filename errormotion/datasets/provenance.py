@@ -120,11 +120,14 @@ def _blocks(variable: xr.Variable) -> Iterator[bytes]:
     if variable.ndim == 0 or variable.size <= _BLOCK:
         yield _bytes(variable)
         return
-    longest = max(variable.sizes, key=lambda dim: variable.sizes[dim])
-    size = variable.sizes[longest]
-    length = max(1, _BLOCK * size // variable.size)
-    for start in range(0, size, length):
-        yield _bytes(variable.isel({longest: slice(start, start + length)}))
+    # Two dimensions at a time: blocks across all the others would read every stored chunk again and again.
+    for index in np.ndindex(*variable.shape[:-2]):
+        part = variable[index]
+        longest = max(part.sizes, key=lambda dim: part.sizes[dim])
+        size = part.sizes[longest]
+        length = max(1, _BLOCK * size // part.size)
+        for start in range(0, size, length):
+            yield _bytes(part.isel({longest: slice(start, start + length)}))
 
 
 def _bytes(variable: xr.Variable) -> bytes:

@@ -221,6 +221,36 @@ def accumulate_shared(
         )
 
 
+@compiled(inline="always")
+def _gain(a: float, b: float, d: float, k: float, s: float, t: float) -> tuple[float, float, float]:  # pragma: no cover
+    """Return the entries of K = T (k + T C T)^-1 T with C = (a b; b d) and T = diag(s, t)."""
+    first, last, mixed = k + s * s * a, k + t * t * d, s * t * b
+    determinant = first * last - mixed * mixed
+    return s * s * last / determinant, -s * t * mixed / determinant, t * t * first / determinant
+
+
+@compiled()
+def line_gains(C: Array, k: float, s: float, t: float) -> Array:  # pragma: no cover - compiled
+    """Return what takes the sums of every line to its effects, (line, 2, 2); ``s``, ``t``: their deviations."""
+    K = np.empty(C.shape)
+    for row in range(len(C)):
+        K[row, 0, 0], K[row, 0, 1], K[row, 1, 1] = _gain(C[row, 0, 0], C[row, 0, 1], C[row, 1, 1], k, s, t)
+        K[row, 1, 0] = K[row, 0, 1]
+    return K
+
+
+@compiled()
+def line_moments(C: Array, u: Array, k: float, s: float, t: float) -> Array:  # pragma: no cover - compiled
+    """Return the sum over lines of the squared effects that their sums u (line, 2) let expect, (2,)."""
+    total = np.zeros(2)
+    for row in range(len(C)):
+        K00, K01, K11 = _gain(C[row, 0, 0], C[row, 0, 1], C[row, 1, 1], k, s, t)
+        first, last = K00 * u[row, 0] + K01 * u[row, 1], K01 * u[row, 0] + K11 * u[row, 1]
+        total[0] += first * first + k * K00
+        total[1] += last * last + k * K11
+    return total
+
+
 @compiled(fastmath=FAST)
 def lag_sums(
     residual: Array, weight: Array, lags: int, sums: Array, pairs: Array

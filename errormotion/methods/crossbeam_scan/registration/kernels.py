@@ -30,6 +30,9 @@ _GATE = 4.5
 # Scatter of a good block, in units of the usual: 61 degrees of freedom scatter by 0.18, curvature adds some 0.2.
 _LIMIT = 2.0
 _BAD_BLOCK = 4.0
+# Blocks of a row that tell its scale.
+_OF_ROW = 16
+_OFF = 1.3
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
@@ -252,6 +255,42 @@ def _block_sums(
         sums[0, column], sums[1, column], sums[2, column], sums[3, column] = S0, S1, S2, SS
 
 
+@compiled()
+def _row_scale(
+    z: NDArray[np.float32],
+    r0: int,
+    dx: Array,
+    dy: Array,
+    sums: NDArray[np.float32],
+    Sxx: float,
+    Syy: float,
+    scale: float,
+    room: Array,
+) -> float:  # pragma: no cover - compiled
+    """Return the scale of a row of blocks: a line that is off as a whole is no outlier in some of its blocks.
+
+    Where a quarter of the blocks scatters too much, the median of what some of them scatter by robustly, if that is
+    more than ``scale`` by what a few blocks leave open.
+    """
+    blocks = sums.shape[1]
+    limit, bad = _LIMIT * scale * scale * (POINTS - 3), 0
+    for column in range(blocks):
+        S0, S1, S2 = np.float64(sums[0, column]), np.float64(sums[1, column]), np.float64(sums[2, column])
+        if not np.float64(sums[3, column]) - S0 * S0 / POINTS - S1 * S1 / Sxx - S2 * S2 / Syy < limit:
+            bad += 1
+    if 4 * bad < blocks:
+        return scale
+    step = max(1, blocks // _OF_ROW)
+    found, scales = 0, np.empty(blocks)
+    for column in range(step // 2, blocks, step):
+        mad = _robust_plane(z, r0, column * COLUMNS, dx, dy, room)[4]
+        if mad == mad:
+            scales[found] = mad
+            found += 1
+    own = _median(scales, found) if found > 0 else scale
+    return own if own > _OFF * scale else scale
+
+
 @compiled(fastmath=FAST)
 def _reduce_row(
     z: NDArray[np.float32], row: int, dx: Array, y: Array, scale: float, out: Array
@@ -275,6 +314,8 @@ def _reduce_row(
     r0 = row * ROWS
     sums = np.empty((4, bx), np.float32)
     _block_sums(z, r0, dx4, y4, sums)
+    scale = _row_scale(z, r0, dx, y, sums, Sxx, Syy, scale, room)
+    limit = _LIMIT * scale * scale * (POINTS - 3)
     for column in range(bx):
         c0 = column * COLUMNS
         base = z[r0 + 1, c0 + 7]

@@ -25,7 +25,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
-from errormotion.methods.crossbeam_scan.registration.comparison import accumulate, accumulate_shared, lag_sums
+from errormotion.methods.crossbeam_scan.registration.comparison import (
+    accumulate,
+    accumulate_shared,
+    lag_sums,
+    line_gains,
+    line_moments,
+)
 from errormotion.methods.crossbeam_scan.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.registration.freedoms import scales
 
@@ -178,10 +184,7 @@ class Noise:
 
     def gains(self, A: Array) -> Array:
         """Return K of every row, (row, 2, 2)."""
-        T = np.diag(self.tau)
-        C = A[:, LINE][:, :, LINE]
-        K: Array = T @ np.linalg.solve(self.k * np.eye(2) + T @ C @ T, np.broadcast_to(T, C.shape))
-        return K
+        return line_gains(np.ascontiguousarray(A[:, LINE][:, :, LINE]), self.k, *self.tau)
 
 
 def normal_equations(sums: Sums, noise: Noise) -> tuple[Array, Array]:
@@ -250,10 +253,7 @@ def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: boo
 def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     """Return the standard deviations of the line effects after some steps of expectation and maximisation."""
     for _ in range(_EM_STEPS):
-        T = np.diag(tau)
-        K = T @ np.linalg.solve(k * np.eye(2) + T @ C @ T, np.broadcast_to(T, C.shape))
-        effects = np.einsum("rij,rj->ri", K, u)
-        tau = np.sqrt(np.mean(effects**2 + k * K.diagonal(axis1=1, axis2=2), axis=0))
+        tau = np.sqrt(line_moments(C, u, k, *tau) / len(u))
     return tau
 
 
