@@ -31,7 +31,7 @@ _GATE = 4.5
 _LIMIT = 2.0
 _BAD_BLOCK = 4.0
 # Blocks of a row that tell its scale.
-_OF_ROW = 16
+_OF_ROW = 6
 _OFF = 1.3
 
 
