@@ -30,8 +30,8 @@ _GATE = 4.5
 # Scatter of a good block, in units of the usual: 61 degrees of freedom scatter by 0.18, curvature adds some 0.2.
 _LIMIT = 2.0
 _BAD_BLOCK = 4.0
-# Blocks of a row that tell its scale.
-_OF_ROW = 6
+# Blocks of a row that tell its scale: a few at first, and more where these say that it is another one.
+_FEW_OF_ROW, _OF_ROW = 6, 16
 _OFF = 1.3
 
 
@@ -280,15 +280,18 @@ def _row_scale(
             bad += 1
     if 4 * bad < blocks:
         return scale
-    step = max(1, blocks // _OF_ROW)
-    found, scales = 0, np.empty(blocks)
-    for column in range(step // 2, blocks, step):
-        mad = _robust_plane(z, r0, column * COLUMNS, dx, dy, room)[4]
-        if mad == mad:
-            scales[found] = mad
-            found += 1
-    own = _median(scales, found) if found > 0 else scale
-    return own if own > _OFF * scale else scale
+    scales, own = np.empty(blocks), scale
+    for looked_at in (_FEW_OF_ROW, _OF_ROW):
+        step, found = max(1, blocks // looked_at), 0
+        for column in range(step // 2, blocks, step):
+            mad = _robust_plane(z, r0, column * COLUMNS, dx, dy, room)[4]
+            if mad == mad:
+                scales[found] = mad
+                found += 1
+        own = _median(scales, found) if found > 0 else scale
+        if not own > _OFF * scale:
+            return scale
+    return own
 
 
 @compiled(fastmath=FAST)
