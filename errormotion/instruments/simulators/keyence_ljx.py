@@ -119,6 +119,8 @@ class SimulatedLJX(SimulatedDevice):
                 return
             frame, self._buffer = self._buffer[:size], self._buffer[size:]
             self.reply(self.answer(frame))
+            if self._stream is not None and self._stream.ident is None:
+                self._stream.start()  # after the answer: a stream that breaks at once must not swallow it
 
     def reply(self, data: bytes) -> None:
         """Send an answer; garbage comes in the stream only."""
@@ -196,7 +198,6 @@ class SimulatedLJX(SimulatedDevice):
             return NOT_NOW
         self._ended.clear()
         self._stream = threading.Thread(target=self._run, args=(layout,), name=f"sim-{self.name}-profiles", daemon=True)
-        self._stream.start()
         return 0
 
     @property
@@ -206,7 +207,8 @@ class SimulatedLJX(SimulatedDevice):
     def _join(self) -> None:
         stream, self._stream = self._stream, None
         if stream is not None and stream is not threading.current_thread():
-            stream.join()
+            if stream.ident is not None:
+                stream.join()
             self._position += self._taken or self._sent
             self._sent = 0
 
