@@ -406,6 +406,18 @@ def test_silence_in_a_stream_is_a_timeout_error_and_the_profiler_is_lost_until_o
         assert profiler.identify().manufacturer == "Keyence"
 
 
+def test_a_start_that_is_answered_late_is_answered_before_the_stream_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = SimulatedLJX.reply
+
+    def late(simulator: SimulatedLJX, data: bytes) -> None:
+        time.sleep(0.05)  # in which an unanswered stream would send its 50 profiles and fall silent
+        at_once(simulator, data)
+
+    monkeypatch.setattr(SimulatedLJX, "reply", late)
+    with pytest.raises(InstrumentTimeoutError, match=r"no data for 0\.5 s"):
+        session(SMALL + "&fault=silence&fault_at=50", settings=FAST)
+
+
 def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() -> None:
     profiler = KeyenceLJX(SMALL + "&fault=disconnect&fault_at=50", FAST)
     for _ in range(2):
