@@ -54,7 +54,7 @@ def load(path: str | Path) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        NetCDF-4 file or Zarr folder.
+        NetCDF-4 file or Zarr folder; or ``.csv``, as `errormotion.datasets.readings_csv` reads it.
 
     Returns
     -------
@@ -66,6 +66,10 @@ def load(path: str | Path) -> xr.Dataset:
         Nothing there, no permission, not a dataset, or truncated.
     """
     path = Path(path)
+    if path.suffix.lower() == ".csv":
+        from errormotion.datasets.readings_csv import read_csv
+
+        return read_csv(path)
     engine = _engine_of(path)
     with _reading(path):
         if engine == "h5netcdf":

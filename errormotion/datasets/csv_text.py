@@ -1,0 +1,91 @@
+"""A text file with header lines and tables, taken apart: what each line says is for others to judge."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from errormotion.errors import DatasetError
+
+_KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Lines between empty ones: the header line and those below it, each with its number."""
+
+    head: tuple[int, list[str]]
+    rows: list[tuple[int, list[str]]]
+
+
+def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
+    """Take a text file apart.
+
+    Parameters
+    ----------
+    path : Path
+        UTF-8 text; fields are separated by tabulator, semicolon or comma, whichever the first line of a table has.
+
+    Returns
+    -------
+    dict of str to (int, str)
+        Line and text of each ``# key = text``.
+    list of Table
+        Tables have empty lines between them.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read or split, a key comes twice, or there is no table.
+    """
+    header: dict[str, tuple[int, str]] = {}
+    parts: list[list[tuple[int, str]]] = [[]]
+    for number, line in enumerate(_lines(path), 1):
+        # A spreadsheet fills every line up with separators, and may put one with commas in quotes.
+        bare = line.strip().strip('",;\t ')
+        if bare.startswith("#"):
+            match = _KEY.fullmatch(bare)
+            if match and match[1] in header:
+                before = header[match[1]][0]
+                raise DatasetError(f"{path}, line {number}: '{match[1]}' comes again; line {before} has it already")
+            if match:
+                header[match[1]] = (number, match[2].strip())
+        elif bare:
+            parts[-1].append((number, line))
+        elif parts[-1]:
+            parts.append([])
+    tables = [_split(path, block) for block in parts if block]
+    if not tables:
+        raise DatasetError(f"{path}: expected a line of column names and lines of readings; found none")
+    return header, tables
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise DatasetError(f"{path}: is UTF-16; expected UTF-8. Save it as 'CSV UTF-8'")
+    try:
+        return data.decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise DatasetError(
+            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as 'CSV UTF-8'"
+        ) from error
+
+
+def _split(path: Path, block: list[tuple[int, str]]) -> Table:
+    first = block[0][1]
+    delimiter = next((sign for sign in "\t;" if sign in first), ",")
+    rows = []
+    for number, line in block:
+        try:
+            (fields,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True)
+        except csv.Error as error:
+            raise DatasetError(f"{path}, line {number}: cannot be split into fields: {error}") from error
+        rows.append((number, [text.strip() for text in fields]))
+    return Table(rows[0], rows[1:])
