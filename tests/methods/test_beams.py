@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
+from errormotion.kinematics.beams import across
 from errormotion.methods.spindle_drift.beams import (
-    across,
     circles_and_line,
     fisher_bound,
     likelihood_fit,

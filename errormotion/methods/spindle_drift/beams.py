@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from errormotion.errors import MethodError
+from errormotion.kinematics.beams import across, turned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,13 +60,6 @@ class Beam:
     left_out: NDArray[np.int64]
 
 
-def across(direction: Array) -> Array:
-    """Return two unit vectors (2, 3) that span the plane across a direction."""
-    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)])
-
-
 def sphere_reading(origin: Array, direction: Array, centre: Array, radius: float) -> tuple[Array, Array]:
     """Return the readings (...,), m, of a beam on spheres at ``centre`` (..., 3), NaN for a miss, and their Jacobian.
 
@@ -80,11 +74,6 @@ def sphere_reading(origin: Array, direction: Array, centre: Array, radius: float
     gain = -1.0 / (n @ direction)
     jacobian = np.concatenate([n, (n @ across(direction).T) * reading[..., None]], axis=-1) * gain[..., None]
     return reading, jacobian
-
-
-def _turn(direction: Array, angles: Array) -> Array:
-    turned = direction + angles @ across(direction)
-    return np.asarray(turned / np.linalg.norm(turned))
 
 
 def likelihood_fit(
@@ -178,7 +167,7 @@ def _gauss_newton(
             break
         step, *_ = np.linalg.lstsq(jacobian[meets], (distance - model)[meets])
         origin = origin + step[:3]
-        direction = _turn(direction, np.asarray(step[3:], np.float64))
+        direction = turned(direction, np.asarray(step[3:], np.float64))
         if np.abs(step[:3]).max() < 1e-13 and np.abs(step[3:]).max() < 1e-11:
             model, jacobian = sphere_reading(origin, direction, centre, radius)
             if np.isfinite(model[used]).all():

@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import cross_matrix
+from errormotion.kinematics.beams import beam_errors
 from errormotion.methods.spindle_drift.beams import Beam, circles_and_line, likelihood_fit
 from errormotion.methods.spindle_drift.segmentation import scan_seconds, segment_steps
 
@@ -23,15 +23,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_ALONG = np.cos(np.radians(1e-4))
-
 
 def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
     """Return an error dataset of component ``beam``: what each beam is, minus what it was meant to be.
 
-    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation that takes the nominal direction to the
-    actual one, about that beam's zero point. The rotation of a beam about itself is not seen: NaN where the nominal
-    beam lies along an axis; elsewhere the smallest rotation stands for it.
+    Each beam's errors are stated about its own zero point; see `beam_errors` for their meaning.
 
     Raises
     ------
@@ -64,7 +60,13 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         if len(beam.left_out):
             places = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
             notes.append(f"{name}: {len(beam.left_out)} readings left out as outliers: {places}.")
-    errors, covariance = beam_errors(origin0, direction0, found)
+    errors, covariance = beam_errors(
+        origin0,
+        direction0,
+        np.array([b.origin for b in found]),
+        np.array([b.direction for b in found]),
+        np.array([b.covariance for b in found]),
+    )
     for note in notes:
         log.warning(note)
     beam_axis, axis = ("beam", names), ("direction", list("xyz"))
@@ -144,26 +146,3 @@ def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Datas
         except MethodError as error:
             notes.append(f"{place}: {error}")
     return raw.drop_dims("sample").assign(distance=(("channel", "profile", "step"), means, {"units": "m"}))
-
-
-def beam_errors(origin0: Array, direction0: Array, found: list[Beam]) -> tuple[Array, Array]:
-    """Return the errors (beam, 6) of beams against nominal ones, and their covariance (beam, 6, 6)."""
-    errors = np.empty((len(found), 6))
-    covariance = np.empty((len(found), 6, 6))
-    for i, (p0, u0, beam) in enumerate(zip(origin0, direction0, found, strict=True)):
-        sine = np.cross(u0, beam.direction)
-        cosine = float(u0 @ beam.direction)
-        if cosine <= 0:
-            raise MethodError("A detected beam points away from its nominal direction: check the nominal directions.")
-        size = float(np.linalg.norm(sine))
-        errors[i, :3] = beam.origin - p0
-        errors[i, 3:] = sine * (np.arctan2(size, cosine) / size if size > 0 else 1.0)
-        # d(u0 x u) = [u0] du; the angle's stretch is 1 to second order in a few mrad.
-        chart = np.zeros((6, 6))
-        chart[:3, :3] = np.eye(3)
-        chart[3:, 3:] = cross_matrix(u0)
-        covariance[i] = chart @ beam.covariance @ chart.T
-        along = int(np.argmax(np.abs(u0)))
-        if abs(u0[along]) >= _ALONG:
-            errors[i, 3 + along] = np.nan
-    return errors, covariance

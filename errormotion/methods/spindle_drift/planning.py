@@ -9,8 +9,8 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.schemas import CHANNELS
-from errormotion.methods.spindle_drift.beams import Beam, fisher_bound
-from errormotion.methods.spindle_drift.detection import beam_errors
+from errormotion.kinematics.beams import beam_errors
+from errormotion.methods.spindle_drift.beams import fisher_bound
 from errormotion.methods.spindle_drift.scanning import machine_axes
 
 if TYPE_CHECKING:
@@ -42,12 +42,7 @@ def _frame(settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _plan_beams(method: SpindleDrift, settings: Settings) -> xr.Dataset:
     origin, direction, bounds = _frame(settings)
-    none = np.zeros((0, 2), np.int64)
-    found = [
-        Beam(o, u, c, settings.layout.step_noise, np.zeros((0, 0)), none)
-        for o, u, c in zip(origin, direction, bounds, strict=True)
-    ]
-    errors, covariance = beam_errors(origin, direction, found)
+    errors, covariance = beam_errors(origin, direction, origin, direction, bounds)
     return build_errors(
         errors,
         covariance,

@@ -14,8 +14,8 @@ import xarray as xr
 
 from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import InstrumentError, MethodError
+from errormotion.kinematics.beams import across
 from errormotion.methods.spindle_drift.acquisition import HAND_OVER_SECONDS, SCHEMA
-from errormotion.methods.spindle_drift.beams import across
 from errormotion.methods.spindle_drift.segmentation import scan_seconds
 from errormotion.plugins import Bench
 

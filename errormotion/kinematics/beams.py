@@ -1,0 +1,182 @@
+"""Directions of beams: how far one is off its nominal, and how a surface lies to it.
+
+A beam starts at its zero point, where the reading is 0, and goes along a unit vector u towards the target. A surface
+with unit normal N (towards the sensor, N.u < 0) is inclined to it by alpha, the angle between -u and N. The azimuth of
+that tilt about the beam, counted from the plane of triangulation (emitted and received beam), is the rotation beta.
+Both together are the tilt vector
+
+    q = tan(alpha) (cos beta, sin beta) = (N.e1, N.e2) / (-N.u),    e1 = t x u / |t x u|,   e2 = u x e1,
+
+t the normal of the plane of triangulation. q has no pole where the beam meets the surface at right angles. What is
+published as a sensor's deflection is no third freedom: whatever way the sensor was turned, u, t and N say alpha, beta.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.errors import MethodError
+from errormotion.kinematics.twists import cross_matrix
+
+__all__ = [
+    "across",
+    "beam_errors",
+    "inclination_rotation",
+    "rotation_between",
+    "tilt",
+    "tilt_vector",
+    "turned",
+]
+
+Array = NDArray[np.float64]
+
+_ALONG = np.cos(np.radians(1e-4))
+"""Cosine from which a direction counts as lying along an axis."""
+_IN_LINE = 1e-6
+"""Sine of the angle below which a triangulation normal lies along the beam."""
+
+
+def across(direction: Array) -> Array:
+    """Return two unit vectors (2, 3) that span the plane across a direction (3,)."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(direction, first)])
+
+
+def turned(direction: Array, angles: Array) -> Array:
+    """Return the unit vector (3,) that lies off ``direction`` by two small angles (2,), rad, along ``across`` of it."""
+    there = direction + angles @ across(direction)
+    return np.asarray(there / np.linalg.norm(there))
+
+
+def rotation_between(nominal: ArrayLike, actual: ArrayLike) -> Array:
+    """Return the smallest rotation (..., 3), rad, as a vector, that takes one unit vector (..., 3) to the other.
+
+    Where they oppose one another every axis across them would do, and the result is NaN.
+    """
+    u0, u = np.asarray(nominal, float), np.asarray(actual, float)
+    sine = np.cross(u0, u)
+    size, cosine = np.linalg.norm(sine, axis=-1), np.sum(u0 * u, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        stretch = np.where(size > 0, np.arctan2(size, cosine) / size, np.where(cosine > 0, 1.0, np.nan))
+    return np.asarray(sine * stretch[..., None])
+
+
+def beam_errors(
+    nominal_origin: ArrayLike,
+    nominal_direction: ArrayLike,
+    origin: ArrayLike,
+    direction: ArrayLike,
+    covariance: ArrayLike,
+) -> tuple[Array, Array]:
+    """Return the errors of beams against their nominal ones, and the covariance of these errors.
+
+    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation that takes the nominal direction to the
+    actual one, about that beam's zero point. The rotation of a beam about itself is not seen: NaN where the nominal
+    beam lies along an axis; elsewhere the smallest rotation stands for it.
+
+    Parameters
+    ----------
+    nominal_origin, nominal_direction, origin, direction : array_like (beam, 3)
+        m and unit vectors; NaN in an origin that is not known.
+    covariance : array_like (beam, 6, 6)
+        Of (origin, direction), SI.
+
+    Returns
+    -------
+    errors : ndarray (beam, 6)
+        m and rad.
+    covariance : ndarray (beam, 6, 6)
+
+    Raises
+    ------
+    MethodError
+        A beam that points away from its nominal direction.
+    """
+    p0, u0, p, u = (np.asarray(part, float) for part in (nominal_origin, nominal_direction, origin, direction))
+    cosine = np.sum(u0 * u, axis=-1)
+    if (cosine <= 0).any():
+        raise MethodError("A detected beam points away from its nominal direction: check the nominal directions.")
+    errors = np.concatenate([p - p0, rotation_between(u0, u)], axis=-1)
+    chart = np.zeros((len(u), 6, 6))
+    chart[:, :3, :3] = np.eye(3)
+    chart[:, 3:, 3:] = _turning_by_direction(u0, u)
+    moved = chart @ np.nan_to_num(np.asarray(covariance, float)) @ np.swapaxes(chart, -1, -2)
+    along = np.abs(u0) >= _ALONG
+    errors[:, 3:][along] = np.nan
+    unseen = np.isnan(errors)
+    return errors, np.where(unseen[:, :, None] | unseen[:, None, :], np.nan, moved)
+
+
+def _turning_by_direction(u0: Array, u: Array) -> Array:
+    """Return the derivative (..., 3, 3) of `rotation_between` by the actual direction."""
+    sine = np.cross(u0, u)
+    size, cosine = np.linalg.norm(sine, axis=-1), np.sum(u0 * u, axis=-1)
+    angle = np.arctan2(size, cosine)
+    small = angle < 1e-3
+    s = np.where(small, 1.0, size)
+    stretch = np.where(small, 1 + angle**2 / 6, angle / s)
+    # d(angle / sin angle) / d(cos angle)
+    change = np.where(small, -1 / 3, -(s - angle * cosine) / s**3)
+    return np.asarray(
+        stretch[..., None, None] * cross_matrix(u0) + change[..., None, None] * sine[..., :, None] * u0[..., None, :]
+    )
+
+
+def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) -> Array:
+    """Return how surfaces lie to a beam, as tilt vectors.
+
+    Parameters
+    ----------
+    beam : array_like (3,)
+        Unit vector from the sensor to the target.
+    triangulation_normal : array_like (3,)
+        Unit normal of the plane that holds emitted and received beam; what of it lies along the beam does not matter.
+    normal : array_like (..., 3)
+        Unit normals of the surfaces, towards the sensor.
+
+    Returns
+    -------
+    ndarray (..., 2)
+        q = tan(alpha) (cos beta, sin beta); NaN where the beam does not meet the surface's outside.
+
+    Raises
+    ------
+    MethodError
+        The triangulation normal lies along the beam.
+    """
+    u, t, N = (np.asarray(part, float) for part in (beam, triangulation_normal, normal))
+    first = np.cross(t, u)
+    size = np.linalg.norm(first)
+    if not size > _IN_LINE:
+        raise MethodError(
+            "The triangulation normal lies along the beam; expected the normal of the plane that holds the emitted and "
+            "the received beam, so across the beam."
+        )
+    e1 = first / size
+    e2 = np.cross(u, e1)
+    facing = -(N @ u)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = np.stack([N @ e1, N @ e2], axis=-1) / facing[..., None]
+    return np.where((facing > 0)[..., None], q, np.nan)
+
+
+def inclination_rotation(q: ArrayLike) -> tuple[Array, Array]:
+    """Return inclination in [0, pi/2) and rotation in [0, 2 pi), rad, of tilt vectors (..., 2).
+
+    Where the beam meets the surface at right angles the rotation is 0.
+    """
+    q = np.asarray(q, float)
+    alpha = np.arctan(np.hypot(q[..., 0], q[..., 1]))
+    beta = np.mod(np.arctan2(q[..., 1], q[..., 0]), 2 * np.pi)
+    return alpha, np.where(beta >= 2 * np.pi, 0.0, beta)
+
+
+def tilt_vector(inclination: ArrayLike, rotation: ArrayLike) -> Array:
+    """Return tilt vectors (..., 2) of inclinations and rotations, rad.
+
+    A negative inclination is the same tilt turned by half a turn: data given over -45..45 deg need no other handling.
+    """
+    alpha, beta = np.asarray(inclination, float), np.asarray(rotation, float)
+    return np.asarray(np.tan(alpha)[..., None] * np.stack(np.broadcast_arrays(np.cos(beta), np.sin(beta)), axis=-1))
