@@ -16,6 +16,7 @@ from errormotion.twin import crossbeam as crossbeams
 from errormotion.twin import frame as frames
 from errormotion.twin import rawdata, truth
 from errormotion.twin.artefacts import Artefact, circular_pocket, swept
+from errormotion.twin.beam_rawdata import BeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.profiler import Profiler
@@ -30,10 +31,10 @@ SPIN_UP_TIME = 0.75
 #: sensors count as warm when they have been on for this time, s
 WARM_AFTER = 4 * 3600.0
 
-_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "crossbeam"))}
+_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor"))}
 
 
-class VirtualMachine:
+class VirtualMachine(BeamMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
@@ -70,6 +71,8 @@ class VirtualMachine:
         The 21 geometric errors.
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
+    point_sensor, sine_gauge, check_bar
+        A point sensor on the stage and what it looks at: see `BeamMeasurements`, also for the measurements with them.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -89,6 +92,7 @@ class VirtualMachine:
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
         self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
         self.crossbeam: crossbeams.Crossbeam = crossbeams.seeded_crossbeam(self._rng("crossbeam"), self.travel["Y"])
+        self._set_up_point_sensor(self._rng("point_sensor"))
         self._sensing = self._sense()
 
     def __repr__(self) -> str:

@@ -1,0 +1,168 @@
+"""A point laser sensor on the machine's stage: where its beam is meant to be, where it is, and what it reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.kinematics.beams import tilt, turned
+from errormotion.twin.planes import Target
+from errormotion.twin.triangulation import Optics, key_of, speckle
+
+Array = NDArray[np.float64]
+
+#: place of the zero point while the stage stands at 0, by the drawing, m
+NOMINAL_ORIGIN = (0.05, 0.0, -0.08)
+#: how the beam leans away from -Z, by the drawing, rad
+NOMINAL_LEAN = np.radians(20.0)
+#: how far the beam is off the drawing: zero point in each direction, m; direction, rad; about itself, rad (one sigma)
+OFF_ORIGIN, OFF_DIRECTION, OFF_ROLL = 0.1e-3, np.radians(0.3), np.radians(0.5)
+
+
+@dataclass(frozen=True)
+class PointSensor:
+    """A beam from a zero point along a direction; a reading d puts a surface point at origin + stage + d direction.
+
+    Depth counts from the zero point as a reading does, but is true.
+
+    Attributes
+    ----------
+    nominal_origin, nominal_direction, nominal_triangulation_normal : ndarray, (3,)
+        By the drawing: where the reading is 0 while the stage stands at 0, m; from the sensor to the target, unit;
+        normal of the plane of emitted and received beam, unit.
+    true_origin, true_direction, triangulation_normal : ndarray, (3,)
+        As they are.
+    range : (low, high)
+        Depths that the sensor sees, m.
+    optics : Optics
+        What the tilt of the surface does.
+    noise : float
+        White noise of one reading, m (one sigma).
+    speckle, speckle_length : float
+        What the surface's texture does to a reading, m (one sigma), and the way of the sensor over it on which that
+        loses its correlation, m.
+    warm_up, warm_up_time : float
+        Rise of the reading after switching on, m, and its time constant, s.
+    """
+
+    nominal_origin: Array
+    nominal_direction: Array
+    nominal_triangulation_normal: Array
+    true_origin: Array
+    true_direction: Array
+    triangulation_normal: Array
+    range: tuple[float, float] = (-10e-3, 10e-3)
+    optics: Optics = field(default_factory=Optics)
+    noise: float = 0.1e-6
+    speckle: float = 0.3e-6
+    speckle_length: float = 50e-6
+    warm_up: float = 10.5e-6
+    warm_up_time: float = 1440.0
+
+    @property
+    def mid_range(self) -> float:
+        """Depth at which the tilt of the surface does nothing, m."""
+        return (self.range[0] + self.range[1]) / 2
+
+    def from_start(self, measuring_range: float) -> PointSensor:
+        """Return the same beam as a sensor with another range sees it, which counts from the start of its range, m."""
+        shift = self.mid_range - measuring_range / 2
+        return replace(
+            self,
+            nominal_origin=self.nominal_origin + shift * self.nominal_direction,
+            true_origin=self.true_origin + shift * self.true_direction,
+            range=(0.0, measuring_range),
+        )
+
+    def slope(self, q: ArrayLike) -> Array:
+        """Return the error of the reading per depth from mid-range at tilt vectors (..., 2), 1; NaN where unseen."""
+        return self.optics.slope(q)
+
+    def still(self, target: Target, stage: Array, *, inclination_error: bool = True, beyond: bool = False) -> Array:
+        """Return what the warm sensor reads without noise and speckle.
+
+        Parameters
+        ----------
+        target : Plane or CheckBar
+            What it looks at.
+        stage : ndarray, (n, 3)
+            Places of the stage, m.
+        inclination_error : bool
+            Whether the tilt of the surface matters.
+        beyond : bool
+            Whether a surface before or behind the range reads as minus or plus infinity, and not as NaN.
+
+        Returns
+        -------
+        ndarray, (n,)
+            m; NaN out of range, where the beam misses, and where no light comes back.
+        """
+        depth, normals = target.meet(self.true_origin + stage, self.true_direction)
+        slope = self.slope(tilt(self.true_direction, self.triangulation_normal, normals))
+        reading = depth + (depth - self.mid_range) * (slope if inclination_error else 0.0 * slope)
+        low, high = self.range
+        with np.errstate(invalid="ignore"):
+            reading = np.where(depth < low, -np.inf, np.where(depth > high, np.inf, reading))
+        reading = np.where(np.isnan(slope), np.nan, reading)
+        return reading if beyond else np.where(np.isinf(reading), np.nan, reading)
+
+    def speckles(self, key: tuple[int, ...], stage: Array) -> Array:
+        """Return what the texture of a target adds to the readings at stage places (n, 3), m, shape (n,).
+
+        Parameters
+        ----------
+        key : tuple of int
+            Another target, another texture.
+        stage : ndarray, (n, 3)
+            The sensor's way over the target, m, whether across it or towards it.
+        """
+        return self.speckle * speckle(key_of(*key), stage, self.speckle_length)
+
+    def warm_up_offset(self, since_on: ArrayLike) -> Array:
+        """Return what the readings lack of their settled value, m (not positive)."""
+        return np.asarray(-self.warm_up * np.exp(-np.asarray(since_on, dtype=float) / self.warm_up_time))
+
+
+def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, azimuth: float = 0.0) -> PointSensor:
+    """Return a sensor whose beam is off its drawing by about 0.1 mm and 0.3 deg.
+
+    Parameters
+    ----------
+    rng : Generator
+        Which individual.
+    lean : float
+        Angle of the nominal beam to -Z, rad.
+    azimuth : float
+        In which direction it leans, rad; 0 = towards +X.
+    """
+    towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    nominal = np.sin(lean) * towards - np.cos(lean) * np.array([0.0, 0.0, 1.0])
+    plane = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    origin = np.array(NOMINAL_ORIGIN)
+    direction = turned(nominal, OFF_DIRECTION * _limited(rng, 2))
+    rolled = plane - (plane @ direction) * direction
+    rolled /= np.linalg.norm(rolled)
+    rolled = rolled + OFF_ROLL * float(_limited(rng, 1)[0]) * np.cross(direction, rolled)
+    optics = Optics(
+        roughness=float(rng.uniform(0.5, 0.6)),
+        glossy=float(rng.uniform(0.3, 0.4)),
+        defocus=float(rng.uniform(0.33, 0.39)),
+        scale=float(rng.uniform(-1e-4, 1e-4)),
+    )
+    return PointSensor(
+        nominal_origin=origin,
+        nominal_direction=nominal,
+        nominal_triangulation_normal=plane,
+        true_origin=origin + OFF_ORIGIN * _limited(rng, 3),
+        true_direction=direction,
+        triangulation_normal=rolled / np.linalg.norm(rolled),
+        optics=optics,
+        warm_up=10.5e-6 * float(rng.uniform(0.95, 1.05)),
+    )
+
+
+def _limited(rng: np.random.Generator, n: int) -> Array:
+    """Return normal numbers that keep within 2."""
+    return np.clip(rng.normal(size=n), -2.0, 2.0)

@@ -1,0 +1,144 @@
+"""What laser triangulation does to a reading: the surface's tilt, and its speckle.
+
+The receiving lens has an aperture. A surface that is tilted scatters unevenly into it, so that the light's centre of
+gravity in the aperture shifts, and with it the angle under which the sensor believes to look. Out of focus that moves
+the image: in proportion to the depth, not at all at mid-range.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.twin import kernels
+
+Array = NDArray[np.float64]
+
+#: rings of places in the aperture: radius as a share of the aperture's, number of places, weight of each
+_RINGS = ((0.0, 1, 1.0), (0.55, 6, 1.2), (0.9, 12, 1.0))
+#: cosine between surface normal and received beam below which the receiver gets no light
+_LEAST_COSINE = 0.02
+#: waves that make a speckle field
+_WAVES = 256
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The receiving side of a sensor, and how the surface scatters.
+
+    Attributes
+    ----------
+    triangulation_angle : float
+        Between emitted and received beam, rad; the receiver lies where a surface of rotation 180 deg inclines to.
+    aperture : float
+        Half angle of the receiving lens as seen from the spot, rad.
+    roughness : float
+        Slope of the facets of the surface, root mean square, 1.
+    glossy : float
+        Share of the light that these facets reflect; the rest scatters evenly (Lambert).
+    defocus : float
+        Relative error of the reading per radian by which the light's centre shifts in the aperture, 1.
+    scale : float
+        Relative error of the reading at right angles, 1.
+    steepest : float
+        Inclination beyond which the sensor sees nothing, rad.
+    """
+
+    triangulation_angle: float = np.radians(28.0)
+    aperture: float = np.radians(9.0)
+    roughness: float = 0.55
+    glossy: float = 0.35
+    defocus: float = 0.36
+    scale: float = 0.0
+    steepest: float = np.radians(75.0)
+
+    def slope(self, q: ArrayLike) -> Array:
+        """Return the error of the reading per depth from mid-range, 1.
+
+        Parameters
+        ----------
+        q : (..., 2)
+            Tilt vector, see `errormotion.kinematics.beams.tilt`.
+
+        Returns
+        -------
+        ndarray, (...)
+            NaN where the sensor does not see the surface.
+        """
+        tilts = np.asarray(q, dtype=float)
+        steep = np.hypot(tilts[..., 0], tilts[..., 1])
+        with np.errstate(invalid="ignore"):
+            seen = (steep <= np.tan(self.steepest)) & (self._receiver_cosine(tilts, steep) > _LEAST_COSINE)
+        shift = self._light_centre(np.where(seen[..., None], tilts, 0.0)) - self._light_centre(np.zeros(2))
+        return np.where(seen, self.scale + self.defocus * shift, np.nan)
+
+    def _receiver_cosine(self, q: Array, steep: Array) -> Array:
+        sine, cosine = np.sin(self.triangulation_angle), np.cos(self.triangulation_angle)
+        return np.asarray((cosine - sine * q[..., 0]) / np.hypot(1.0, steep))
+
+    def _light_centre(self, q: Array) -> Array:
+        """Return where in the aperture the light's centre is, towards the emitted beam, rad.
+
+        In coordinates (in the triangulation plane, across it, towards the sensor) of the emitted beam.
+        """
+        sine, cosine = np.sin(self.triangulation_angle), np.cos(self.triangulation_angle)
+        along, across, weight = _aperture(self.aperture)
+        received = np.array([-sine, 0.0, cosine]) + along[:, None] * np.array([cosine, 0.0, sine])
+        received = _unit(received + across[:, None] * np.array([0.0, 1.0, 0.0]))
+        halfway = _unit(received + np.array([0.0, 0.0, 1.0]))
+        normal = _unit(np.concatenate([q, np.ones((*q.shape[:-1], 1))], axis=-1))
+        square = (normal @ halfway.T) ** 2  # of the cosine between the normal and that of a facet which reflects
+        facets = np.exp(-(1 / square - 1) / self.roughness**2) / square**2
+        light = weight * ((1 - self.glossy) * np.maximum(normal @ received.T, 0.0) + self.glossy * facets)
+        return np.asarray((light @ along) / light.sum(axis=-1))
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+@lru_cache(maxsize=32)
+def _aperture(half_angle: float) -> tuple[Array, Array, Array]:
+    """Return places in the aperture along and across the triangulation plane, rad, and their weights, each (n,)."""
+    radius = np.concatenate([np.full(n, share) for share, n, _ in _RINGS]) * half_angle
+    angle = np.concatenate([2 * np.pi * np.arange(n) / n for _, n, _ in _RINGS])
+    weight = np.concatenate([np.full(n, each) for _, n, each in _RINGS])
+    return radius * np.cos(angle), radius * np.sin(angle), weight
+
+
+def speckle(key: int, places: Array, length: float) -> Array:
+    """Return a random field of variance 1 that loses its correlation as exp(-distance / length).
+
+    A sum of plane waves: where a field is isotropic and its correlation exponential, wave vectors follow a Cauchy
+    distribution of width 1 / length, a normal vector over the size of a normal number.
+
+    Parameters
+    ----------
+    key : int
+        Which field.
+    places : ndarray, (n, 3)
+        m. The value at a place does not depend on what else is asked for.
+    length : float
+        m.
+
+    Returns
+    -------
+    ndarray, (n,)
+    """
+    waves, phases = _waves(key)
+    return np.asarray(np.sqrt(2 / _WAVES) * np.cos(places @ (waves / length) + phases).sum(axis=1))
+
+
+@lru_cache(maxsize=64)
+def _waves(key: int) -> tuple[Array, Array]:
+    rng = np.random.default_rng([key])
+    waves = rng.normal(size=(3, _WAVES)) / np.abs(rng.normal(size=_WAVES))
+    return waves, rng.uniform(0, 2 * np.pi, _WAVES)
+
+
+def key_of(*labels: int) -> int:
+    """Return the key of a speckle field from integer labels."""
+    return int(kernels.stream_key(*labels))
