@@ -1,0 +1,233 @@
+"""What an LK-G or LK-H controller says over RS-232C: lines of ASCII that end with a carriage return.
+
+A request is a command and its identifiers, joined by commas; the answer begins with what was asked and goes on with
+the value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,code``. One request at a time. A value
+has eight characters: a sign and seven digits with their point, or one of three texts that stand for no value. The text
+does not say whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
+
+Formats, modes and error codes are those of the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6). Facts marked (m) are
+from memory; each is one line to correct.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from errormotion.errors import InstrumentError, ProtocolError
+
+LINE_END = b"\r"
+BITS_PER_BYTE = 10  # 8N1
+MEASURING, SETTING = "R0", "Q0"  # commands that change the mode, and the modes' names here
+ERROR = "ER"
+
+WIDTH = 8  # characters of a value
+NO_VALUE, OVER, UNDER = "XXXXXXXX", "+FFFFFFF", "-FFFFFFF"
+
+#: Why a reading has no value. The place in this list is its code; 0 = it has one.
+REASONS: tuple[str, ...] = ("", "no value", "over range", "under range", "garbled")
+ABSENT, ABOVE, BELOW, GARBLED = range(1, 5)
+_TEXTS: Mapping[str, int] = {NO_VALUE: ABSENT, OVER: ABOVE, UNDER: BELOW}
+_NUMBER = re.compile(r"[+-](?=.{7}\Z)[0-9]+\.([0-9]+)")
+
+COMMAND_ERROR, STATE_ERROR, LENGTH_ERROR, COUNT_ERROR, PARAMETER_ERROR = "00", "01", "20", "21", "22"
+TIMEOUT_ERROR, OTHER_ERROR = "88", "99"
+ERRORS: Mapping[str, str] = {
+    COMMAND_ERROR: "it does not know this command; is it the controller that the settings name?",
+    STATE_ERROR: "not in this state: measuring and setting are two modes of it",
+    LENGTH_ERROR: "wrong length of the command",
+    COUNT_ERROR: "wrong number of parameters",
+    PARAMETER_ERROR: "a parameter out of its range; has it the output that the settings name?",
+    TIMEOUT_ERROR: "it ran into its own time limit; ask again",
+    OTHER_ERROR: "another error; see its display",
+}
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A generation of controllers: how a value is asked for, and how its outputs are numbered."""
+
+    measure: str
+    output: str
+    outputs: int
+    zero_off: str
+
+    def measure_request(self, output: int) -> str:
+        """Return the request for the value of one output."""
+        return self.measure + self.output.format(output)
+
+    def zero_off_request(self, output: int) -> str:
+        """Return the request that takes a zero back which somebody has set on the panel."""
+        return self.zero_off + self.output.format(output)
+
+
+#: LK-G5000 serves the heads LK-H and LK-G, LK-G3000 the heads LK-G.
+CONTROLLERS: Mapping[str, Controller] = {
+    "LK-G5000": Controller("MS,", "{:02d}", 12, "WS,"),  # (m) zero
+    "LK-G3000": Controller("M", "{:d}", 2, "W"),  # (m) zero
+}
+
+
+@dataclass(frozen=True)
+class Display:
+    """A smallest displayed unit: its number in the controller's settings, decimals of a value, and their unit in m."""
+
+    number: int
+    decimals: int
+    unit: float
+
+    @property
+    def step(self) -> float:
+        """One unit of the last digit, m."""
+        return self.unit / 10.0**self.decimals
+
+    @property
+    def largest(self) -> float:
+        """The largest value that the seven characters hold, m."""
+        return (10.0 ** (WIDTH - 2) - 1) * self.step
+
+
+#: By the unit of the last digit. Settings of six and of seven characters look alike in mm and um (m: the numbers).
+DISPLAYS: Mapping[str, Display] = {
+    "0.01 mm": Display(0, 2, 1e-3),
+    "0.001 mm": Display(1, 3, 1e-3),
+    "0.0001 mm": Display(2, 4, 1e-3),
+    "0.00001 mm": Display(3, 5, 1e-3),
+    "0.1 um": Display(4, 1, 1e-6),
+    "0.01 um": Display(5, 2, 1e-6),
+    "0.001 um": Display(6, 3, 1e-6),  # LK-G5000 only
+}
+
+DISPLAY_SETTING = "OI"  # (m) by its place in the list of settings
+OFFSET_SETTING = "OF"
+NO_OFFSET = "+000000"
+
+#: Measuring range of the heads about the middle of their range, m; lowest and highest reading. All (m) but LK-H050.
+HEADS: Mapping[str, tuple[float, float]] = {
+    "LK-H008": (-0.5e-3, 0.5e-3),
+    "LK-H020": (-3e-3, 3e-3),
+    "LK-H050": (-10e-3, 10e-3),
+    "LK-H080": (-18e-3, 18e-3),
+    "LK-H150": (-40e-3, 40e-3),
+    "LK-G10": (-1e-3, 1e-3),
+    "LK-G15": (-2e-3, 2e-3),
+    "LK-G30": (-5e-3, 5e-3),
+    "LK-G80": (-15e-3, 15e-3),
+    "LK-G150": (-40e-3, 40e-3),
+    "LK-G400": (-100e-3, 100e-3),
+}
+
+
+#: What a reading of the controller counts along the beam: the makers' setting is positive on the near side (m).
+SIGNS: Mapping[str, float] = {"near": -1.0, "far": 1.0}
+
+
+def encode(text: str) -> bytes:
+    """Return a request or an answer as bytes, with its end."""
+    return text.encode("ascii") + LINE_END
+
+
+def decode(line: bytes) -> str:
+    """Return the text of a line without its end.
+
+    Raises
+    ------
+    ProtocolError
+        Other bytes than printable ASCII.
+    """
+    body = line.removesuffix(LINE_END)
+    if not all(0x20 <= byte < 0x7F for byte in body):
+        raise ProtocolError(f"Expected a line of ASCII; found {line!r}")
+    return body.decode("ascii")
+
+
+def parse_answer(request: str, text: str, header: str | None = None) -> str:
+    """Return what an answer says behind its header; empty where it says no more.
+
+    Parameters
+    ----------
+    request : str
+        What was asked.
+    text : str
+        The answer without its end.
+    header : str, optional
+        With what the answer begins; default: the request.
+
+    Raises
+    ------
+    InstrumentError
+        The controller refuses; the message names the error.
+    ProtocolError
+        This is not the answer to that request.
+    """
+    if (code := error_code(request, text)) is not None:
+        meaning = ERRORS.get(code, "this code is in no manual known here")
+        raise InstrumentError(f"The controller refuses '{request}' with error {code}: {meaning}")
+    expected = request if header is None else header
+    if text == expected:
+        return ""
+    if not text.startswith(f"{expected},"):
+        raise ProtocolError(f"'{request}': expected an answer that begins with '{expected}'; found '{text}'")
+    return text[len(expected) + 1 :]
+
+
+def error_code(request: str, text: str) -> str | None:
+    """Return the code of an error that answers a request; None where it is no error, or that of another request.
+
+    The command that the error repeats is the first word of the request, or the name of the setting behind it.
+    """
+    match text.split(","):
+        case [word, command, code] if word == ERROR and command and code:
+            asked = request.split(",")
+            return code if command in (request, *asked[:2]) else None
+    return None
+
+
+def parse_value(text: str, display: Display) -> tuple[float, int]:
+    """Return a value in m, and the place in `REASONS` of why it is NaN.
+
+    Raises
+    ------
+    ProtocolError
+        A value with other decimals than the display has: its unit is not known.
+    """
+    if reason := _TEXTS.get(text, 0):
+        return float("nan"), reason
+    number = _NUMBER.fullmatch(text)
+    if number is None:
+        return float("nan"), GARBLED
+    if len(number[1]) != display.decimals:
+        raise ProtocolError(
+            f"Expected a value with {display.decimals} decimals, as the settings say; found '{text}'. Make the setting "
+            "'display' and the smallest displayed unit of the controller the same"
+        )
+    return float(text) * display.unit, 0
+
+
+def format_value(value: float, display: Display) -> str:
+    """Return a value (m) as the controller sends it; NaN is no value, and what the digits do not hold out of range."""
+    if value != value:
+        return NO_VALUE
+    text = f"{value / display.unit:+z08.{display.decimals}f}"
+    if len(text) > WIDTH:
+        return OVER if value > 0 else UNDER
+    return text
+
+
+def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
+    """Refuse a rate (Hz) at which requests and answers do not fit through the line.
+
+    Raises
+    ------
+    InstrumentError
+        With the arithmetic.
+    """
+    request = len(encode(controller.measure_request(1)))
+    answer = request + 1 + WIDTH
+    needed = rate * (request + answer) * BITS_PER_BYTE
+    if needed > baudrate:
+        raise InstrumentError(
+            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes to ask and {answer} "
+            f"to answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
+        )

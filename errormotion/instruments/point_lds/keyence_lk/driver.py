@@ -1,0 +1,270 @@
+"""Driver of one head at an LK-G or LK-H controller."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.point_lds.keyence_lk.codec import (
+    CONTROLLERS,
+    DISPLAY_SETTING,
+    DISPLAYS,
+    ERROR,
+    GARBLED,
+    HEADS,
+    LINE_END,
+    MEASURING,
+    NO_OFFSET,
+    OFFSET_SETTING,
+    REASONS,
+    SETTING,
+    SIGNS,
+    STATE_ERROR,
+    check_rate,
+    decode,
+    encode,
+    error_code,
+    parse_answer,
+    parse_value,
+)
+from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
+from errormotion.instruments.transports import Transport, open_transport, parse_address
+from errormotion.plugins import Identity, InstrumentInfo, Samples
+
+BLOCK_SECONDS = 0.5
+LONGEST_LINE = 256  # bytes
+MOST_LATE_LINES = 16
+
+
+class KeyenceLK(Driver):
+    """A Keyence LK-G or LK-H laser displacement sensor over RS-232C.
+
+    Readings are in m from the middle of the measuring range along the beam: negative nearer to the head, positive
+    beyond, whichever way round the controller shows them; NaN where the sensor has none.
+
+    Parameters
+    ----------
+    address : str
+        ``serial:///dev/ttyUSB0?baudrate=115200``, ``tcp://host:port``, ``sim://cframe/lk?seed=3``, ``replay://file``.
+    settings : LKSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    no_value : str
+        Why the last reading was NaN, one of `codec.REASONS`; empty where it was a number.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="keyence_lk",
+        kind="point_lds",
+        summary="Keyence LK-G/LK-H laser displacement sensor, RS-232C in ASCII",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.keyence_lk:SimulatedKeyenceLK",
+    )
+    Settings: ClassVar[type[LKSettings]] = LKSettings
+    settings: LKSettings
+    no_value: str = ""
+    _in_step = False
+    _streaming = False
+
+    @property
+    def rate(self) -> float:
+        """Readings per second of a stream."""
+        return self.settings.rate
+
+    @property
+    def measuring_range(self) -> tuple[float, float]:
+        """Lowest and highest reading, m."""
+        return HEADS[self.settings.head]
+
+    @property
+    def mid_range(self) -> float:
+        """The reading in the middle of the range, m: readings count from there."""
+        return 0.0
+
+    def identify(self) -> Identity:
+        """Make sure that a controller answers; it does not tell who it is: model and head are those of the settings."""
+        self._enter(MEASURING)
+        settings = self.settings
+        return Identity(
+            manufacturer="Keyence",
+            model=f"{settings.controller} with {settings.head}",
+            serial_number="not told over RS-232C",
+            simulated=self.transport.simulated,
+            details={"address": self.address, **settings.model_dump(include={"output", "display", "positive"})},
+        )
+
+    def configure(self, settings: LKSettings) -> None:
+        """Check the settings against the line and the controller, or send them, see ``set_up``.
+
+        Raises
+        ------
+        InstrumentError
+            The rate does not fit through the line; the controller has another display unit or an offset, or refuses.
+        """
+        if self._streaming:
+            raise InstrumentError(f"{self.info.id} is streaming; leave the stream first")
+        self._line_speed(settings)
+        output = CONTROLLERS[settings.controller].output.format(settings.output)
+        unit = str(DISPLAYS[settings.display].number)
+        if settings.set_up != "trust":
+            self._enter(SETTING)
+            try:
+                if settings.set_up == "set":
+                    for name, value in ((DISPLAY_SETTING, unit), (OFFSET_SETTING, NO_OFFSET)):
+                        self._ask(f"SW,{name},{output},{value}", header=f"SW,{name}")
+                else:
+                    self._check_controller(output, unit, settings)
+            except InstrumentError:
+                self._in_step = False  # the next request leaves the setting mode first
+                raise
+            self._enter(MEASURING)
+        if settings.set_up == "set":
+            self._ask(CONTROLLERS[settings.controller].zero_off_request(settings.output))
+        self.settings = settings
+
+    def read(self) -> float:
+        """Return one reading now, m; NaN where the sensor has none, and ``no_value`` then says why.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Silence.
+        InstrumentError
+            The controller refuses, with its error named; or it shows another unit than the settings say.
+        """
+        value, reason = self._measure()
+        self.no_value = REASONS[reason]
+        return value
+
+    def stream(self, block: int | None = None) -> Iterator[Samples]:
+        """Yield blocks of readings, asked for one by one in the rhythm of ``rate``, until the caller stops.
+
+        The clock is this computer's. A simulated sensor is asked as fast as it answers: its clock is a virtual one.
+
+        Parameters
+        ----------
+        block : int, optional
+            Readings in a block; default: half a second.
+
+        Yields
+        ------
+        Samples
+            ``values`` (1, block) in m; ``invalid`` counts the NaN by `codec.REASONS`.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Silence.
+        InstrumentError
+            The controller refuses; or its answers take longer than ``rate`` allows.
+        """
+        size = block or max(1, round(BLOCK_SECONDS * self.rate))
+        self._streaming = True
+        try:
+            first, start = 0, time.monotonic()
+            while True:
+                values = np.empty((1, size))
+                invalid: Counter[str] = Counter()
+                for place in range(size):
+                    self._keep_pace(start, first + place)
+                    values[0, place], reason = self._measure()
+                    if reason:
+                        invalid[REASONS[reason]] += 1
+                yield Samples(values, first, self.rate, time.monotonic(), invalid=dict(invalid))
+                first += size
+        finally:
+            self._streaming = False
+
+    def _measure(self) -> tuple[float, int]:
+        settings = self.settings
+        try:
+            text = self._ask(CONTROLLERS[settings.controller].measure_request(settings.output))
+        except ProtocolError:
+            return float("nan"), GARBLED
+        value, reason = parse_value(text, DISPLAYS[settings.display])
+        self._in_step = reason != GARBLED
+        return SIGNS[settings.positive] * value, reason
+
+    def _ask(self, request: str, header: str | None = None) -> str:
+        """Send a request and return what the answer says behind its header."""
+        if not self._in_step:
+            self._enter(MEASURING)
+        self._in_step = False
+        self.transport.write(encode(request))
+        text = decode(self.transport.read_until(LINE_END, limit=LONGEST_LINE))
+        self._in_step = error_code(request, text) is not None  # a refusal is an answer as well
+        answer = parse_answer(request, text, header)
+        self._in_step = True
+        return answer
+
+    def _enter(self, mode: str) -> None:
+        """Bring the controller into a mode, if it is not in it.
+
+        Late answers to earlier requests, and what is left of damaged ones, are passed over: afterwards the next answer
+        belongs to the next request.
+        """
+        self._in_step = False
+        self.transport.write(encode(mode))
+        for _ in range(MOST_LATE_LINES):
+            line = self.transport.read_until(LINE_END, limit=LONGEST_LINE)
+            text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
+            if text.endswith((mode, f"{ERROR},{mode},{STATE_ERROR}")):  # an error where it was in this mode already
+                self._in_step = True
+                return
+            if error_code(mode, text) is not None:
+                parse_answer(mode, text)
+        raise ProtocolError(f"{self.address}: expected '{mode}' as an answer; {MOST_LATE_LINES} other lines came")
+
+    def _check_controller(self, output: str, unit: str, settings: LKSettings) -> None:
+        request = f"SR,{DISPLAY_SETTING},{output}"
+        if (found := self._ask(request)) != unit:
+            names = {str(display.number): name for name, display in DISPLAYS.items()}
+            raise InstrumentError(
+                f"The settings say that the controller at {self.address} shows units of {settings.display}; it answers "
+                f"'{request}' with {names.get(found, found)!r}. Change one of them, or have it set: set_up = \"set\""
+            )
+        request = f"SR,{OFFSET_SETTING},{output}"
+        if set(found := self._ask(request)) & set("123456789"):
+            raise InstrumentError(
+                f"The controller at {self.address} has an offset of {found}, so that 0 is not the middle of the range. "
+                'Clear it, or have it cleared: set_up = "set"'
+            )
+
+    def _keep_pace(self, start: float, number: int) -> None:
+        if self.transport.simulated:
+            return
+        ahead = start + number / self.rate - time.monotonic()
+        if ahead > 0:
+            time.sleep(ahead)
+        elif -ahead > self.settings.timeout:
+            raise InstrumentError(
+                f"{self.address}: {self.rate:g} readings/s were asked for, but {number} took "
+                f"{number / self.rate - ahead:.1f} s; lower the rate"
+            )
+
+    def _line_speed(self, settings: LKSettings) -> int:
+        speed = int(parse_address(self.address).number("baudrate", settings.baudrate))
+        check_rate(settings.rate, speed, CONTROLLERS[settings.controller])
+        return speed
+
+    def _connect(self) -> Transport:
+        return open_transport(
+            self.address,
+            simulator=self.info.simulator,
+            recorder=self._record,
+            timeout=self.settings.timeout,
+            baudrate=self._line_speed(self.settings),
+        )
+
+    def _begin(self) -> None:
+        self._enter(MEASURING)
+        self.configure(self.settings)
