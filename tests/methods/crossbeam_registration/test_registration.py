@@ -1,5 +1,7 @@
 """The pose between two scans: its sign, its precision against the bound, its honesty, and what is refused."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
@@ -11,6 +13,8 @@ from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.registration import prepare, register, solver
 from errormotion.methods.crossbeam_scan.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.registration.solver import Problem, State
+
+registering = import_module("errormotion.methods.crossbeam_scan.registration.register")
 
 ORIGIN = np.zeros(3)
 BLOCK_X, BLOCK_Y = 16 * 12.5e-6, 4 * 70e-6
@@ -65,6 +69,22 @@ def test_errors_are_at_the_bound_and_the_covariance_says_so(scanner):
     # Lines are taken for jittering where they differ by four standard deviations: hardly ever by chance.
     assert sum(r.line_jitter != (0.0, 0.0) for r in results) <= 4
     np.testing.assert_allclose(np.mean([r.sigma for r in results], axis=0), np.sqrt(np.diag(bound)), rtol=0.06)
+
+
+@pytest.mark.parametrize("extra", [None, {"scale_z": np.inf}])
+def test_a_short_last_step_needs_no_second_look(scanner, monkeypatch, extra):
+    maps = []
+    for heights in (scanner.true_heights(), scanner.true_heights(poses.displaced(TWIST))):
+        maps.append(prepare(scanner.noisy(np.random.default_rng(len(maps)), heights), scanner.x, scanner.y))
+    quick = register(*maps, extra=extra)
+    monkeypatch.setattr(registering, "STRAIGHT", 0.0)
+    slow = register(*maps, extra=extra)
+    assert slow.iterations == quick.iterations + 1
+    difference = quick.twist - slow.twist
+    assert difference @ np.linalg.solve(slow.covariance, difference) < 0.01**2
+    unit = np.outer(slow.sigma, slow.sigma)
+    np.testing.assert_allclose(quick.covariance / unit, slow.covariance / unit, atol=1e-3)
+    np.testing.assert_allclose(quick.residual, slow.residual, atol=1e-3 * slow.rms)
 
 
 @pytest.mark.parametrize(("part_x", "part_y"), [(0, 0), (0.25, 0.25), (0.5, 0.5), (0.5, 0), (0, 0.5), (0.8, 0.3)])

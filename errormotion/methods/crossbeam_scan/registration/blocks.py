@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.registration import kernels
+from errormotion.methods.crossbeam_scan.registration import kernels, sums
 from errormotion.methods.crossbeam_scan.registration.freedoms import Moments
 from errormotion.methods.crossbeam_scan.registration.kernels import COLUMNS, POINTS, ROWS
 from errormotion.methods.crossbeam_scan.registration.surface import Surface, repaired
@@ -80,11 +80,7 @@ class BlockMap:
     @cached_property
     def centre(self) -> Array:
         """Middle of the known surface, (3,), m."""
-        known = self.known
-        count = np.count_nonzero(known)
-        along_x, along_y = np.count_nonzero(known, axis=0), np.count_nonzero(known, axis=1)
-        height = np.sum(self.height, where=known)
-        return np.array([self.x @ along_x, self.y @ along_y, height]) / count
+        return np.asarray(sums.middle(self.height, self.variance, self.x, self.y))
 
     @cached_property
     def surface(self) -> Surface:
@@ -110,11 +106,10 @@ class BlockMap:
     @cached_property
     def moments(self) -> Moments:
         """What the slopes of every fourth block along both directions tell about motions."""
-        some = slice(THIN // 2, None, THIN)
-        known = self.known[some, some]
-        place = np.stack([*np.meshgrid(self.x[some], self.y[some]), self.height[some, some]])[:, known]
-        slope_x, slope_y = self.slope_x[some, some][known], self.slope_y[some, some][known]
-        return Moments.of(slope_x, slope_y, place - self.centre[:, None])
+        q = sums.normals_by_place(
+            self.height, self.slope_x, self.slope_y, self.variance, self.x, self.y, self.centre, THIN
+        )
+        return Moments(q @ q.T, q[8:] @ q[8:].T, q.shape[1])
 
 
 def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
@@ -161,8 +156,8 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
             f"{kernels.FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
         )
     out = np.empty((9, rows, columns))
-    # A scan without any noise still has the last bit of its numbers.
-    least = float(np.spacing(np.nanmax(np.abs(z[:: ROWS - 1, :: COLUMNS - 1]))))
+    # A scan without any noise still has the last bit of its numbers; a few of them tell how large they are.
+    least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
     kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least), out)
     return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y))
 
@@ -208,7 +203,8 @@ def _deblurred(
             "expected a smooth surface, found none: no plane explains the blocks of 16 x 4 points; "
             "check that heights are in metres and that the scan is of the artefact"
         )
-    out[0], out[1], out[2] = repaired(mean, sx, sy, pitch_x, pitch_y)
+    if not known.all():
+        out[0], out[1], out[2] = repaired(mean, sx, sy, pitch_x, pitch_y)
     # A curved block scatters about its plane without any noise.
     share = POINTS / (POINTS - 3)
     bends = share * np.array([np.var(0.5 * dx**2), np.var(0.5 * dy**2), np.var(dx) * np.var(dy)])
@@ -244,6 +240,6 @@ def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
 def sampled_median(values: Array) -> float:
     """Return the median of the finite out of some thousand evenly chosen values: a robust scale needs no more."""
     flat = values.reshape(-1)
-    some = flat[:: flat.size // _FEW | 1]  # odd: not the same columns of every row
-    known = some[np.isfinite(some)]
-    return float(np.median(known if known.size else flat[np.isfinite(flat)]))
+    step = flat.size // _FEW | 1  # odd: not the same columns of every row
+    found = sums.median_of_some(flat, step)
+    return found if found == found else float(np.median(flat[np.isfinite(flat)]))

@@ -221,6 +221,22 @@ def accumulate_shared(
         )
 
 
+@compiled(parallel=True)
+def advance(
+    blocks: Array, x: Array, y: Array, pose: Array, normal: Array, centre: Array, bases: Array, grid: Array,
+    step: Array, residual: Array,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Add J step to the residuals of `accumulate` at a pose: what they are after a short step (6 + k,)."""
+    for row in numba.prange(len(residual)):
+        bx, rest = residual.shape[1], residual[row]
+        J, points = np.empty((6 + len(bases), bx)), np.empty((5, bx))
+        _moved_row(blocks[0, row], x, y[row], pose, grid, points)
+        _jacobian_row(points, blocks[1, row], blocks[2, row], normal, centre, bases, J)
+        for k in range(len(J)):
+            for c in range(bx):
+                rest[c] += step[k] * J[k, c]
+
+
 @compiled(inline="always")
 def _gain(a: float, b: float, d: float, k: float, s: float, t: float) -> tuple[float, float, float]:  # pragma: no cover
     """Return the entries of K = T (k + T C T)^-1 T with C = (a b; b d) and T = diag(s, t)."""

@@ -69,13 +69,6 @@ class Moments:
     places: Array
     blocks: int
 
-    @classmethod
-    def of(cls, slope_x: Array, slope_y: Array, place: Array) -> Moments:
-        """Return the sums for slopes (n,) and places (3, n), m, about the centre."""
-        p = np.concatenate([np.ones((1, place.shape[1])), place])
-        q = np.concatenate([-slope_x * p, -slope_y * p, p])
-        return cls(q @ q.T, p @ p.T, place.shape[1])
-
     def information(self, motions: Array) -> tuple[Array, Array]:
         """Return J^T J of motions (n, 3, 4), and what of it slopes with a noise of 1 add, (n, n).
 

@@ -32,6 +32,7 @@ from errormotion.methods.crossbeam_scan.registration.solver import (
     solve,
 )
 from errormotion.methods.crossbeam_scan.registration.start import Start, descend, search
+from errormotion.methods.crossbeam_scan.registration.sums import within
 
 Array = NDArray[np.float64]
 Backend = Literal["height_map", "open3d_plane", "paper"]
@@ -48,6 +49,8 @@ NOISY = 10.0
 """Information counts beyond this many times what the slopes' noise makes of nothing."""
 NEAR = 0.01
 """The noise is estimated once a step would change its variance by no more than this share."""
+STRAIGHT = 400.0
+"""Over steps of this squared length, in standard deviations, residuals change in proportion: 0.01 of one is left."""
 _STEPS = 12
 
 
@@ -122,13 +125,13 @@ def register(
     C = _covariance(problem, found, found.noise, free)
     share = _cold_share(problem, warm, found, free, C)
     C = terms.moved(_unknown(C + np.outer(missed, missed), free), at - problem.centre)
-    used = np.abs(sums.residual) < found.gate
+    square, used, points = within(sums.residual, warm.points, found.gate)
     if rms is None:
-        rms = float(np.sqrt(np.mean(sums.residual[used] ** 2)))
+        rms = float(np.sqrt(square / used))
     return Registration(
         backend=registration, pose=terms.pose_about(state.pose, state.values, at - problem.centre), point=at,
         covariance=C[:6, :6], residual=sums.residual, x=warm.x, y=warm.y,
-        rms=rms, points=int(warm.points[used].sum()), noise=(cold.noise, warm.noise),
+        rms=rms, points=int(points), noise=(cold.noise, warm.noise),
         line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
         condition=free.condition, loose=free.loose, iterations=found.steps,
         extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,
@@ -236,13 +239,17 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
     for _ in range(_STEPS):
         steps += 1
         sums = problem.evaluate(state, gate)
-        if near:
-            noise = estimate_noise(problem, state, sums, line_effects)
-        H, h = problem.equations(sums, noise, state)
-        move = solve(H, h, free.motions, free.radius)
-        state = problem.stepped(state, move)
-        # Squared length in standard deviations: after one of 3, the next is far below a hundredth.
-        length = float(move @ H @ move) / noise.k
+        for _ in range(2):
+            if near:
+                noise = estimate_noise(problem, state, sums, line_effects)
+            H, h = problem.equations(sums, noise, state)
+            move = solve(H, h, free.motions, free.radius)
+            before, state = state, problem.stepped(state, move)
+            # Squared length in standard deviations: after one of 3, the next is far below a hundredth.
+            length = float(move @ H @ move) / noise.k
+            if near or not length < min(NEAR * sums.used, STRAIGHT):
+                break
+            near, sums = True, problem.after(before, sums, move)
         if near and length < 0.1:
             break
         near = near or length < NEAR * sums.used

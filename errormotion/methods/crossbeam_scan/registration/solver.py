@@ -18,7 +18,8 @@ Variances of the effects by expectation and maximisation: tau^2 = mean(effect^2 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,14 @@ from errormotion.methods.crossbeam_scan.registration.blocks import BlockMap
 from errormotion.methods.crossbeam_scan.registration.comparison import (
     accumulate,
     accumulate_shared,
+    advance,
     lag_sums,
     line_gains,
     line_moments,
 )
 from errormotion.methods.crossbeam_scan.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.registration.freedoms import scales
+from errormotion.methods.crossbeam_scan.registration.sums import median_size_of_some
 
 Array = NDArray[np.float64]
 
@@ -45,7 +48,7 @@ MANY = 10000
 LAGS = 2
 _NEIGHBOURS = (2 * LAGS + 1) ** 2
 _EM_STEPS = 25
-_FEW = 10000
+_FEW = 4000
 # What a cubic cardinal spline leaves of white noise is 1 - 1.27 t (1 - t) at t between two nodes, to 0.01.
 _GAIN = 1.27
 
@@ -88,6 +91,16 @@ class Problem:
         )  # fmt: skip
         A, g = rows[:, : n * n].reshape(-1, n, n), rows[:, n * n : n * n + n]
         return Sums(residual, weight, A, g, *rows[:, n * n + n :].T)
+
+    def after(self, state: State, sums: Sums, step: Array) -> Sums:
+        """Return the sums at a state after a step (6 + k,) so short that residuals change in proportion."""
+        matrix, normal = self.map(state)
+        advance(
+            self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, self.cold.surface.grid,
+            step, sums.residual,
+        )  # fmt: skip
+        along = sums.A @ step
+        return replace(sums, g=sums.g + along, square=sums.square + (2 * sums.g + along) @ step)
 
     def map(self, state: State) -> tuple[Array, Array]:
         """Return what takes warm points to the cold frame (3, 4), and what takes normals (3, 3)."""
@@ -143,10 +156,10 @@ class State:
 
 def rotation(v: Array) -> Array:
     """Return the matrix (3, 3) of a rotation vector (3,), rad, after Rodrigues."""
-    angle = float(np.sqrt(v @ v))
+    angle = math.sqrt(v @ v)
     K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    half = np.sinc(angle / (2 * np.pi))
-    R: Array = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half * half * (K @ K)
+    sinc, half = (math.sin(a) / a if a > 0.0 else 1.0 for a in (angle, 0.5 * angle))
+    R: Array = np.eye(3) + sinc * K + 0.5 * half * half * (K @ K)
     return R
 
 
@@ -169,10 +182,8 @@ class Sums:
 
     def scale(self) -> float:
         """Return the robust standard deviation of the residuals about zero, m; infinite where there are none."""
-        flat = self.residual.reshape(-1)
-        some = flat[:: max(1, flat.size // _FEW)]
-        known = some[np.isfinite(some)]
-        return float(1.4826 * np.median(np.abs(known))) if known.size else np.inf
+        found = 1.4826 * median_size_of_some(self.residual.reshape(-1), self.residual.size // _FEW | 1)
+        return found if found == found else np.inf
 
 
 @dataclass(frozen=True)
