@@ -84,7 +84,7 @@ def test_a_short_last_step_needs_no_second_look(scanner, monkeypatch, extra):
     assert difference @ np.linalg.solve(slow.covariance, difference) < 0.01**2
     unit = np.outer(slow.sigma, slow.sigma)
     np.testing.assert_allclose(quick.covariance / unit, slow.covariance / unit, atol=1e-3)
-    np.testing.assert_allclose(quick.residual, slow.residual, atol=1e-3 * slow.rms)
+    assert np.nanstd(quick.residual - slow.residual) < 1e-3 * slow.rms
 
 
 @pytest.mark.parametrize(("part_x", "part_y"), [(0, 0), (0.25, 0.25), (0.5, 0.5), (0.5, 0), (0, 0.5), (0.8, 0.3)])
