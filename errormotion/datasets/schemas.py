@@ -420,6 +420,26 @@ RAW_SCHEMAS = (
         sizes=_DIRECTION,
         labels=_XYZ,
     ),
+    RawSchema(
+        "errormotion.raw.inclination/1",
+        "",
+        "group",
+        (
+            Row("reading", ("group",), "m", *_READING, "of the sensor; NaN = none"),
+            Row("reference", ("group",), "m", *_READING, "true depth, by an interferometer, counted as the reading is"),
+            Row("inclination", ("group",), "rad", -1.5, 1.5, "of the surface; negative: tilted the other way"),
+            Row("rotation", ("group",), "rad", -6.3, 6.3, "azimuth of the tilt from the triangulation plane"),
+            Row("reading_noise", (), "m", *_NOISE, "standard deviation of one reading", required=False),
+            Row(
+                "mid_range",
+                (),
+                "m",
+                *_READING,
+                "reading at which the error vanishes; 0 where not given",
+                required=False,
+            ),
+        ),
+    ),
 )
 """Every raw schema; `variants` finds those of one id."""
 

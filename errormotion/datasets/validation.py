@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
+from errormotion.datasets import calibration
 from errormotion.datasets.error_dataset import error_violations
 from errormotion.datasets.raw import raw_violations, variant_of
 from errormotion.datasets.schemas import RAW_SCHEMAS, SCHEMA
@@ -22,10 +23,12 @@ def violations(ds: xr.Dataset) -> list[str]:
     schema = ds.attrs.get("schema")
     if schema == SCHEMA:
         return error_violations(ds)
+    if schema == calibration.SCHEMA:
+        return calibration.violations(ds)
     raw = variant_of(ds)
     if raw is not None:
         return raw_violations(ds, raw)
-    known = {SCHEMA, *(known.id for known in RAW_SCHEMAS)}
+    known = {SCHEMA, calibration.SCHEMA, *(known.id for known in RAW_SCHEMAS)}
     if schema is None:
         return [f"attribute 'schema': missing; expected one of {', '.join(sorted(known))}"]
     return [f"attribute 'schema': '{schema}' is not known; {nearest(str(schema), known)}"]
