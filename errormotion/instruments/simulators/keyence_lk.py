@@ -33,13 +33,14 @@ from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.transports import Address
 
 STILL = 1.2345e-3
-"""What it reads as long as the machine has set no target before it, m."""
+"""What a head reads that has no place on the machine, m."""
 
 
 class SimulatedKeyenceLK(SimulatedDevice):
     """A controller with one head.
 
-    It reads what the world's point sensor reads, from the middle of the range on.
+    It reads what the world's point sensor reads of the target that is set there, from the middle of the range on; it
+    has no value without a target. Where the address names no device it looks at a plate that never moves until then.
 
     Further parameters of the address: ``readings`` (mm along the beam, joined by commas: taken one after the other
     instead of the world's; ``nan`` is no value), ``head`` (LK-H050), ``controller`` (LK-G5000), ``output`` (1),
@@ -75,7 +76,7 @@ class SimulatedKeyenceLK(SimulatedDevice):
         self._low, self._high = HEADS[address.params.get("head", "LK-H050")]
         self._output = self._controller.output.format(int(address.number("output", 1)))
         display = int(address.number("display", 2))
-        self._display = next(unit for unit in DISPLAYS.values() if unit.number == display)
+        self._display = {unit.number: unit for unit in DISPLAYS.values()}[display]
         self._sign = SIGNS[address.params.get("positive", "near")]
         self._offset = 1e-3 * address.number("offset", 0)
         self._zero = 1e-3 * address.number("zero", 0)
@@ -83,6 +84,7 @@ class SimulatedKeyenceLK(SimulatedDevice):
         texts = address.params.get("readings", "")
         self._readings = cycle([1e-3 * float(text) for text in texts.split(",")] if texts else ())
         self._given = bool(texts)
+        self._on_the_desk = not address.path
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request."""
@@ -140,8 +142,9 @@ class SimulatedKeyenceLK(SimulatedDevice):
         """Return what the head reads along its beam, m."""
         if self._given:
             return next(self._readings)
-        look = getattr(self.world, "read_point", None)
-        return STILL if look is None else float(look(self.name))
+        if self._on_the_desk and self.world.stand.target is None:
+            return STILL
+        return self.world.read_point(self.name)
 
     def _faulty(self) -> bool:
         begun = self._answers - self.fault.at

@@ -67,6 +67,16 @@ class OptoNCDT(Driver):
         return self.settings.rate
 
     @property
+    def measuring_range(self) -> tuple[float, float]:
+        """Lowest and highest reading, m."""
+        return 0.0, self.settings.range
+
+    @property
+    def mid_range(self) -> float:
+        """The reading in the middle of the range, m."""
+        return self.settings.range / 2
+
+    @property
     def stray_bytes(self) -> int:
         """Bytes of the running stream that were neither values nor answers."""
         return 0 if self._reader is None else self._reader.stray_bytes
