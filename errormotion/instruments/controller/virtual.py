@@ -119,7 +119,8 @@ class VirtualController(Driver):
 
         ``time`` (s since the start of the schedule), ``spindle_speed`` (1/min), ``compensation`` (axis to on or off),
         ``position`` (X, Y, Z, m), ``tool``, ``stepping`` and ``running`` (whether a step program, or an NC program,
-        waits or runs), ``alarms`` (list of str).
+        waits or runs), ``alarms`` (list of str); and ``target`` where one is set (``kind``, and of a plane
+        ``inclination`` and ``rotation``, rad).
         """
         return dict(self._call("state"))
 
@@ -210,6 +211,50 @@ class VirtualController(Driver):
             names the line.
         """
         return dict(self._call("run_program", text=str(text)))
+
+    def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
+        """Move the axes in a straight line.
+
+        Simulated time passes by as much as the move takes; while sensors stream it passes with their samples, and
+        ``state()["running"]`` says when the move is over.
+
+        Parameters
+        ----------
+        position : (3,)
+            X, Y, Z, m.
+        feed : float, optional
+            m/s; as fast as the machine can where not given.
+
+        Returns
+        -------
+        dict
+            ``duration`` of the move, s.
+
+        Raises
+        ------
+        InstrumentError
+            The place is out of travel, or something else moves: nothing moves.
+        """
+        place = [float(x) for x in position]
+        return dict(self._call("move_to", position=place, feed=None if feed is None else float(feed)))
+
+    def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
+        """Put a target before the point sensors, which ride on the stage while there is one.
+
+        Parameters
+        ----------
+        kind : {"plane", "bar"} or None
+            A face of a sine gauge on a turntable, a check bar, or nothing: then they are those of the frame again.
+        inclination, rotation : float, optional
+            Of the gauge and its turntable, rad; for a plane.
+
+        Raises
+        ------
+        InstrumentError
+            A sensor streams, or there is no such target.
+        """
+        angles = {"inclination": inclination, "rotation": rotation}
+        self._call("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
     def _call(self, op: str, **arguments: Any) -> Any:
         self._number += 1

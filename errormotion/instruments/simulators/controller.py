@@ -53,6 +53,10 @@ class SimulatedController(SimulatedDevice):
             case "run_program":
                 path = world.run_program(**arguments)
                 return {"duration": path.duration, "longest_lead_in": LEAD_IN[1]}
+            case "move_to":
+                return {"duration": world.move_to(**arguments)}
+            case "set_target":
+                world.set_target(**arguments)
             case _:
                 raise ValueError(f"no such operation: {op}")
         return None

@@ -29,6 +29,8 @@ Array = np.ndarray[Any, Any]
 class SimulatedOptoNCDT(SimulatedDevice):
     """A sensor of the frame: the device's name is its channel, X1 X2 Y1 Y2 or Z.
 
+    While a target is set it rides on the stage and looks at that, whatever its name.
+
     Further parameters of the address: ``model`` (ILD2300 or ILD1420) and ``range`` (mm).
     """
 
@@ -110,7 +112,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return _BAD_PARAMETER
 
     def _start(self) -> str:
-        if self.name not in self.world.machine.frame.channels:
+        if self.name not in self.world.machine.frame.channels and self.world.stand.target is None:
             return "E300 No such beam in the frame of this machine"
         if self.world.following:
             return "E301 The machine is being followed by another device"
@@ -198,13 +200,13 @@ class SensorStream:
         self._fault = fault
         self._rng = rng
         self._counter = counter
-        self._range = measuring_range
+        self.measuring_range = measuring_range
 
     def push(self, distances: Array) -> None:
         """Send the next samples with whatever fault is due; may wait for the reader."""
         first, size = self.sent, distances.size
         raws = np.empty(size, dtype=np.int32)
-        kernels.quantise(distances, self._range, raws)
+        kernels.quantise(distances, self.measuring_range, raws)
         data = self._spoilt(raws, first) if self._fault.kind else self._encoded(raws, first)
         with self._server.lock:
             if self.ended:

@@ -11,7 +11,8 @@ class Stream(Protocol):
     """A channel that wants samples.
 
     ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
-    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more.
+    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more. Its readings count
+    from the start of its ``measuring_range`` (m).
     """
 
     rate: float
@@ -20,6 +21,7 @@ class Stream(Protocol):
     position: int
     taken: int | None
     ended: bool
+    measuring_range: float
 
     @property
     def channel(self) -> str:

@@ -20,12 +20,14 @@ from numpy.typing import ArrayLike
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.nc_program import interpret
 from errormotion.instruments.simulators.streams import Device, Stream, TriggeredStream
+from errormotion.instruments.simulators.targets import TargetStand
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 
 BLOCK = 4096  # samples made at once when running freely
 PACED_BLOCK = 0.01  # s, when running at a pace
 LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: nobody outside knows exactly
+_ROUNDING = 1e-9  # m
 
 
 class VirtualWorld:
@@ -56,11 +58,14 @@ class VirtualWorld:
         self._compile()
         self.pace: float | None = None
         self._front = 0.0  # time up to which samples have been made
+        self._making = 0.0  # time up to which they are being made
         self._settings_of_clock = 0
         self.tool = "bar"
         self.motion: StepProgram | None = None
         self._programs = 0
         self.path = Path.resting((0.0, 0.0, 0.0))
+        self.stand = TargetStand(self.machine)
+        self._asked = 0  # readings by command
         self._warm_up: float | None = None  # time at which it began
         self._schedule: tuple[Event, ...] = ()
         self._devices: set[Device] = set()
@@ -121,7 +126,7 @@ class VirtualWorld:
             return min(seen, default=self._front)
 
     def _set_clock(self, time: float) -> None:
-        self._front = time
+        self._front = self._making = time
         self._settings_of_clock += 1
 
     @property
@@ -185,6 +190,54 @@ class VirtualWorld:
                 self._warm_up = self.path.warm_up()
             return self.path
 
+    def move_to(self, position: Sequence[float], feed: float | None = None) -> float:
+        """Move the axes in a straight line, at a feed in m/s or in rapid; return how long that takes, s.
+
+        The time passes at once, or with the samples while any stream.
+        """
+        with self._change:
+            self._refuse_while_moving()
+            goal, feed = self._within_travel(position), self.machine.rapid if feed is None else float(feed)
+            if not 0 < feed <= self.machine.rapid * (1 + 1e-9):
+                raise InstrumentError(f"The feed is above 0 and at most {self.machine.rapid:g} m/s; found {feed:g}")
+            begin, start = max(self._front, self._making, self.time), np.array(self.position())
+            duration = float(np.linalg.norm(goal - start)) / feed
+            if duration > 0:
+                times, places = np.array([begin, begin + duration]), np.array([start, goal])
+                self.motion, self.path = None, Path(times, places, np.array([feed == self.machine.rapid]))
+                if not self.streaming:
+                    self._set_clock(self.path.end)
+            return duration
+
+    def _within_travel(self, position: Sequence[float]) -> np.ndarray[Any, Any]:
+        goal = np.array(position, dtype=float)
+        if goal.shape != (3,) or not np.isfinite(goal).all():
+            raise InstrumentError(f"Expected a position X, Y, Z in m; found {position!r}")
+        for (axis, (low, high)), place in zip(self.machine.travel.items(), goal, strict=True):
+            if not low - _ROUNDING <= place <= high + _ROUNDING:
+                raise InstrumentError(f"{axis} travels from {low:g} to {high:g} m; found {place:g}")
+        return goal
+
+    def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
+        """Put a target before the point sensors, see `TargetStand.put`; from then on they ride on the stage."""
+        with self._change:
+            self._refuse_while_streaming("change the target")
+            self._refuse_while_moving()
+            here = Path.resting(self.position())
+            self.stand.put(kind, inclination, rotation)
+            if self.stand.target is not None:
+                self.motion, self.path = None, here
+
+    def read_point(self, name: str) -> float:
+        """Return what a point sensor with a range about zero reads now, m.
+
+        Minus or plus infinity before or behind its range; NaN without a target, and where the beam misses it.
+        """
+        with self._change:
+            self._asked += 1
+            now = np.array([self.time])
+            return float(self.stand.read(name, now, self.path.place(now), self._asked)[0])
+
     def _refuse_while_moving(self) -> None:
         if self.stepping or self.running:
             what = "stepping" if self.stepping else "running"
@@ -222,7 +275,7 @@ class VirtualWorld:
         return self.machine.sensors_on_for + self.time
 
     def commanded(self) -> dict[str, Any]:
-        """Return what a controller displays: time, speed, compensation, whether it moves."""
+        """Return what a controller displays: time, speed, compensation, whether it moves, a target if there is one."""
         now = self.time
         speed, compensation = 0.0, {"X": True, "Y": True, "Z": True}
         for event in self._schedule:
@@ -230,7 +283,8 @@ class VirtualWorld:
                 speed = speed if event.spindle_speed is None else event.spindle_speed
                 compensation.update(event.compensation or {})
         shown = {"time": now, "spindle_speed": speed, "compensation": compensation}
-        return {**shown, "stepping": self.stepping, "running": self.running}
+        target = {"target": self.stand.order} if self.stand.order else {}
+        return {**shown, **target, "stepping": self.stepping, "running": self.running}
 
     def position(self) -> list[float]:
         """Return the commanded position of the tool, m."""
@@ -317,9 +371,9 @@ class VirtualWorld:
                 if not running:
                     wall, began, running = time.monotonic(), self._front, True
                 streams, setting, pace = tuple(self._streams), self._settings_of_clock, self.pace
-            fastest = max(streams, key=lambda stream: stream.rate)
-            size = BLOCK if pace is None else max(1, round(PACED_BLOCK * pace * fastest.rate))
-            until = (fastest.position + size) / fastest.rate
+                fastest = max(streams, key=lambda stream: stream.rate)
+                size = BLOCK if pace is None else max(1, round(PACED_BLOCK * pace * fastest.rate))
+                until = self._making = (fastest.position + size) / fastest.rate
             self._make(streams, until)
             with self._change:
                 if self._settings_of_clock == setting:  # nobody has set the clock meanwhile
@@ -336,14 +390,17 @@ class VirtualWorld:
             size = _first_sample(until, rate) - first
             if size <= 0:
                 continue
-            distances = self._distances(first, size, rate, [stream.channel for stream in group])
+            distances = self._distances(first, size, rate, group)
             for stream, values in zip(group, distances, strict=True):
                 stream.position += size
                 stream.push(values)
                 if stream.ended:
                     self.end_stream(stream)
 
-    def _distances(self, first: int, n: int, rate: float, channels: list[str]) -> np.ndarray[Any, Any]:
+    def _distances(self, first: int, n: int, rate: float, streams: Sequence[Stream]) -> np.ndarray[Any, Any]:
+        if self.stand.target is not None:
+            return self.stand.samples(streams, first, n, rate, self.path)
+        channels = [stream.channel for stream in streams]
         if self.tool == "sphere" and self.motion is None:  # parked outside of the frame
             return np.full((len(channels), n), np.nan)
         return self.machine.distances(first, n, rate, channels, tool=self.tool, motion=self.motion)
