@@ -1,0 +1,170 @@
+"""What an LK-G or LK-H says, without a wire."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.point_lds.keyence_lk import codec
+from errormotion.instruments.point_lds.keyence_lk.codec import CONTROLLERS, DISPLAYS, REASONS
+
+MM4 = DISPLAYS["0.0001 mm"]
+UM2 = DISPLAYS["0.01 um"]
+UM1 = DISPLAYS["0.1 um"]
+
+
+# ---------------------------------------------------------------------- values
+
+
+@pytest.mark.parametrize(
+    ("text", "display", "value"),
+    [
+        ("+01.2345", MM4, 1.2345e-3),  # the four numbers printed in the maker's manual, LK-G-M-NO5-E, page 5-6
+        ("-00.0120", MM4, -0.0120e-3),
+        ("+1234.56", UM2, 1234.56e-6),
+        ("-00001.2", UM1, -1.2e-6),
+    ],
+)
+def test_published_values(text: str, display: codec.Display, value: float) -> None:
+    assert codec.parse_value(text, display) == (pytest.approx(value, rel=1e-15), 0)
+    assert codec.format_value(value, display) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"), [("XXXXXXXX", "no value"), ("+FFFFFFF", "over range"), ("-FFFFFFF", "under range")]
+)
+def test_published_texts_are_nan_with_their_reason(text: str, reason: str) -> None:
+    value, code = codec.parse_value(text, MM4)
+    assert math.isnan(value)
+    assert REASONS[code] == reason
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "+01.234", "+01.23456", "01.23450", "+0123456", "+1.2.345", "+FFFFFF", "++1.2345", "+01.234 ", "+.123456x"],
+)
+def test_anything_else_is_garbled(text: str) -> None:
+    value, code = codec.parse_value(text, MM4)
+    assert math.isnan(value)
+    assert REASONS[code] == "garbled"
+
+
+def test_other_decimals_than_the_display_has_are_an_error_and_no_reading_off_by_ten() -> None:
+    with pytest.raises(ProtocolError, match=r"4 decimals, as the settings say; found '\+001\.234'"):
+        codec.parse_value("+001.234", MM4)
+
+
+def test_mm_and_um_can_look_alike_so_the_display_decides() -> None:
+    text = "+0001.25"
+    assert codec.parse_value(text, DISPLAYS["0.01 mm"])[0] == pytest.approx(1.25e-3)
+    assert codec.parse_value(text, UM2)[0] == pytest.approx(1.25e-6)
+
+
+@given(st.sampled_from(sorted(DISPLAYS)), st.floats(-1, 1))
+def test_a_value_comes_back_to_half_a_step(name: str, share: float) -> None:
+    display = DISPLAYS[name]
+    value = share * display.largest
+    text = codec.format_value(value, display)
+    assert len(text) == codec.WIDTH
+    back, reason = codec.parse_value(text, display)
+    assert reason == 0
+    assert abs(back - value) <= display.step / 2 * (1 + 1e-9)
+
+
+@given(st.sampled_from(sorted(DISPLAYS)), st.floats(min_value=1.0001, max_value=1e6))
+def test_what_the_digits_do_not_hold_is_out_of_range_and_not_cut(name: str, times: float) -> None:
+    display = DISPLAYS[name]
+    assert codec.format_value(times * display.largest, display) == codec.OVER
+    assert codec.format_value(-times * display.largest, display) == codec.UNDER
+
+
+def test_nothing_is_sent_as_no_value_and_zero_without_a_minus() -> None:
+    assert codec.format_value(float("nan"), MM4) == "XXXXXXXX"
+    assert codec.format_value(-1e-9, MM4) == "+00.0000"
+
+
+@given(st.text(max_size=12) | st.from_regex(r"[+-][0-9F.X]{7}", fullmatch=True))
+def test_whatever_comes_is_a_number_a_reason_or_a_protocol_error(text: str) -> None:
+    try:
+        value, reason = codec.parse_value(text, MM4)
+    except ProtocolError:
+        return
+    assert math.isnan(value) == bool(reason)
+    assert reason == 0 or reason in range(1, len(REASONS))
+    assert not value > MM4.largest
+
+
+# ---------------------------------------------------------------------- requests and answers
+
+
+def test_requests_of_both_generations() -> None:
+    assert codec.encode(CONTROLLERS["LK-G5000"].measure_request(1)) == b"MS,01\r"
+    assert codec.encode(CONTROLLERS["LK-G5000"].measure_request(12)) == b"MS,12\r"
+    assert codec.encode(CONTROLLERS["LK-G3000"].measure_request(2)) == b"M2\r"
+
+
+@pytest.mark.parametrize("request_text", ["MS,01", "M1"])
+def test_an_answer_repeats_what_was_asked(request_text: str) -> None:
+    assert codec.parse_answer(request_text, f"{request_text},+01.2345") == "+01.2345"
+    assert codec.parse_answer(request_text, request_text) == ""
+    assert codec.parse_answer("SW,OF,01,+000000", "SW,OF", header="SW,OF") == ""
+
+
+@pytest.mark.parametrize("text", ["", "MS,02,+01.2345", "MS,011,+01.2345", "M", "R0", "xMS,01,+01.2345", "ER", "ER,MS"])
+def test_an_answer_to_something_else_is_a_protocol_error(text: str) -> None:
+    with pytest.raises(ProtocolError, match="begins with 'MS,01'"):
+        codec.parse_answer("MS,01", text)
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [
+        ("00", "does not know this command"),
+        ("01", "not in this state"),
+        ("20", "wrong length"),
+        ("21", "wrong number of parameters"),
+        ("22", "out of its range"),
+        ("88", "time limit"),
+        ("99", "another error"),
+        ("47", "in no manual known here"),
+    ],
+)
+def test_every_error_is_named(code: str, name: str) -> None:
+    with pytest.raises(InstrumentError, match=rf"refuses 'MS,01' with error {code}: .*{name}") as caught:
+        codec.parse_answer("MS,01", f"ER,MS,{code}")
+    assert not isinstance(caught.value, ProtocolError)
+
+
+@pytest.mark.parametrize("repeated", ["SR", "OF"])
+def test_an_error_repeats_the_command_or_the_setting(repeated: str) -> None:
+    assert codec.error_code("SR,OF,01", f"ER,{repeated},22") == "22"
+
+
+def test_an_error_of_another_request_is_no_answer() -> None:
+    assert codec.error_code("MS,01", "ER,SR,01") is None
+    with pytest.raises(ProtocolError, match="found 'ER,SR,01'"):
+        codec.parse_answer("MS,01", "ER,SR,01")
+
+
+@given(st.from_regex(r"[A-Z0-9,+.]{0,40}", fullmatch=True))
+def test_lines_come_back(text: str) -> None:
+    assert codec.decode(codec.encode(text)) == text
+
+
+@given(st.binary(max_size=40))
+def test_a_line_of_other_bytes_is_a_protocol_error(line: bytes) -> None:
+    body = line.removesuffix(b"\r")
+    if all(0x20 <= byte < 0x7F for byte in body):
+        assert codec.decode(line).encode() == body
+    else:
+        with pytest.raises(ProtocolError, match="line of ASCII"):
+            codec.decode(line)
+
+
+def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
+    # 6 bytes to ask, 15 to answer, 10 bits each: 210 bits a reading
+    codec.check_rate(45.0, 9600, CONTROLLERS["LK-G5000"])
+    with pytest.raises(InstrumentError, match=r"6 bytes to ask and 15 to answer, x 10 bits \(8N1\) = 10500 bit/s"):
+        codec.check_rate(50.0, 9600, CONTROLLERS["LK-G5000"])

@@ -1,0 +1,13 @@
+from errormotion.instruments.point_lds.keyence_lk import KeyenceLK
+from errormotion.testing import InstrumentConformance, InstrumentSubject
+
+
+class TestKit(InstrumentConformance):
+    """Over a pty, with readings of both signs and of every reason to have none."""
+
+    subject = InstrumentSubject(
+        KeyenceLK,
+        "sim://cframe/lk?seed=3&wire=pty&readings=-9.9999,nan,9.5,-12,12,0",
+        settings={"timeout": 0.5},
+        name="pty",
+    )
