@@ -2,10 +2,10 @@
 
 A plane of gradient g says one thing of the beam u: g.u = -1. The angles by which the beam may be off its nominal
 direction change this by t, the plane's tilt across the beam (|t| = tan of the inclination), and it is known as well as
-the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings in all, shared out as
-is best, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of the sensor limits a
-stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is positive. With an inclination
-of alpha at most, no set-up with n readings in all can bring the worse of the two angles below
+the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings in all, shared out
+as is best, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of the sensor limits
+a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is positive. With an
+inclination of alpha at most, no set-up with n readings in all can bring the worse of the two angles below
 
     sqrt(24 / n) sigma / (R tan alpha),
 
@@ -146,7 +146,8 @@ def longest_strokes(normals: Array, limits: Limits) -> Array:
     gradient = -normals / (normals @ limits.beam)[:, None]
     spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
     with np.errstate(divide="ignore"):
-        return np.minimum(np.minimum(limits.travel, limits.reach / np.abs(gradient)), limits.plate / spot)
+        longest = np.minimum(limits.reach / np.abs(gradient), limits.plate / spot)
+    return np.asarray(np.minimum(longest, limits.travel))
 
 
 def shares_of_strokes(strokes: Array, limits: Limits) -> tuple[Array, Array]:
@@ -168,7 +169,7 @@ def spread(planes: Array, shares: Array, limits: Limits) -> Array:
     weighted = t / own[:, None]
     information = t.T @ weighted
     information += 1e-12 * np.trace(information) * np.eye(2) + np.finfo(float).tiny
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     return np.asarray(covariance + common_scale(covariance, weighted, limits))
 
 
@@ -265,7 +266,8 @@ def _planes(about_beam: Array, limits: Limits) -> Array:
     normals = np.sin(inclination)[:, None] * sideways - np.cos(inclination)[:, None] * limits.beam
     rotation = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), 2 * np.pi)
     planes = np.stack([np.arccos(np.clip(normals[:, 2], -1.0, 1.0)), rotation], axis=-1)
-    return np.clip(planes, [limits.inclination[0], limits.rotation[0]], [limits.inclination[1], limits.rotation[1]])
+    lower, upper = zip(limits.inclination, limits.rotation, strict=True)
+    return np.asarray(np.clip(planes, lower, upper))
 
 
 def _about_beam(planes: Array, limits: Limits) -> Array:
