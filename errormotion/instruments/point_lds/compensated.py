@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -127,7 +127,15 @@ class CompensatedSensor:
             raise InstrumentError(
                 f"Expected how the surface lies to the beam; found inclination {inclination}, rotation {rotation} rad"
             )
-        return self.calibration.compensate(reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate)
+        found = self.calibration.compensate(reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate)
+        shape = np.shape(reading)  # one tilt for all of them adds no dimension
+        return replace(
+            found,
+            raw=found.raw.reshape(shape),
+            value=found.value.reshape(shape),
+            uncertainty=found.uncertainty.reshape(shape),
+            jacobian=found.jacobian.reshape(*shape, -1),
+        )
 
 
 def _found(calibration: str | Path | InclinationCalibration) -> InclinationCalibration:
