@@ -1,0 +1,61 @@
+"""Settings of the method: what a campaign file or ``--set`` may say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from errormotion.datasets.units import Angle, Length
+from errormotion.plugins import PluginSettings
+
+
+class PlaneSetting(PluginSettings):
+    """How the sine gauge stands."""
+
+    inclination: Angle = Field(ge=0, lt=np.pi / 2, description="of its face to the table")
+    rotation: Angle = Field(default=0.0, description="of the turntable; at 0 the face's normal leans towards +X")
+
+
+def _three_planes() -> tuple[PlaneSetting, ...]:
+    a = float(np.radians(20.0))
+    return tuple(PlaneSetting(inclination=a, rotation=float(np.radians(b))) for b in (0.0, 90.0, 180.0))
+
+
+class Settings(PluginSettings):
+    """Settings of ``beam_direction``."""
+
+    beam: str = Field(default="beam", min_length=1, description="name of the beam in the result")
+
+    # Acquisition
+    planes: tuple[PlaneSetting, ...] = Field(
+        default_factory=_three_planes, min_length=2, description="how the gauge stands, one after the other"
+    )
+
+    # Identification
+    moves: Literal["sensor", "target"] | None = Field(
+        default=None, description="what the stage carries; default: as the raw dataset says, else the sensor"
+    )
+    compensation: str | None = Field(
+        default=None, description="calibration of the sensor's inclination error, by path or name; default: none"
+    )
+    extrapolate: bool = Field(
+        default=False, description="compensate also at tilts and readings that the calibration does not speak for"
+    )
+    triangulation_normal_uncertainty: Angle = Field(
+        default=float(np.radians(0.5)),
+        ge=0,
+        description="standard uncertainty of the triangulation plane's angle about the beam, where the data state none",
+    )
+    tolerance: Angle = Field(
+        default=1e-9, gt=0, description="change of the direction at which the compensation has converged"
+    )
+    max_iterations: int = Field(default=30, ge=1, description="after so many the compensation is refused")
+    robust: bool = Field(default=True, description="leave out readings that lie far off their plane, and name them")
+    ordered: bool = Field(
+        default=True, description="readings lie along strokes; false where the stage went to its places in any order"
+    )
+    noise: Literal["auto", "stated"] = Field(
+        default="auto", description="the stated noise of the readings, raised where their scatter is larger (auto)"
+    )
