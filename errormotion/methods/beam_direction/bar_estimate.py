@@ -33,6 +33,7 @@ class Bar:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
         tilts = ("tilt_1", "tilt_2") if self.tilts else ()
         return ("across_1", "across_2", *tilts, *(() if self.held else ("radius",)))
 
@@ -55,6 +56,7 @@ class Bar:
         return np.concatenate(columns, axis=1)
 
     def stepped(self, step: Array) -> Bar:
+        """Return the bar with its parameters changed by a step (parameter,)."""
         basis = across(self.axis)
         axis = self.axis + step[2:4] @ basis if self.tilts else self.axis
         radius = self.radius if self.held else self.radius + float(step[-1])
@@ -136,7 +138,7 @@ def judged(bar: Bar, p: Array, own: Array, influence: Array, radius_uncertainty:
     exceeds = False
     if stated and freedoms > 0:
         # The sum of squares of points that are not equally noisy is nearly a chi-square of fewer freedoms.
-        half = expected**2 / float(np.einsum("ij,j,ji,i->", M, variance, M, variance))
+        half = expected**2 / float(2 * np.einsum("ij,j,ji,i->", M, variance, M, variance))
         exceeds = bool(gammaincc(half, half * square / expected) < FALSE_ALARMS)
     if not stated:
         variance = np.full(len(p), square / freedoms if freedoms else np.nan)
