@@ -18,7 +18,10 @@ from errormotion.datasets.checks import (
 from errormotion.datasets.schemas import RawSchema, Row, variants
 
 # What a sensor hands over: NaN where it saw nothing. Everything else that is required must be known.
-_READINGS = ("distance", "height", "displacement", "centre", "touch", "record", "encoder", "y", "reading", "stage")
+_READINGS = (
+    *("distance", "height", "displacement", "centre", "touch", "record", "encoder", "y", "reading", "stage"),
+    "bar_distance",
+)
 
 # A direction that is 1e-6 too long makes 1 nm on a reading of 1 mm.
 _UNIT_NORM = 1e-6

@@ -183,6 +183,37 @@ _PROFILER = (
 )
 _PROFILER_SIZES = {"row": 4, "column": 4, "p": 6, "p_": 6}
 
+_POINT_SENSOR = (
+    Row(
+        "triangulation_normal",
+        ("direction",),
+        "1",
+        *_UNIT_VECTOR,
+        "normal of the sensor's triangulation plane, for the inclination compensation",
+        required=False,
+    ),
+    Row(
+        "triangulation_normal_uncertainty",
+        (),
+        "rad",
+        0.0,
+        0.5,
+        "standard uncertainty of that normal's angle about the beam",
+        required=False,
+    ),
+    Row("mid_range", (), "m", *_READING, "reading at which the inclination error vanishes", required=False),
+    Row("reading_range", ("limit",), "m", *_READING, "least and greatest reading of the sensor", required=False),
+    Row(
+        "speckle",
+        (),
+        "m",
+        *_NOISE,
+        "standard deviation of what the surface adds along a stroke",
+        required=False,
+    ),
+    Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
+)
+
 RAW_SCHEMAS = (
     RawSchema(
         "errormotion.raw.spindle_drift/1",
@@ -348,7 +379,7 @@ RAW_SCHEMAS = (
     ),
     RawSchema(
         "errormotion.raw.beam_direction/1",
-        "",
+        "planes",
         "stage",
         (
             Row("distance", ("plane", "reading"), "m", -2.0, 2.0, "reading along the beam; NaN = none"),
@@ -370,36 +401,7 @@ RAW_SCHEMAS = (
                 "normal of each plane as set, to compare; the method needs none",
                 required=False,
             ),
-            Row(
-                "triangulation_normal",
-                ("direction",),
-                "1",
-                *_UNIT_VECTOR,
-                "normal of the sensor's triangulation plane, for the inclination compensation",
-                required=False,
-            ),
-            Row(
-                "triangulation_normal_uncertainty",
-                (),
-                "rad",
-                0.0,
-                0.5,
-                "standard uncertainty of that normal's angle about the beam",
-                required=False,
-            ),
-            Row("mid_range", (), "m", *_READING, "reading at which the inclination error vanishes", required=False),
-            Row(
-                "reading_range", ("limit",), "m", *_READING, "least and greatest reading of the sensor", required=False
-            ),
-            Row(
-                "speckle",
-                (),
-                "m",
-                *_NOISE,
-                "standard deviation of what the surface adds along a stroke",
-                required=False,
-            ),
-            Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
+            *_POINT_SENSOR,
             Row("plane_point", ("plane", "direction"), "m", *_PLACE, "known point of each plane", required=False),
             Row(
                 "plane_point_uncertainty",
@@ -413,6 +415,23 @@ RAW_SCHEMAS = (
             Row("bar_stage", ("bar_reading", "direction"), "m", *_PLACE, "place of the stage there", required=False),
             Row("bar_axis", ("direction",), "1", *_UNIT_VECTOR, "direction of the bar", required=False),
             Row("bar_radius", (), "m", *_RADIUS, "radius of the bar; NaN = to be found", required=False),
+        ),
+        sizes={**_DIRECTION, "limit": 2},
+        labels=_XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.beam_direction/1",
+        "check bar alone",
+        "bar_distance",
+        (
+            Row("bar_distance", ("bar_reading",), "m", -2.0, 2.0, "reading on a check bar; NaN = none"),
+            Row("bar_stage", ("bar_reading", "direction"), "m", *_PLACE, "place of the stage there"),
+            Row("bar_axis", ("direction",), "1", *_UNIT_VECTOR, "direction of the bar"),
+            Row("bar_radius", (), "m", *_RADIUS, "radius of the bar; NaN = to be found", required=False),
+            Row("nominal_direction", ("direction",), "1", *_UNIT_VECTOR, "direction of the beam"),
+            Row("distance_noise", (), "m", *_NOISE, "standard deviation of one reading"),
+            Row("nominal_origin", ("direction",), "m", *_PLACE, "zero point while the stage is at 0", required=False),
+            *_POINT_SENSOR,
         ),
         sizes={**_DIRECTION, "limit": 2},
         labels=_XYZ,
