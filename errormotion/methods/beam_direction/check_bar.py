@@ -201,6 +201,8 @@ def measure_bar(
     calibration: InclinationCalibration | None = None,
     moves: Literal["sensor", "target"] = "sensor",
     shape: Literal["circle", "cylinder"] = "circle",
+    stage_noise: float = 0.0,
+    radius_uncertainty: float = 0.0,
     hold_radius: bool = False,
     robust: bool = True,
     extrapolate: bool = False,
@@ -213,9 +215,9 @@ def measure_bar(
         Schema ``errormotion.raw.beam_direction/1`` with a check bar.
     origin, direction, covariance
         The beam; see `errormotion.methods.beam_direction.scanning.points`.
-    calibration, moves, extrapolate
+    calibration, moves, stage_noise, extrapolate
         See there; the normals are those of a round bar.
-    shape, hold_radius, robust
+    shape, radius_uncertainty, hold_radius, robust
         See `fit_bar`.
 
     Raises
@@ -237,6 +239,7 @@ def measure_bar(
         direction,
         covariance=covariance,
         noise=float(np.hypot(float(raw["distance_noise"]), speckle)),
+        stage_noise=stage_noise,
         calibration=calibration,
         triangulation_normal=raw["triangulation_normal"].values if "triangulation_normal" in raw else None,
         mid_range=float(raw["mid_range"]) if "mid_range" in raw else None,
@@ -246,7 +249,15 @@ def measure_bar(
     )
     radius = float(raw["bar_radius"]) if "bar_radius" in raw and np.isfinite(raw["bar_radius"]) else None
     held = hold_radius and radius is not None
-    return scanned, fit_bar(scanned, axis, shape=shape, radius=radius, hold_radius=held, robust=robust)
+    return scanned, fit_bar(
+        scanned,
+        axis,
+        shape=shape,
+        radius=radius,
+        radius_uncertainty=radius_uncertainty,
+        hold_radius=held,
+        robust=robust,
+    )
 
 
 @dataclass(frozen=True)
