@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import beam, crossbeam, crossbeam_pose, generic, provenance, spindle
+from errormotion.report import beam, beam_direction, crossbeam, crossbeam_pose, generic, provenance, spindle
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH
@@ -119,6 +119,8 @@ def _builder(errors: xr.Dataset) -> Builder:
         return crossbeam.part
     if crossbeam_pose.is_pose(errors):
         return crossbeam_pose.part
+    if beam_direction.is_direction(errors):
+        return beam_direction.part
     return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 
