@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from errormotion.methods.beam_direction.settings import Settings
+
     Array = NDArray[np.float64]
 
 LEAST_READINGS = 3
@@ -87,6 +89,30 @@ class Limits:
     slope_uncertainty: Callable[[Array], Array] | None = None
 
 
+def limits_of(
+    settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
+) -> Limits:
+    """Return the limits that settings state; ``sensor_range``, m, where the sensor itself says its own."""
+    p = settings.layout
+    if sensor_range is None:
+        sensor_range = p.reading_range[1] - p.reading_range[0]
+    u = np.array(p.nominal_direction, np.float64)
+    return Limits(
+        beam=u / np.linalg.norm(u),
+        beam_uncertainty=p.direction_uncertainty,
+        reach=p.used_range * sensor_range,
+        travel=np.array(p.travel),
+        plate=p.plate,
+        inclination=p.inclinations,
+        rotation=p.rotations,
+        max_inclination=p.max_inclination,
+        readings=len(settings.planes) * p.readings,
+        noise=float(np.hypot(p.noise / np.sqrt(p.average), p.speckle)),
+        scale_uncertainty=p.scale_uncertainty,
+        slope_uncertainty=slope_uncertainty,
+    )
+
+
 @dataclass(frozen=True)
 class Design:
     """A set-up: planes, strokes, and how many readings each stroke has.
@@ -99,14 +125,19 @@ class Design:
         Lengths of the strokes along X, Y, Z, m.
     readings : ndarray of int64 (k, 3)
         Readings of each stroke, equally spaced.
+    path : ndarray (n, 3), optional
+        Places of the stage on every plane instead of strokes, m.
     """
 
     planes: Array
     strokes: Array
     readings: NDArray[np.int64]
+    path: Array | None = None
 
     def stages(self) -> list[Array]:
         """Return for each plane the places (n, 3) of the stage, m, about the one where the reading is mid-range."""
+        if self.path is not None:
+            return [self.path] * len(self.planes)
         return [stroke_points(lengths, counts) for lengths, counts in zip(self.strokes, self.readings, strict=True)]
 
     @property

@@ -1,0 +1,257 @@
+"""Measuring: a point sensor on a stage looks at one face of a sine gauge after the other.
+
+For each face the stage looks for it along the beam, from far away to near, comes to mid-range, and then moves along X,
+Y and Z (or along a given path). At each place it rests, and several readings are averaged.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.errors import MethodError
+from errormotion.methods.beam_direction import design
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.plugins import Bench
+
+    Array = NDArray[np.float64]
+
+SCHEMA = "errormotion.raw.beam_direction/1"
+NO_VALUE = "no value"
+_TRIES = 5
+_CLOSE = 0.05
+_TRIAL = 0.1
+_SEARCH = 0.5
+"""Shares of the range: how close to mid-range is close enough; a move that shows the sign; a step of the search."""
+
+
+def measure_planes(
+    bench: Bench,
+    settings: Settings,
+    inputs: Mapping[str, xr.Dataset],  # noqa: ARG001 - the same for every method
+    done: xr.Dataset | None,
+) -> Iterator[xr.Dataset]:
+    """Yield one raw dataset for each face of the gauge, to be joined along ``plane``.
+
+    Parameters
+    ----------
+    bench : Bench
+        With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). One that can also set
+        the gauge (``set_target``) does; otherwise the operator is asked to.
+    settings : Settings
+    inputs : mapping
+        Not used.
+    done : Dataset, optional
+        What an interrupted run holds: its faces are not measured again.
+
+    Raises
+    ------
+    MethodError
+        No control that moves the stage, or no face within the search.
+    """
+    stand = Stand(bench, settings)
+    faces = settings.planes
+    longest = max(len(places) for places in stand.paths)
+    for number in range(0 if done is None else int(done.sizes["plane"]), len(faces)):
+        stand.set_face(number)
+        middle = stand.approach(number)
+        yield stand.measure(number, middle, longest)
+
+
+class Stand:
+    """Sensor, stage and gauge of a bench.
+
+    Attributes
+    ----------
+    normals : ndarray (k, 3)
+        Of the faces, as commanded.
+    paths : list of ndarray (n, 3)
+        Places of the stage on each face about its middle, m.
+    """
+
+    def __init__(self, bench: Bench, settings: Settings) -> None:
+        self.bench, self.settings, self.layout = bench, settings, settings.layout
+        self.sensor = bench.of_kind("point_lds")
+        self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
+        if not hasattr(self.control, "move_to"):
+            raise MethodError(
+                "A beam is calibrated by moving its sensor over the faces of a gauge, which needs an instrument of "
+                "kind 'controller' that can move to a place (move_to); the bench has none. Measure by hand and hand "
+                "the readings over as a table: 'errormotion identify READINGS.csv'."
+            )
+        self.low, self.high = (float(x) for x in self.sensor.measuring_range)
+        self.middle = float(self.sensor.mid_range)
+        u = np.array(self.layout.nominal_direction, np.float64)
+        self.beam = u / np.linalg.norm(u)
+        self.sign = 1.0 if settings.moves == "sensor" else -1.0
+        self.normals = design.plane_normals(np.array([(face.inclination, face.rotation) for face in settings.planes]))
+        self.paths = [self._path(normal) for normal in self.normals]
+        self.invalid: Counter[str] = Counter()
+
+    @property
+    def range(self) -> float:
+        """Length of the sensor's range, m."""
+        return self.high - self.low
+
+    def _path(self, normal: Array) -> Array:
+        if self.layout.path:
+            return np.array(self.layout.path, np.float64)
+        if self.layout.strokes == "longest":
+            lengths = design.longest_strokes(normal[None], design.limits_of(self.settings, self.range))[0]
+        else:
+            lengths = np.array(self.layout.strokes, np.float64)
+        counts = np.full(3, self.layout.readings // 3)
+        counts[: self.layout.readings % 3] += 1
+        return design.stroke_points(lengths, counts)
+
+    def set_face(self, number: int) -> None:
+        """Turn the gauge to a face; the sensor is out of the way then."""
+        face = self.settings.planes[number]
+        self.move(self.start() - self.sign * self.layout.search * self.beam)
+        if hasattr(self.control, "set_target"):
+            self.control.set_target("plane", inclination=face.inclination, rotation=face.rotation)
+            return
+        self.bench.ask(
+            f"Face {number + 1} of {len(self.settings.planes)}: set the sine gauge to an inclination of "
+            f"{np.degrees(face.inclination):.6g} deg and its turntable to {np.degrees(face.rotation):.6g} deg."
+        )
+
+    def start(self) -> Array:
+        """Return the place of the stage from which a face is looked for, m.
+
+        Raises
+        ------
+        MethodError
+            The settings do not say.
+        """
+        p = self.layout
+        if p.start is not None:
+            return np.array(p.start)
+        if p.pivot is None or p.nominal_origin is None:
+            raise MethodError(
+                "Where does the search for a face begin? Expected layout.start (a place of the stage), or both "
+                "layout.pivot and layout.nominal_origin; found neither."
+            )
+        return np.asarray(self.sign * (np.array(p.pivot) - np.array(p.nominal_origin) - self.middle * self.beam))
+
+    def move(self, place: Array) -> Array:
+        """Move the stage and return where the control says that it is, m."""
+        self.control.move_to([float(x) for x in place])
+        return np.array(self.control.state()["position"], np.float64)
+
+    def read(self) -> float:
+        """Return the mean of several readings, m; NaN, and counted, where fewer than half of them have a value."""
+        values = np.empty(self.layout.average)
+        reasons: Counter[str] = Counter()
+        for i in range(values.size):
+            values[i] = self.sensor.read()
+            if np.isnan(values[i]):
+                reasons[getattr(self.sensor, "no_value", "") or NO_VALUE] += 1
+        self.invalid.update(reasons)
+        valid = values[np.isfinite(values)]
+        return float(valid.mean()) if 2 * valid.size >= values.size else float("nan")
+
+    def approach(self, number: int) -> Array:
+        """Look for a face along the beam, from far away to near, and return the stage's place at mid-range, m.
+
+        Raises
+        ------
+        MethodError
+            No reading, or readings that do not fall while the sensor comes nearer.
+        """
+        forth = self.sign * self.beam
+        steps = np.arange(-self.layout.search, self.layout.search + 1e-12, _SEARCH * self.range)
+        name = f"Face {number + 1}"
+        for step in steps:
+            place = self.move(self.start() + step * forth)
+            reading = self.read()
+            if np.isfinite(reading):
+                break
+        else:
+            raise MethodError(
+                f"{name}: no reading from {-self.layout.search * 1e3:g} to {self.layout.search * 1e3:g} mm along the "
+                f"beam about the stage's place {_mm(self.start())} mm. Check layout.start or layout.pivot, the "
+                "nominal direction, and how the gauge stands; or widen layout.search."
+            )
+        ahead = _TRIAL * self.range if reading > self.middle else -_TRIAL * self.range
+        there = self.move(place + ahead * forth)
+        change = (self.read() - reading) / ahead
+        if not abs(change + 1) < 0.5:
+            raise MethodError(
+                f"{name}: while the sensor moves by {ahead * 1e3:g} mm towards the face the reading changes by "
+                f"{change * ahead * 1e3:.3g} mm; expected {-ahead * 1e3:g} mm. Check the sign of the readings, the "
+                "nominal direction, and whether the stage carries the sensor or the target (setting moves)."
+            )
+        for _ in range(_TRIES):
+            off = self.read() - self.middle
+            if abs(off) < _CLOSE * self.range:
+                break
+            there = self.move(there + off * forth)
+        self.invalid.clear()  # a search meets places without a reading
+        return there
+
+    def measure(self, number: int, middle: Array, longest: int) -> xr.Dataset:
+        """Return the raw dataset of one face, padded to ``longest`` readings."""
+        distance, stage = np.full(longest, np.nan), np.full((longest, 3), np.nan)
+        for i, offset in enumerate(self.paths[number]):
+            stage[i] = self.move(middle + offset)
+            distance[i] = self.read()
+        return self._dataset(number, distance, stage)
+
+    def noise(self) -> float:
+        """Return the standard deviation of an average, m."""
+        stated = getattr(self.sensor.settings, "noise", None)
+        return float((stated or self.layout.noise) / np.sqrt(self.layout.average))
+
+    def _dataset(self, number: int, distance: Array, stage: Array) -> xr.Dataset:
+        m, one = {"units": "m"}, {"units": "1"}
+        p = self.layout
+        variables: dict[str, Any] = {
+            "distance": (("plane", "reading"), distance[None], m),
+            "stage": (("plane", "reading", "direction"), stage[None], m),
+            "nominal_normal": (("plane", "direction"), self.normals[number : number + 1], one),
+            "nominal_direction": ("direction", self.beam, one),
+            "distance_noise": ((), self.noise(), m),
+            "mid_range": ((), self.middle, m),
+            "reading_range": ("limit", np.array([self.low, self.high]), m),
+        }
+        if p.speckle > 0:
+            variables |= {"speckle": ((), p.speckle, m), "speckle_length": ((), p.speckle_length, m)}
+        if p.nominal_origin is not None:
+            variables["nominal_origin"] = ("direction", np.array(p.nominal_origin), m)
+        if p.triangulation_normal is not None:
+            t = np.array(p.triangulation_normal)
+            variables["triangulation_normal"] = ("direction", t / np.linalg.norm(t), one)
+        if p.pivot is not None:
+            variables["plane_point"] = (("plane", "direction"), np.array([p.pivot]), m)
+            variables["plane_point_uncertainty"] = ((), p.pivot_uncertainty, m)
+        invalid, self.invalid = dict(self.invalid), Counter()
+        return xr.Dataset(
+            variables,
+            coords={"direction": list("xyz")},
+            attrs={
+                "schema": SCHEMA,
+                "machine": self.bench.machine,
+                "frame": "machine",
+                "moves": self.settings.moves,
+                "sensor": type(self.sensor).info.id,
+                "average": p.average,
+                "start": datetime.now(UTC).isoformat(timespec="seconds"),
+                "dropped": 0,
+                "invalid": invalid,
+            },
+        )
+
+
+def _mm(place: Array) -> str:
+    return "({:.3f}, {:.3f}, {:.3f})".format(*(place * 1e3))
