@@ -339,9 +339,9 @@ def _incomplete(
         lacking = [f"{row.name}_{label}" for k, label in enumerate(names.labels[dim]) if k not in there] if dim else []
         if lacking:
             yield f"{row.name}: expected all its components; missing {', '.join(lacking)}"
-    records = {names.record_dims(row): row.name for row in rows.values()}
+    records = {names.record_dims(row): row.name for row in reversed(rows.values())}
     if len(records) > 1:
-        kinds = " and ".join(f"{name} ({', '.join(dims) or 'one value'})" for dims, name in records.items())
+        kinds = " and ".join(f"{name} ({', '.join(dims) or 'one value'})" for dims, name in reversed(records.items()))
         yield f"expected variables of one kind in a table; found {kinds}. Put an empty line and a table between them"
         return
     (record,) = records

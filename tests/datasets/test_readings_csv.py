@@ -1,0 +1,245 @@
+"""Readings that a person wrote: what is right is read in SI, what is wrong is told with its line and column."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion import datasets
+from errormotion.datasets.readings_csv import read_csv
+from errormotion.errors import DatasetError
+
+HEAD = """# schema = errormotion.raw.beam_direction/1
+# machine = C-frame 610
+# a remark of any kind
+# nominal_direction = 0.342 0 0.940
+# distance_noise = 0.1 um
+"""
+TABLE = """plane,reading [mm],x [mm],y [mm],z [mm]
+1,-2.004,100.000,50.000,20.000
+1,-1.508,101.000,50.000,20.000
+2,0.25,101.000,50.000,20.000
+2,,101.000,50.000,21.000
+2,0.5,101.000,51.000,21.000
+"""
+INCLINATION = """# schema = errormotion.raw.inclination/1
+# reading_noise = 0.1 um
+reading [mm],reference [mm],inclination [deg],rotation [deg]
+-5.001,-5.000,-30,0
+5.002,5.000,30,90
+"""
+
+
+@pytest.fixture
+def read(tmp_path: Path):
+    def read(text: str | bytes) -> xr.Dataset:
+        path = tmp_path / "readings.csv"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_csv(path)
+
+    return read
+
+
+@pytest.fixture
+def complaints(read, tmp_path: Path):
+    def complaints(text: str | bytes) -> str:
+        with pytest.raises(DatasetError) as caught:
+            read(text)
+        told = str(caught.value)
+        assert str(tmp_path / "readings.csv") in told
+        return told
+
+    return complaints
+
+
+def test_planes_of_a_beam_in_si(read) -> None:
+    raw = read(HEAD + TABLE)
+    assert raw.attrs["schema"] == "errormotion.raw.beam_direction/1"
+    assert raw.attrs["machine"] == "C-frame 610"
+    assert raw["distance"].dims == ("plane", "reading")
+    assert raw["stage"].dims == ("plane", "reading", "direction")
+    np.testing.assert_array_equal(raw["distance"], [[-2.004e-3, -1.508e-3, np.nan], [0.25e-3, np.nan, 0.5e-3]])
+    np.testing.assert_allclose(raw["stage"][1, 2], [0.101, 0.051, 0.021])
+    assert float(raw["distance_noise"]) == pytest.approx(1e-7)
+    assert list(raw["plane"].values) == [1, 2]
+    assert datasets.violations(raw) == []
+
+
+def test_empty_cells_are_counted_and_places_beyond_a_short_plane_are_not(read) -> None:
+    assert json.loads(read(HEAD + TABLE).attrs["missing_values"]) == {"distance": 1}
+
+
+def test_direction_of_a_few_digits_is_brought_to_length_1(read) -> None:
+    assert np.linalg.norm(read(HEAD + TABLE)["nominal_direction"]) == pytest.approx(1, abs=1e-12)
+
+
+def test_second_table_goes_by_the_names_of_the_first(read) -> None:
+    normals = "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n2,0,0,1\n1,0,1,0\n"
+    np.testing.assert_array_equal(read(HEAD + TABLE + normals)["nominal_normal"], [[0, 1, 0], [0, 0, 1]])
+
+
+def test_planes_may_have_names_and_their_lines_may_alternate(read) -> None:
+    head, *lines = TABLE.splitlines()
+    mixed = [lines[2], lines[0], lines[3], lines[1], lines[4]]
+    text = "\n".join([head, *mixed]).replace("\n1,", "\nsteep,").replace("\n2,", "\nflat,")
+    raw = read(HEAD + text)
+    assert list(raw["plane"].values) == ["flat", "steep"]
+    np.testing.assert_array_equal(raw["distance"][1], [-2.004e-3, -1.508e-3, np.nan])
+
+
+def test_check_bar_in_a_table_of_its_own(read) -> None:
+    bar = "\nbar_distance [um],bar_stage_x [mm],bar_stage_y [mm],bar_stage_z [mm]\n5,1,2,3\n6,1,2,4\n"
+    raw = read(HEAD + "# bar_radius = 25 mm\n# bar_axis = 0 0 1\n" + TABLE + bar)
+    np.testing.assert_allclose(raw["bar_distance"], [5e-6, 6e-6])
+    assert float(raw["bar_radius"]) == 0.025
+
+
+def test_inclination_readings(read) -> None:
+    raw = read(INCLINATION)
+    np.testing.assert_allclose(raw["inclination"], np.radians([-30, 30]))
+    assert raw["reading"].dims == ("group",)
+    assert float(raw["reading_noise"]) == pytest.approx(1e-7)
+
+
+@pytest.mark.parametrize("sign", [";", "\t"])
+def test_other_separators(read, sign: str) -> None:
+    assert read(HEAD + TABLE.replace(",", sign)).equals(read(HEAD + TABLE))
+
+
+def test_what_a_spreadsheet_makes_of_it(read) -> None:
+    lines = (HEAD + TABLE).splitlines()
+    padded = "\r\n".join(line if "," in line else line + ",,,," for line in lines) + "\r\n,,,,\r\n"
+    assert read(b"\xef\xbb\xbf" + padded.encode()).equals(read(HEAD + TABLE))
+
+
+def test_load_reads_what_ends_in_csv(tmp_path: Path) -> None:
+    path = tmp_path / "A.CSV"
+    path.write_text(HEAD + TABLE)
+    raw = datasets.load(path)
+    assert raw.equals(read_csv(path))
+    assert datasets.load(datasets.save(raw, tmp_path / "a.nc")).equals(raw)
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=20))
+def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
+    path = tmp_path_factory.mktemp("csv") / "readings.csv"
+    lines = [f"1,{value * 1e-3!r},0,0,0" for value in values]
+    path.write_text(HEAD + TABLE.splitlines()[0].replace("mm", "m") + "\n" + "\n".join(lines))
+    np.testing.assert_array_equal(read_csv(path)["distance"][0], [value * 1e-3 for value in values])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("x [mm]", "q [mm]", "line 6: column 3 'q [mm]': unknown column; "),
+        ("x [mm]", "stage_xx [mm]", "did you mean 'stage_x'?"),
+        ("x [mm]", "x", "line 6: column 3 'x': expected its unit in brackets, such as 'x [m]'; found none"),
+        ("reading [mm]", "reading", "column 2 'reading': expected its unit in brackets"),
+        ("x [mm]", "x []", "expected its unit in brackets, such as 'x [m]'; found none"),
+        ("x [mm]", "x (mm)", "column 3 'x (mm)': expected a name and its unit in brackets"),
+        ("x [mm]", "x [deg]", "column 'x [deg]': expected a unit of the kind of m; found 'deg'"),
+        ("x [mm]", "x [parsnip]", "found 'parsnip'"),
+        ("x [mm]", "y [mm]", "column 4 'y [mm]': comes again; column 3 is 'y [mm]'"),
+        ("x [mm]", "stage_z [mm]", "column 5 'z [mm]': comes again; column 3 is 'stage_z [mm]'"),
+        ("z [mm]", "bar_distance [mm]", "stage: expected all its components; missing stage_z"),
+        ("plane,", "group,", "line 6: column 1 'group': unknown column"),
+        (
+            "x [mm]",
+            "x [m]",
+            "line 7: column 'x [m]': makes a stage of 100 m; expected -20..20 m. Is the unit 'm' right?",
+        ),
+        ("-1.508", "-1,508", "line 8: expected 5 fields; found 6 (the decimal sign is a point)"),
+        ("-1.508", "broken", "line 8: column 'reading [mm]': expected a number; found 'broken'"),
+        ("-1.508", "1_000", "expected a number; found '1_000'"),
+        ("-1.508", "inf", "expected a number; found 'inf'"),
+        ("-1.508", "1e999", "expected a number; found '1e999'"),
+        ("-1.508,", "", "line 8: expected 5 fields; found 4"),
+        (",101.000,51", ",,51", "line 11: column 'x [mm]': expected a number; found nothing"),
+        ("1,-1.508", ",-1.508", "line 8: column 'plane': expected a number or name; found nothing"),
+        ("0.1 um", "0.1", "line 5: distance_noise: expected a unit, such as m; found none"),
+        (
+            "0.1 um",
+            "0,1 um",
+            "line 5: distance_noise: expected one number and a unit such as m; found '0,1 um' (the dec",
+        ),
+        ("0.1 um", "0.1 s", "line 5: distance_noise: expected a unit of the kind of m; found 's'"),
+        ("0.1 um", "0.1 m", "line 5: distance_noise: makes a distance_noise of 0.1 m; expected 0..0.001 m"),
+        ("0.1 um", "", "line 5: distance_noise: expected one number"),
+        ("0.342 0 0.940", "0.342 0", "line 4: nominal_direction: expected 3 numbers; found '0.342 0'"),
+        ("0.342 0 0.940", "0,342 0 0,940", "(the decimal sign is a point; blanks separate numbers)"),
+        ("0.342 0 0.940", "0.342 0 0.640", "line 4: nominal_direction: expected a vector of length 1; found 0.7256"),
+        ("distance_noise", "distance_noize", "line 5: distance_noize: unknown key; did you mean 'distance_noise'?"),
+        ("# distance_noise", "# stage = 1 mm\n# distance_noise", "line 5: stage: expected in a table"),
+        ("# distance_noise = 0.1 um\n", "", "distance_noise(): missing; expected in m"),
+        ("# machine = C-frame 610", "# schema = errormotion.raw.inclination/1", "line 2: 'schema' comes again; line 1"),
+        (
+            "raw.beam_direction",
+            "raw.beam_directoin",
+            "line 1: schema 'errormotion.raw.beam_directoin/1' is not known; did",
+        ),
+        ("# schema = errormotion.raw.beam_direction/1\n", "", "expected a line '# schema = ...'"),
+    ],
+)
+def test_mistakes_are_told_with_their_place(complaints, old: str, new: str, told: str) -> None:
+    assert told in complaints((HEAD + TABLE).replace(old, new, 1))
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        (
+            "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,1,0\n7,0,0,1\n",
+            "of 1, 2; found '7'",
+        ),
+        (
+            "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,1,0\n1,0,0,1\n",
+            "comes again; line 14",
+        ),
+        (
+            "\nnominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,0\n",
+            "line 13: expected 2 along plane",
+        ),
+        ("\nplane,reading [mm]\n1,0.1\n", "column 2 'reading [mm]': distance stands further up already"),
+        ("\ndistance_noise [um]\n0.1\n", "distance_noise: expected in the header, as '# distance_noise = ...'"),
+        ("\nplane,bar_distance [mm]\n1,0.1\n", "column 'plane': no variable of this table has it"),
+        ("\nbar_distance [mm]\n", "line 13: expected lines of numbers below the column names; found none"),
+        ('\nbar_distance [mm]\n"0.1\n', "line 14: cannot be split into fields"),
+    ],
+)
+def test_mistakes_of_further_tables(complaints, table: str, told: str) -> None:
+    assert told in complaints(HEAD + TABLE + table)
+
+
+def test_variables_of_two_kinds_do_not_share_a_table(complaints) -> None:
+    told = complaints(
+        INCLINATION.replace("reading [mm],", "reading_noise [um],", 1).replace("# reading_noise = 0.1 um\n", "")
+    )
+    assert "expected variables of one kind in a table; found reading_noise (one value) and reference (group)" in told
+
+
+def test_all_mistakes_are_told_at_once(complaints) -> None:
+    told = complaints((HEAD + TABLE).replace("-1.508", "a").replace("0.25", "b").replace("0.1 um", "0.1"))
+    assert "3 mistakes" in told
+    assert told.index("line 5") < told.index("line 8") < told.index("line 9")
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", "expected a line of column names and lines of readings; found none"),
+        (HEAD.encode(), "expected a line of column names"),
+        ((HEAD + TABLE).encode("utf-16"), "is UTF-16; expected UTF-8"),
+        ((HEAD + "# 3 \xb5m\n" + TABLE).encode("latin-1"), "line 6: byte 0xb5 is not UTF-8"),
+    ],
+)
+def test_other_files_are_told(complaints, data: bytes, told: str) -> None:
+    assert told in complaints(data)
+
+
+def test_no_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nothing\.csv: cannot be read: No such file"):
+        datasets.load(tmp_path / "nothing.csv")
