@@ -46,12 +46,16 @@ class SpindleDrift:
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``scanning``."""
+        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``scanning``.
+
+        For a drift ``inputs`` may hold the ``beams`` of a detection, or single ones by the name of their channel.
+        """
         from errormotion.methods.spindle_drift import acquisition, scanning
+        from errormotion.methods.spindle_drift.given_beams import given_beams
 
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
-        return acquisition.record_drift(bench, settings, inputs.get("beams"), done)
+        return acquisition.record_drift(bench, settings, given_beams(inputs), done)
 
     def append_dim(self, settings: DriftSettings) -> str:
         """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""
