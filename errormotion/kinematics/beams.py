@@ -22,6 +22,7 @@ from errormotion.kinematics.twists import cross_matrix
 __all__ = [
     "across",
     "beam_errors",
+    "error_jacobian",
     "inclination_rotation",
     "rotation_between",
     "tilt",
@@ -99,14 +100,21 @@ def beam_errors(
     if (cosine <= 0).any():
         raise MethodError("A detected beam points away from its nominal direction: check the nominal directions.")
     errors = np.concatenate([p - p0, rotation_between(u0, u)], axis=-1)
-    chart = np.zeros((len(u), 6, 6))
-    chart[:, :3, :3] = np.eye(3)
-    chart[:, 3:, 3:] = _turning_by_direction(u0, u)
+    chart = error_jacobian(u0, u)
     moved = chart @ np.nan_to_num(np.asarray(covariance, float)) @ np.swapaxes(chart, -1, -2)
     along = np.abs(u0) >= _ALONG
     errors[:, 3:][along] = np.nan
     unseen = np.isnan(errors)
     return errors, np.where(unseen[:, :, None] | unseen[:, None, :], np.nan, moved)
+
+
+def error_jacobian(nominal_direction: ArrayLike, direction: ArrayLike) -> Array:
+    """Return the derivative (beam, 6, 6) of the errors of beams by their (origin, direction); see `beam_errors`."""
+    u0, u = np.asarray(nominal_direction, float), np.asarray(direction, float)
+    chart = np.zeros((len(u), 6, 6))
+    chart[:, :3, :3] = np.eye(3)
+    chart[:, 3:, 3:] = _turning_by_direction(u0, u)
+    return chart
 
 
 def _turning_by_direction(u0: Array, u: Array) -> Array:

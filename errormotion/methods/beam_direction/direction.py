@@ -57,8 +57,12 @@ class Direction:
         Unit vector towards the target.
     covariance : ndarray (3, 3)
         Of it; rank 2, since it keeps its length.
+    by_gradient : ndarray (3, k, 3)
+        Change of the direction with each gradient.
+    discrepancy : ndarray (k,)
+        g . u + 1 of the gradients as measured.
     closure, closure_u : ndarray (k,)
-        g . u + 1 by plane and the standard deviation that it should have; both 0 where two planes meet it exactly.
+        The same, and the standard deviation that it should have by the noise; both 0 where two planes meet it exactly.
     other_root : ndarray (3,) or None
         Another direction that fits as well.
     gradients_fitted : ndarray (k, 3)
@@ -73,6 +77,8 @@ class Direction:
 
     direction: Array
     covariance: Array
+    by_gradient: Array
+    discrepancy: Array
     closure: Array
     closure_u: Array
     other_root: Array | None
@@ -146,6 +152,8 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     return Direction(
         direction=u,
         covariance=covariance,
+        by_gradient=-np.einsum("ij,kj,k,l->ikl", covariance, fitted, 1 / sigma2, u),
+        discrepancy=closure,
         closure=np.where(exact, 0.0, closure),
         closure_u=np.sqrt(np.where(exact, 0.0, left)),
         other_root=other,

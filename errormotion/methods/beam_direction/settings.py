@@ -7,20 +7,14 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from errormotion.datasets.units import Angle, Length
+from errormotion.datasets.units import Angle
+from errormotion.methods.beam_direction.layout import Face, Layout
 from errormotion.plugins import PluginSettings
 
 
-class PlaneSetting(PluginSettings):
-    """How the sine gauge stands."""
-
-    inclination: Angle = Field(ge=0, lt=np.pi / 2, description="of its face to the table")
-    rotation: Angle = Field(default=0.0, description="of the turntable; at 0 the face's normal leans towards +X")
-
-
-def _three_planes() -> tuple[PlaneSetting, ...]:
+def _three_planes() -> tuple[Face, ...]:
     a = float(np.radians(20.0))
-    return tuple(PlaneSetting(inclination=a, rotation=float(np.radians(b))) for b in (0.0, 90.0, 180.0))
+    return tuple(Face(inclination=a, rotation=float(np.radians(b))) for b in (0.0, 90.0, 180.0))
 
 
 class Settings(PluginSettings):
@@ -29,13 +23,15 @@ class Settings(PluginSettings):
     beam: str = Field(default="beam", min_length=1, description="name of the beam in the result")
 
     # Acquisition
-    planes: tuple[PlaneSetting, ...] = Field(
+    planes: tuple[Face, ...] = Field(
         default_factory=_three_planes, min_length=2, description="how the gauge stands, one after the other"
     )
 
+    layout: Layout = Field(default_factory=Layout, description="the set-up that is measured, or planned")
+
     # Identification
-    moves: Literal["sensor", "target"] | None = Field(
-        default=None, description="what the stage carries; default: as the raw dataset says, else the sensor"
+    moves: Literal["sensor", "target"] = Field(
+        default="sensor", description="what the stage carries; a raw dataset with the attribute moves knows better"
     )
     compensation: str | None = Field(
         default=None, description="calibration of the sensor's inclination error, by path or name; default: none"

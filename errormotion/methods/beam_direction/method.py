@@ -1,0 +1,87 @@
+"""The plugin ``beam_direction``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.settings import Settings as BeamSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SCHEMA = "errormotion.raw.beam_direction/1"
+
+
+class BeamDirection:
+    """Where a point sensor's beam starts and where it goes, from planes that a stage moves it over."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="beam_direction",
+        summary="Origin and direction of a point sensor's beam from planes of a sine gauge, inclination compensated",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "the rotation of the beam about itself",
+            "the zero point, where fewer than three planes have a known point",
+            "errors of the stage: its axes are taken as straight and true",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA, optional_instruments=("controller",))
+    Settings: ClassVar[type[PluginSettings]] = BeamSettings
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: BeamSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield one raw dataset a plane. See ``acquisition``."""
+        from errormotion.methods.beam_direction import acquisition
+
+        return acquisition.measure_planes(bench, settings, inputs, done)
+
+    def append_dim(self, settings: BeamSettings) -> str:  # noqa: ARG002 - part of the protocol
+        """Return ``plane``."""
+        return "plane"
+
+    def progress(self, settings: BeamSettings) -> float:
+        """Return the number of planes."""
+        return float(len(settings.planes))
+
+    def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset of component ``beam``.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.beam_direction/1``; stays as it is.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset does not follow its schema (all violations at once), or the calibration is not found.
+        MethodError
+            The data do not determine the answer.
+        """
+        from errormotion.methods.beam_direction.identification import identify_beam
+
+        settings = settings or BeamSettings()
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        validate(checked)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        return identify_beam(checked, settings, self.info.id, self.info.version)
+
+    def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        from errormotion.methods.beam_direction.planning import plan
+
+        return plan(self, settings or BeamSettings())
