@@ -5,9 +5,10 @@ A sensor whose beam meets the surface at the tilt q = tan(alpha) (cos beta, sin 
     r = d + (d - m) k(q),
 
 d the true depth, m the reading at which the inclination error vanishes. k is a sum of products of Legendre polynomials
-in q1 / s and q2 / s, s the largest calibrated tilt. Its coefficients are one Gaussian: their covariance carries the
-noise, the scatter from setting to setting, and what the chosen order may leave out; all readings that are compensated
-share it (`Compensated.jacobian`).
+in the two parts of x = tan(alpha / 2) (cos beta, sin beta) / s, where s puts the steepest calibrated setting at 1: the
+normal of the surface is a rational function of x, so fewer terms do than in q. The coefficients are one Gaussian: their
+covariance carries the noise, the scatter from setting to setting, and what the chosen order may leave out. All readings
+that are compensated share it (`Compensated.jacobian`).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _SLOPE = (-0.5, 0.5)  # an error of half the depth is no inclination error
 _FREE = (-float("inf"), float("inf"))
 
 ROWS = (
-    Row("coefficient", ("term",), "1", *_FREE, "of each product of Legendre polynomials in q / `tilt_scale`"),
+    Row("coefficient", ("term",), "1", *_FREE, "of each product of Legendre polynomials"),
     Row(
         "coefficient_covariance",
         ("term", "term_"),
@@ -58,8 +59,10 @@ ROWS = (
         "of the coefficients: noise, scatter of the settings and what the order leaves out",
     ),
     Row("degree", ("term", "axis"), "", 0, 20, "degrees of the two polynomials of each term"),
-    Row("tilt_scale", (), "1", 1e-6, 20.0, "tan of the largest calibrated inclination"),
-    Row("mid_range", (), "m", *_DEPTH, "reading at which the error vanishes"),
+    Row("tilt_scale", (), "1", 1e-6, 1.0, "s: tan of half the steepest calibrated inclination"),
+    Row("mid_range", (), "m", *_DEPTH, "reading at which the error vanishes, as stated"),
+    Row("mid_range_found", (), "m", *_FREE, "the same as the readings say; NaN where they cannot"),
+    Row("mid_range_uncertainty", (), "m", 0.0, _FREE[1], "standard uncertainty of that; NaN where unknown"),
     Row("reading_low", (), "m", *_DEPTH, "lowest calibrated reading"),
     Row("reading_high", (), "m", *_DEPTH, "highest calibrated reading"),
     Row("support_gap", (), "1", 0.0, 20.0, "widest empty circle between calibrated tilts that counts as surrounded"),
@@ -68,11 +71,16 @@ ROWS = (
     Row("rotation", ("setting",), "rad", -6.3, 6.3, "of each setting that was fitted"),
     Row("slope", ("setting",), "1", *_SLOPE, "k of each setting from its own readings"),
     Row("slope_uncertainty", ("setting",), "1", 0.0, 1.0, "its standard uncertainty from the noise"),
+    Row("offset", ("setting",), "m", -0.1, 0.1, "zero of each setting's interferometer readings against the sensor's"),
     Row("slope_predicted", ("setting",), "1", *_SLOPE, "k at each setting, by a fit to all the others"),
     Row("slope_predicted_uncertainty", ("setting",), "1", 0.0, 1.0, "standard uncertainty of that prediction"),
     Row("setting_left_out", ("setting",), "", 0, 1, "1: the setting contradicts all the others and was left out"),
     Row("noise", (), "m", 0.0, 1e-3, "standard deviation of one reading about the line of its setting"),
     Row("repeatability", (), "1", 0.0, 1.0, "standard deviation of k from setting to setting, beyond the noise"),
+    Row("group_setting", ("group",), "", 0, 1e7, "setting of each group of readings that was fitted"),
+    Row("group_depth", ("group",), "m", *_DEPTH, "its reference minus `mid_range`"),
+    Row("group_residual", ("group",), "m", -0.1, 0.1, "its reading minus the line of its setting"),
+    Row("group_left_out", ("group",), "", 0, 1, "1: the reading does not belong to that line and was left out"),
     Row("remaining_error", (), "1", 0.0, 1.0, "rms of `slope` minus `slope_predicted`: the cross-validated error of k"),
     Row("remaining_error_interval", ("limit",), "1", 0.0, 1.0, "95 % interval of `remaining_error`: low, high"),
 )
@@ -85,6 +93,7 @@ ATTRIBUTES = {
     "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software",
 }
 _SIZES = {"axis": 2, "limit": 2}
+_MAY_BE_UNKNOWN = ("mid_range_found", "mid_range_uncertainty")
 
 
 @dataclass(frozen=True)
@@ -223,12 +232,24 @@ class InclinationCalibration:
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Return the derivative (..., term) of k at tilts (..., 2) by the coefficients."""
-        return terms(np.asarray(q, float) / self._scale, self._degrees)
+        return terms(half_tilt(np.asarray(q, float)) / self._scale, self._degrees)
 
     def slope(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return k at tilts (..., 2) and its standard uncertainty, wherever they lie; see `supported`."""
         J = self.jacobian(q)
         return J @ self.coefficients, _deviation(J, self.coefficient_covariance)
+
+    def grid(self, count: int = 61) -> xr.Dataset:
+        """Return k (`slope`), its standard `uncertainty` and `supported` over a grid of tilts q1, q2, for a map."""
+        steepest = 1.05 * float(np.hypot(*self.settings.T).max())
+        axis = np.linspace(-steepest, steepest, count)
+        q = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        k, u = self.slope(q)
+        dims = ("q1", "q2")
+        return xr.Dataset(
+            {"slope": (dims, k), "uncertainty": (dims, u), "supported": (dims, self.supported(q))},
+            {"q1": axis, "q2": axis},
+        )
 
     def supported(self, q: ArrayLike) -> NDArray[np.bool_]:
         """Return whether calibrated settings surround each tilt (..., 2) closely enough."""
@@ -312,6 +333,11 @@ class InclinationCalibration:
             )
 
 
+def half_tilt(q: Array) -> Array:
+    """Return tan(alpha / 2) (cos beta, sin beta) of tilt vectors (..., 2)."""
+    return np.asarray(q / (1.0 + np.sqrt(1.0 + (q**2).sum(axis=-1, keepdims=True))))
+
+
 def terms(x: Array, degrees: NDArray[np.int64]) -> Array:
     """Return the products (..., term) of Legendre polynomials of degrees (term, 2) at points (..., 2)."""
     highest = int(degrees.max(initial=0))
@@ -354,7 +380,7 @@ def _row_violations(ds: xr.Dataset, row: Row) -> list[str]:
     if variable.size == 0:
         return [f"{row.name}: expected values; found none (a dimension has length 0)"]
     complaints = magnitude_violations(row.name, variable, row)
-    if not complaints and np.isnan(variable.values.astype(float)).any():
+    if not complaints and row.name not in _MAY_BE_UNKNOWN and np.isnan(variable.values.astype(float)).any():
         complaints = [f"{row.name}: expected numbers; found NaN"]
     return complaints
 
