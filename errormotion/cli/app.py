@@ -79,10 +79,13 @@ def run(
 @guarded
 def identify(
     raw: Annotated[
-        list[Path], typer.Argument(help="Raw datasets: NetCDF files, Zarr folders, run folders, or a folder of those.")
+        list[Path],
+        typer.Argument(help="Raw datasets: NetCDF, Zarr, CSV of readings, run folders, or a folder of those."),
     ],
-    method: Annotated[str, typer.Option(help="The id of a method plugin.")],
     out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist. For several runs: a folder.")],
+    method: Annotated[
+        str | None, typer.Option(help="The id of a method plugin; default: the one that the raw data name.")
+    ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     scheduler: Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 def identify(
     raws: list[Path],
-    method_id: str,
+    method_id: str | None,
     out: Path,
     assignments: list[str],
     settings_file: Path | None,
@@ -37,6 +38,7 @@ def identify(
     several = len(raws) > 1 or scheduler or workers or batch.is_runs_folder(raws[0])
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
         _identify_one(batch.raw_of(raws[0]), method_id, settings, out, as_json)
@@ -49,6 +51,21 @@ def identify(
             raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
         )
     _tell(outcomes, out, scheduler, as_json)
+
+
+def _method_of(raw: Path) -> str:
+    """Return the id of the method that a raw dataset is for."""
+    from errormotion.campaign import batch
+
+    if batch.is_runs_folder(raw):
+        raise DatasetError(f"{raw}: is a folder of runs; say which method's with --method")
+    path = batch.raw_of(raw)
+    with reading(path), datasets.load(path) as dataset:
+        schema = str(dataset.attrs.get("schema", "none"))
+    match = re.fullmatch(r"errormotion\.raw\.(\w+)/\d+", schema)
+    if match is None:
+        raise DatasetError(f"{path}: expected a raw dataset, whose schema tells the method; found schema {schema}")
+    return match[1]
 
 
 def _tell(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
