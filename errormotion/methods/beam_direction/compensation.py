@@ -2,7 +2,7 @@
 
 A reading r of a plane with the tilt q is r = d + (d - m) k(q). On one plane q is the same for all readings, so that the
 compensated gradient is g / (1 + k) and the compensated offset m + (offset - m) / (1 + k): nothing has to be fitted
-again. The normal is N = -g / |g| whatever k is. The tilt needs the beam, the beam needs the gradients: both are found
+again. The normal is N = g / |g| whatever k is. The tilt needs the beam, the beam needs the gradients: both are found
 in turn until the direction rests. Source: Lu et al., section 3.3, whose loop is over readings instead.
 
 What is uncertain goes through the whole loop. With du = M dk the effect of the slopes on the direction and H = dk/du
@@ -59,7 +59,7 @@ class Planes:
     @property
     def normals(self) -> Array:
         """Unit normals (k, 3) of the planes, towards the sensor."""
-        return np.asarray(-self.gradients / np.linalg.norm(self.gradients, axis=1, keepdims=True))
+        return np.asarray(self.gradients / np.linalg.norm(self.gradients, axis=1, keepdims=True))
 
     def compensated(self, slope: Array, mid_range: float) -> Planes:
         """Return them with the inclination error of slopes (k,) taken off."""
@@ -192,10 +192,10 @@ def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max
 def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
     """Return names and groups of what the slopes share, and their change (source, k) with each at tilts q (k, 2)."""
     J = sensor.calibration.jacobian(q)
-    variance, axes = np.linalg.eigh(sensor.calibration.coefficient_covariance)
-    by_source = (J @ (axes * np.sqrt(np.maximum(variance, 0.0)))).T
-    weight = np.sum(by_source**2, axis=1)
-    by_source = by_source[weight > _NEGLIGIBLE * max(float(weight.sum()), 1e-300)][::-1]
+    # All coefficients together move the slopes of k planes in k independent ways at most.
+    variance, axes = np.linalg.eigh(J @ sensor.calibration.coefficient_covariance @ J.T)
+    moved = variance > _NEGLIGIBLE * max(float(variance[-1]), 1e-300)
+    by_source = (axes * np.sqrt(np.maximum(variance, 0.0)))[:, moved].T[::-1]
     sources = tuple(f"{CALIBRATION} {i + 1}" for i in range(len(by_source)))
     groups = (CALIBRATION,) * len(sources)
     if sensor.normal_uncertainty > 0:

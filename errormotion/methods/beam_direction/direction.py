@@ -2,7 +2,7 @@
 
 The zero point of the sensor is at p0 + s, s the place of the stage, and reads d along the unit vector u until the plane
 N . (x - P) = 0 is met: N . (p0 + s + u d - P) = 0. So the gradient of the reading is g = -N / (N . u), and each plane,
-whatever its normal, sets one condition: g . u = -1.
+whatever its normal, sets one condition: g . u = -1. With N towards the sensor N . u < 0, so that N = g / |g|.
 
 Measured gradients g_k have covariances S_k. Over all true gradients gamma_k that meet their condition the likelihood is
 greatest at gamma_k = g_k - S_k u c_k / (u . S_k u), with c_k = g_k . u + 1; what is left to minimise is
@@ -279,7 +279,7 @@ def _check_gradients(gradients: Array, covariances: Array, names: Sequence[str])
         axis /= np.linalg.norm(axis)
         raise MethodError(
             f"The planes are parallel to within {_degrees(spread)}, with a noise of {_degrees(noise)}: they fix the "
-            f"angle between the beam and their common normal {_vector(-axis)}, and leave open how far the beam is "
+            f"angle between the beam and their common normal {_vector(axis)}, and leave open how far the beam is "
             "turned about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
         )
 

@@ -104,5 +104,5 @@ def locate(
     by_reading, by_point = np.zeros((3, k, 4)), np.zeros((3, k))
     by_reading[:, known] = K[:, :, None] * by_own[known]
     by_reading[:, :, :3] += np.einsum("pk,ki,ijl->pjl", K, by_direction[known], direction.by_gradient)
-    by_point[:, known] = -K * size[known]
+    by_point[:, known] = K * size[known]
     return Origin(p0, by_reading, by_point, misfit, float(np.sum(misfit[known] ** 2 * W)))
