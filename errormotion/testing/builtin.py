@@ -36,6 +36,8 @@ def builtin_subjects(
         return spindle_drift(cls)
     if (group, plugin_id) == ("methods", "crossbeam_scan"):
         return crossbeam_scan(cls)
+    if (group, plugin_id) == ("methods", "beam_direction"):
+        return (beam_direction(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
         return (InstrumentSubject(cls, str(scan_file())),)
     return ()
@@ -129,6 +131,35 @@ def crossbeam_scan(cls: Any) -> tuple[MethodSubject, ...]:
     return scans, pose
 
 
+def beam_direction(cls: Any) -> MethodSubject:
+    """Return ``beam_direction`` on four planes of a sine gauge, with the triangulation plane as well known as it is."""
+    return MethodSubject(
+        cls,
+        planes_of_gauge,
+        settings={
+            "layout": {
+                "nominal_direction": (np.sin(np.radians(20)), 0.0, -np.cos(np.radians(20))),
+                "nominal_origin": (0.05, 0.0, -0.08),
+                "pivot": (0.1, 0.05, 0.12),
+            }
+        },
+        raw_vectors={
+            "stage": "direction",
+            "nominal_direction": "direction",
+            "nominal_origin": "point",
+            "nominal_normal": "direction",
+            "triangulation_normal": "direction",
+            "plane_point": "point",
+        },
+        optional=(
+            *("nominal_origin", "nominal_normal", "triangulation_normal", "mid_range", "reading_range"),
+            *("speckle", "plane_point", "plane_point_uncertainty"),
+        ),
+        measured=("distance",),
+        seeds=150,
+    )
+
+
 #: Where the artefacts of the simulated scans stand along Y, and where the profiler hangs by its drawing, m.
 SCANNED = (-0.5, 0.0, 0.5)
 NOMINAL_LIFT = -0.17
@@ -167,6 +198,14 @@ def pocket_scans(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         provenance=provenance.make({}, None, None, seed=seed),
     )
     return virtual.raw_pocket_scan(seed=seed), truth
+
+
+def planes_of_gauge(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return readings with speckle on four planes of a sine gauge, and how the beam truly lies off its drawing."""
+    virtual = VirtualMachine("cframe", seed=seed)
+    planes = [(math.radians(20.0), math.radians(rotation)) for rotation in (0.0, 90.0, 180.0, 270.0)]
+    raw = virtual.raw_beam_direction(planes, seed=seed, speckle=True, inclination_error=False)
+    return raw, virtual.truth_beam()
 
 
 @cache
