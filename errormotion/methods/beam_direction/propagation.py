@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.methods.beam_direction.compensation import Planes, uncompensated
+from errormotion.methods.beam_direction.origin import locate
+from errormotion.methods.beam_direction.slopes import expected_covariance
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from errormotion.methods.beam_direction.compensation import Settled
@@ -85,3 +91,56 @@ def closure_chi2(propagated: Propagated) -> float:
     values, vectors = np.linalg.eigh(C)
     z = vectors[:, 2:].T @ (propagated.closure / size)
     return float(np.sum(z**2 / values[2:]))
+
+
+def expected_beam(
+    stages: Sequence[Array],
+    normals: Array,
+    direction: Array,
+    noise: float,
+    speckle: float = 0.0,
+    speckle_length: float = 0.0,
+    *,
+    origin: Array | None = None,
+    points: Array | None = None,
+    point_uncertainty: float = 0.0,
+) -> Array:
+    """Return the covariance (6, 6) of (origin, direction) to expect from readings on planes, SI.
+
+    Parameters
+    ----------
+    stages : sequence of ndarray (n, 3)
+        Places of the stage on each plane, m.
+    normals : ndarray (k, 3)
+        Unit normals of the planes.
+    direction : ndarray (3,)
+        Of the beam.
+    noise, speckle, speckle_length : float
+        Of the readings, m; see `slopes`.
+    origin : ndarray (3,), optional
+        Zero point of the beam, m.
+    points : ndarray (k, 3), optional
+        Known points of the planes, m.
+    point_uncertainty : float
+        Standard uncertainty of these points along the normals, m.
+
+    Returns
+    -------
+    ndarray (6, 6)
+        NaN for the origin where ``origin`` or ``points`` is not given, or the planes leave it open.
+
+    Raises
+    ------
+    MethodError
+        Planes that leave the direction open.
+    """
+    k = len(normals)
+    gradients = -normals / (normals @ direction)[:, None]
+    p0 = np.zeros(3) if origin is None else origin
+    P = np.full((k, 3), np.nan) if points is None or origin is None else points
+    offsets = np.nan_to_num(np.sum(gradients * (p0 - P), axis=1))
+    C = np.stack([expected_covariance(stage, noise, speckle, speckle_length) for stage in stages])
+    names = tuple(f"Plane {i + 1}" for i in range(k))
+    settled = uncompensated(Planes(names, gradients, offsets, C), direction)
+    found = locate(settled.direction, offsets, C, P, point_uncertainty)
+    return propagate(settled, found, point_uncertainty).covariance

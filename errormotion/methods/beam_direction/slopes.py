@@ -122,24 +122,37 @@ def fit_plane_readings(
             "belong together and that all of them are on one plane."
         )
     _check_strokes(design[used], total, name)
-    to_zero = np.eye(UNKNOWNS)
-    to_zero[3, :3] = -centre
     padded = np.full(distance.size, np.nan)
     padded[used] = whitened
     return PlaneFit(
         gradient=solution[:3],
         offset=float(solution[3] - solution[:3] @ centre),
-        covariance=to_zero @ covariance @ to_zero.T,
+        covariance=_about_zero(covariance, centre),
         residual=residual,
         whitened=padded,
         left_out=everything & ~used,
     )
 
 
+def expected_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
+    """Return the covariance (4, 4) that gradient and offset of readings at places (n, 3), m, will have."""
+    centre = stage.mean(axis=0)
+    design = np.column_stack([stage - centre, np.ones(len(stage))])
+    nothing = np.zeros(len(stage))
+    covariance = _generalised(design, nothing, stage, noise, speckle, speckle_length, "The plane")[1]
+    return _about_zero(covariance, centre)
+
+
 def gradient_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
     """Return the covariance (3, 3) that the gradient of readings at places (n, 3), m, will have."""
-    design = np.column_stack([stage - stage.mean(axis=0), np.ones(len(stage))])
-    return _generalised(design, np.zeros(len(stage)), stage, noise, speckle, speckle_length, "The plane")[1][:3, :3]
+    return expected_covariance(stage, noise, speckle, speckle_length)[:3, :3]
+
+
+def _about_zero(covariance: Array, centre: Array) -> Array:
+    """Return the covariance (4, 4) of (gradient, reading at place 0) from that with the reading at ``centre``."""
+    to_zero = np.eye(UNKNOWNS)
+    to_zero[3, :3] = -centre
+    return np.asarray(to_zero @ covariance @ to_zero.T)
 
 
 def correlation_factor(stage: Array, noise: float, speckle: float, speckle_length: float) -> Array:
