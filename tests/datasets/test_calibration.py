@@ -1,0 +1,245 @@
+"""The calibration of an inclination error as a dataset: what it says, where it refuses, and how it is found."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion import datasets
+from errormotion.datasets.calibration import SCHEMA, InclinationCalibration, build, violations
+from errormotion.datasets.tilt_support import TiltSupport
+from errormotion.errors import DatasetError, MethodError
+from errormotion.kinematics.beams import tilt_vector
+
+INCLINATIONS = np.radians([0, 10, 20, 30, 40])
+ROTATIONS = np.radians([0, 30, 60, 90, 120, 150, 180, 210, 240, 270, 300, 330])
+DEGREES = np.array([[0, 0], [1, 0], [2, 0], [0, 2]])
+COEFFICIENTS = np.array([1e-4, 3e-3, 2e-3, 5e-4])
+DEVIATIONS = np.array([1e-6, 2e-6, 2e-6, 3e-6])
+
+
+def calibration(
+    alpha: np.ndarray = INCLINATIONS, beta: np.ndarray = ROTATIONS, gap: float = 0.5, **changes: object
+) -> InclinationCalibration:
+    """Return a calibration of four terms over a grid of settings."""
+    a, b = (part.ravel() for part in np.meshgrid(alpha, beta))
+    n = len(a)
+    variables = {
+        "coefficient": COEFFICIENTS,
+        "coefficient_covariance": np.diag(DEVIATIONS**2),
+        "degree": DEGREES,
+        "tilt_scale": np.tan(np.radians(20)),
+        "mid_range": 0.0,
+        "mid_range_found": np.nan,
+        "mid_range_uncertainty": np.nan,
+        "reading_low": -10e-3,
+        "reading_high": 10e-3,
+        "support_gap": gap,
+        "support_margin": 0.04,
+        "inclination": a,
+        "rotation": b,
+        "setting_left_out": np.zeros(n, dtype=np.int8),
+        "noise": 1e-7,
+        "repeatability": 1e-6,
+        "group_setting": np.arange(n),
+        "group_left_out": np.zeros(n, dtype=np.int8),
+        "remaining_error": 2e-6,
+        "remaining_error_interval": [1e-6, 3e-6],
+        **{name: np.zeros(n) for name in ("group_depth", "group_residual", "offset", "slope", "slope_uncertainty")},
+        **{name: np.zeros(n) for name in ("slope_predicted", "slope_predicted_uncertainty")},
+    }
+    return InclinationCalibration(build({**variables, **changes}, {"order": 2, "mirror": 1, "provenance": "{}"}))
+
+
+@pytest.fixture(scope="module")
+def good() -> InclinationCalibration:
+    return calibration()
+
+
+@pytest.fixture(scope="module")
+def holed() -> InclinationCalibration:
+    """Settings along 0..10, 90 and 170..180 deg, over inclinations of both signs."""
+    return calibration(np.radians(np.arange(-45, 46, 5)), np.radians([0, 5, 10, 90, 170, 175, 180]))
+
+
+@given(
+    depth=st.floats(-9e-3, 9e-3),
+    alpha=st.floats(0.0, np.radians(38)),
+    beta=st.floats(0.0, 2 * np.pi),
+    mid=st.sampled_from([0.0, 1e-3]),
+)
+def test_compensation_undoes_the_error(depth: float, alpha: float, beta: float, mid: float) -> None:
+    known = calibration()
+    q = tilt_vector(alpha, beta)
+    k, _ = known.slope(q)
+    found = known.compensate(mid + depth + depth * k, q, mid_range=mid)
+    assert found.value == pytest.approx(mid + depth, abs=1e-15)
+
+
+def test_the_raw_reading_stays_beside_the_compensated_one(good: InclinationCalibration) -> None:
+    reading = np.array([-4e-3, 0.0, 5e-3, np.nan])
+    found = good.compensate(reading, tilt_vector(np.radians(20.0), 0.0))
+    np.testing.assert_array_equal(found.raw, reading)
+    assert found.value[1] == 0.0
+    assert abs(found.value[2] - reading[2]) > 1e-6
+    assert np.isnan(found.value[3])
+    assert np.isnan(found.uncertainty[3])
+
+
+def test_uncertainty_and_jacobian_are_those_of_the_coefficients(good: InclinationCalibration) -> None:
+    q, reading = tilt_vector(np.radians([15.0, 30.0]), np.radians([40.0, 200.0])), np.array([5e-3, -8e-3])
+    found = good.compensate(reading, q)
+    C = good.coefficient_covariance
+    np.testing.assert_allclose(
+        found.uncertainty, np.sqrt(np.einsum("ni,ij,nj->n", found.jacobian, C, found.jacobian)), rtol=1e-12
+    )
+    for k, step in enumerate(1e-7 * np.eye(len(COEFFICIENTS))):
+        moved = calibration(coefficient=COEFFICIENTS + step).compensate(reading, q).value
+        # second order in a step of 1e-7 relative to 1 + k
+        np.testing.assert_allclose((moved - found.value) / 1e-7, found.jacobian[:, k], rtol=1e-5, atol=1e-12)
+
+
+def test_between_settings_is_supported(good: InclinationCalibration) -> None:
+    assert good.supported(
+        tilt_vector(np.radians([5.0, 15.0, 35.0, 40.0]), np.radians([15.0, 100.0, 345.0, 45.0]))
+    ).all()
+
+
+def test_beyond_the_steepest_setting_is_refused_by_name(good: InclinationCalibration) -> None:
+    with pytest.raises(
+        MethodError, match=r"inclination 50\.0 deg at rotation 30\.0 deg lies beyond the steepest"
+    ) as told:
+        good.compensate(1e-3, tilt_vector(np.radians(50.0), np.radians(30.0)))
+    assert "nearest calibrated: inclination 40.0 deg at rotation 30.0 deg" in str(told.value)
+
+
+def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> None:
+    q = tilt_vector(np.radians([30.0, 30.0]), np.radians([5.0, 45.0]))
+    assert holed.supported(q).tolist() == [True, False]
+    with pytest.raises(
+        MethodError, match=r"rotation 45\.0 deg lies where the calibrated settings leave a hole \(1 of 2"
+    ):
+        holed.compensate([1e-3, 1e-3], q)
+    assert holed.compensate([1e-3, 1e-3], q, extrapolate=True).uncertainty[1] > 0
+
+
+def test_along_a_single_row_of_settings_is_supported(holed: InclinationCalibration) -> None:
+    alpha = np.radians(np.arange(-44.0, 45.0, 2.0))
+    assert holed.supported(tilt_vector(alpha, np.radians(90.0))).all()
+    assert holed.supported(tilt_vector(alpha, np.radians(91.5))).all()
+
+
+def test_near_right_angles_the_rows_are_close_enough_everywhere(holed: InclinationCalibration) -> None:
+    assert holed.supported(tilt_vector(np.radians(12.0), np.radians(np.arange(0.0, 360.0, 5.0)))).all()
+
+
+def test_holes_are_found_without_being_used(holed: InclinationCalibration, good: InclinationCalibration) -> None:
+    holes = holed.support.holes()
+    assert len(holes) == 4  # one in each quarter
+    assert not holed.supported(holes).any()
+    assert len(good.support.holes()) == 0
+
+
+def test_settings_that_were_left_out_support_nothing() -> None:
+    a, _ = np.meshgrid(INCLINATIONS, ROTATIONS)
+    steep = (np.abs(np.degrees(a.ravel()) - 40) < 1).astype(np.int8)
+    assert not calibration(setting_left_out=steep).supported(tilt_vector(np.radians(38.0), 0.0))
+
+
+@pytest.mark.parametrize("tilts", [[[0.0, 0.0]], [[0.0, 0.0], [0.2, 0.0]], [[0.0, 0.0], [0.2, 0.1], [0.4, 0.2]]])
+def test_settings_on_a_line_support_that_line_only(tilts: list[list[float]]) -> None:
+    support = TiltSupport(np.array(tilts), gap=0.5, margin=0.02)
+    inside = np.mean(tilts, axis=0)
+    assert support.holds(inside)
+    assert not support.holds(inside + np.array([0.0, 0.1]))
+    assert not support.holds([np.nan, 0.0])
+
+
+def test_a_reading_beyond_the_calibrated_depths_is_refused(good: InclinationCalibration) -> None:
+    with pytest.raises(MethodError, match=r"a reading 12\.000 mm from mid range lies beyond the calibrated -10\.000"):
+        good.compensate([1e-3, 12e-3], tilt_vector(0.1, 0.0))
+    assert good.compensate([12e-3], tilt_vector(0.1, 0.0), extrapolate=True).value.shape == (1,)
+
+
+def test_the_grid_shows_the_surface_and_where_it_holds(good: InclinationCalibration) -> None:
+    grid = good.grid(21)
+    q = np.array([float(grid.q1[5]), float(grid.q2[8])])
+    assert float(grid.slope[5, 8]) == good.slope(q)[0]
+    assert bool(grid.supported[10, 10])
+    assert not bool(grid.supported[0, 0])
+
+
+def test_a_calibration_comes_back_from_its_file(good: InclinationCalibration, tmp_path: Path) -> None:
+    again = InclinationCalibration.load(good.save(tmp_path / "lk_h050.nc"))
+    q = tilt_vector(np.radians(25.0), 0.3)
+    assert again.name == "lk_h050"
+    assert again.order == 2
+    np.testing.assert_array_equal(again.slope(q), good.slope(q))
+    assert datasets.violations(datasets.load(tmp_path / "lk_h050.nc")) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["lk_h050.nc"]
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder and, beside it, a folder of a bench file."""
+    for name in ("here", "bench/calibrations", "shared"):
+        (tmp_path / name).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.delenv("ERRORMOTION_CALIBRATIONS", raising=False)
+    return tmp_path
+
+
+def test_a_calibration_is_found_by_name_beside_the_file_that_names_it(
+    good: InclinationCalibration, folders: Path
+) -> None:
+    good.save(folders / "bench" / "calibrations" / "left.nc")
+    assert InclinationCalibration.find("left", folders / "bench").name == "left"
+    assert InclinationCalibration.find("calibrations/left.nc", folders / "bench").name == "left"
+
+
+def test_a_calibration_is_found_by_name_in_the_working_folder_and_in_the_named_one(
+    good: InclinationCalibration, folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ERRORMOTION_CALIBRATIONS", str(folders / "shared"))
+    good.save(folders / "shared" / "one.nc")
+    (folders / "here" / "calibrations").mkdir()
+    good.save(folders / "here" / "calibrations" / "two.nc")
+    good.save(folders / "here" / "three.nc")
+    assert [InclinationCalibration.find(name).name for name in ("one", "two", "three.nc")] == ["one", "two", "three"]
+
+
+def test_a_calibration_that_is_not_there_says_where_it_was_looked_for(
+    good: InclinationCalibration, folders: Path
+) -> None:
+    good.save(folders / "bench" / "calibrations" / "left.nc")
+    with pytest.raises(DatasetError, match="not found") as told:
+        InclinationCalibration.find("right", folders / "bench")
+    message = str(told.value)
+    assert str(folders / "bench" / "calibrations" / "right.nc") in message
+    assert str(folders / "here" / "calibrations" / "right.nc") in message
+    assert "Calibrations there: left." in message
+    assert "ERRORMOTION_CALIBRATIONS" in message
+
+
+def test_readings_are_no_calibration(tmp_path: Path) -> None:
+    datasets.save(xr.Dataset(attrs={"schema": "errormotion.raw.inclination/1"}), tmp_path / "data.nc")
+    with pytest.raises(DatasetError, match="make a calibration of them with 'errormotion calibrate"):
+        InclinationCalibration.load(tmp_path / "data.nc")
+
+
+def test_every_breach_of_the_schema_is_told(good: InclinationCalibration, tmp_path: Path) -> None:
+    broken = good.dataset.drop_vars("noise").assign(
+        mid_range=5.0, coefficient_covariance=(("term", "term_"), -np.eye(4)), tilt_scale=np.nan
+    )
+    found = violations(broken)
+    assert [line.split(":")[0] for line in found] == ["tilt_scale", "mid_range = 5 m", "noise()"]
+    assert "is it in mm?" in found[1]
+    found = violations(good.dataset.assign(coefficient_covariance=(("term", "term_"), -np.eye(4))))
+    assert found == ["coefficient_covariance: expected a symmetric matrix without negative variances; found another"]
+    datasets.save(broken, tmp_path / "broken.nc")
+    with pytest.raises(DatasetError, match=rf"breaks its schema \({SCHEMA}\)") as told:
+        InclinationCalibration.load(tmp_path / "broken.nc")
+    assert len(told.value.violations) == 3
