@@ -46,7 +46,7 @@ class Points:
     influence : ndarray (source, n, 3)
         Signed effect, m, of one standard uncertainty of each source that all points share.
     sources : tuple of str
-        Names of these sources.
+        Names of these sources; scans with the same beam and calibration share the sources of the same name.
     reading : ndarray (n,)
         As read, m.
     distance : ndarray (n,)
