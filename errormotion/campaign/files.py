@@ -119,6 +119,8 @@ class CampaignPlan:
     runs: Path
     source: Path
     text: str
+    folder: Path
+    """Where files are looked for that its settings name."""
 
     @property
     def sha256(self) -> str:
@@ -210,7 +212,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         )
         for test in table.test
     )
-    return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text)
+    return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text, source.parent.resolve())
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:

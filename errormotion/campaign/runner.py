@@ -14,6 +14,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 from uuid import uuid4
@@ -28,6 +29,7 @@ from errormotion.campaign.journal import journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
+from errormotion.datasets.folders import looking_beside
 from errormotion.errors import ErrormotionError, RunError
 
 log = logging.getLogger(__name__)
@@ -191,7 +193,7 @@ class _Session:
                 if folder is None:
                     folder = folders[test.name] = self._new_folder(test)
                 self.progress.test(test.name, folder.path, number, len(self.campaign.tests))
-                with folder.locked(), journal(folder.log), _failures(folder):
+                with folder.locked(), journal(folder.log), looking_beside(self.campaign.folder), _failures(folder):
                     self._test(folder, test, folders)
         return [folders[test.name] for test in self.campaign.tests]
 
@@ -210,6 +212,7 @@ class _Session:
                 "campaign": {
                     "name": plan.name,
                     "file": plan.source.name,
+                    "folder": str(plan.folder),
                     "sha256": plan.sha256,
                     "tests": [entry.name for entry in plan.tests],
                     "text": plan.text,
@@ -412,4 +415,5 @@ def _stored_plan(folder: RunFolder) -> CampaignPlan:
     """Return the plan of a run as it was when it was started."""
     campaign, bench = folder.data["campaign"], folder.data["bench"]
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
-    return parse_campaign(campaign["text"], folder.path / f"run.json ({campaign['file']})", plan)
+    found = parse_campaign(campaign["text"], folder.path / f"run.json ({campaign['file']})", plan)
+    return replace(found, folder=Path(campaign["folder"])) if "folder" in campaign else found

@@ -26,6 +26,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
+from errormotion.datasets.folders import folders_beside
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
@@ -182,7 +183,8 @@ class InclinationCalibration:
         name : str or Path
             A path, taken from ``folder`` if it is relative and from the working folder if it is not there; or a bare
             name: ``NAME.nc`` in the folder `calibrations` of ``folder``, in that of the working folder, or in the
-            folder that the environment variable ``ERRORMOTION_CALIBRATIONS`` names.
+            folder that the environment variable ``ERRORMOTION_CALIBRATIONS`` names. While a campaign runs, the folder
+            of its file counts as ``folder`` does.
         folder : str or Path, optional
             Where the file stands that names the calibration.
 
@@ -192,7 +194,7 @@ class InclinationCalibration:
             Not found (says where it was looked for, and what is there instead), or no calibration.
         """
         bases = [Path(folder)] if folder is not None else []
-        bases += [Path.cwd()] if Path.cwd() not in bases else []
+        bases += [base for base in dict.fromkeys((*folders_beside(), Path.cwd())) if base not in bases]
         places = [base / name for base in bases]
         homes: list[Path] = []
         if len(Path(name).parts) == 1:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.calibration import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction import design
 
@@ -58,7 +59,11 @@ def measure_planes(
     ------
     MethodError
         No control that moves the stage, or no face within the search.
+    DatasetError
+        The calibration that the settings name is not found: before anything is measured.
     """
+    if settings.compensation is not None:
+        InclinationCalibration.find(settings.compensation)
     stand = Stand(bench, settings)
     faces = settings.planes
     longest = max(len(places) for places in stand.paths)

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.calibration import InclinationCalibration
 from errormotion.datasets.units import format_quantity
 from errormotion.kinematics.beams import across, beam_errors, tilt
 from errormotion.methods.beam_direction import design
@@ -130,8 +131,6 @@ def _slope_uncertainty(settings: Settings) -> Callable[[Array], Array] | None:
     """Return what the calibration named in the settings leaves of the slope, as a function of the tilts (k, 2)."""
     if settings.compensation is None:
         return None
-    from errormotion.datasets.calibration import InclinationCalibration
-
     calibration = InclinationCalibration.find(settings.compensation)
     u = np.array(settings.layout.nominal_direction, np.float64)
     u /= np.linalg.norm(u)

@@ -1,0 +1,25 @@
+"""Where files are looked for that settings name: beside the file that holds the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+_beside: ContextVar[tuple[Path, ...]] = ContextVar("beside", default=())
+
+
+@contextmanager
+def looking_beside(folder: Path) -> Iterator[None]:
+    """Let names in settings be looked for in a folder too, such as that of a campaign file, while this lasts."""
+    token = _beside.set((folder, *_beside.get()))
+    try:
+        yield
+    finally:
+        _beside.reset(token)
+
+
+def folders_beside() -> tuple[Path, ...]:
+    """Return the folders to look into, the innermost first."""
+    return _beside.get()
