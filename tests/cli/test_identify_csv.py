@@ -66,3 +66,10 @@ def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) ->
     (tmp_path / "runs" / "one" / "run.json").write_text("{}")
     told = run("identify", "runs", "--out", "errors", code=1).stderr
     assert "is a folder of runs; say which method's with --method" in told
+
+
+def test_check_bar_alone_tells_no_beam(run: Run) -> None:
+    published = Path(__file__).parents[2] / "examples" / "check_bar" / "scheme1.csv"
+    run("validate", published)
+    told = run("identify", published, "--out", "errors.nc", code=1).stderr
+    assert "hold a check bar alone" in told

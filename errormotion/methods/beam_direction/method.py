@@ -78,6 +78,11 @@ class BeamDirection:
         validate(checked)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        if "distance" not in checked:
+            raise MethodError(
+                "The raw data hold a check bar alone: it proves a beam that is known, and does not tell where one goes. "
+                "Measure planes as well, or fit the bar with errormotion.methods.beam_direction.check_bar.measure_bar."
+            )
         return identify_beam(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
