@@ -80,7 +80,7 @@ class BeamDirection:
             raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         if "distance" not in checked:
             raise MethodError(
-                "The raw data hold a check bar alone: it proves a beam that is known, and does not tell where one goes. "
+                "The raw data hold a check bar alone: it proves a beam that is known and finds none. "
                 "Measure planes as well, or fit the bar with errormotion.methods.beam_direction.check_bar.measure_bar."
             )
         return identify_beam(checked, settings, self.info.id, self.info.version)
