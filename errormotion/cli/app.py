@@ -103,6 +103,21 @@ def identify(
     data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
 
 
+@app.command()
+@guarded
+def calibrate(
+    data: Annotated[Path, typer.Argument(help="Readings of a point sensor against an interferometer: NetCDF or CSV.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, .nc; it must not exist.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    json_: Json = False,
+) -> None:
+    """Make a calibration of a sensor's inclination error."""
+    from errormotion.cli import calibrating
+
+    calibrating.run(data, out, set_ or [], settings, json_)
+
+
 @app.command("import")
 @guarded
 def import_(

@@ -50,7 +50,9 @@ def _range(row: Row) -> str:
 
 
 def _guess(value: float, row: Row) -> str:
-    for factor, offset, unit in _MISTAKES.get(row.unit, ()):
+    mistakes = _MISTAKES.get(row.unit, ())
+    # Where a whole turn is plausible nobody writes seconds of arc.
+    for factor, offset, unit in mistakes[::-1] if row.unit == "rad" and row.high > 1 else mistakes:
         if row.low <= value * factor + offset <= row.high:
             return f"; is it in {unit}?"
     return ""

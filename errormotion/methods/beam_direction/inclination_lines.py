@@ -217,8 +217,11 @@ def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
 
 def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, free: bool) -> NDArray[np.bool_]:
     """Return which readings lie on the line of their setting; a setting keeps at least what its line needs."""
-    scale = max(_GAUSS * float(np.median(np.abs(residual[kept]))), _LEAST_NOISE)
-    few = np.bincount(readings.setting)[readings.setting] < (_ENOUGH if free else 2)
+    count = np.bincount(readings.setting)
+    # Lines come closer to their readings than the truth does, by the share of the readings that they take up.
+    share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
+    scale = max(_GAUSS * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
+    few = count[readings.setting] < (_ENOUGH if free else 2)
     return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
 
 
