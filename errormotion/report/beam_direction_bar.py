@@ -92,7 +92,7 @@ def blocks(bar: Bar, key: str) -> list[Block]:
     """Return the section on the check bar; ``key`` keeps its figure's identifiers apart."""
     used = int((np.isfinite(bar.residual) & ~bar.left_out).sum())
     rows: list[list[Cell | str]] = [
-        [f"centre, {name}", "mm", estimate(1e3 * value, 2e3 * u, digits=7)]
+        [f"centre, {name}", "mm", _coordinate(value, u)]
         for name, value, u in zip("xyz", bar.centre, bar.centre_u, strict=True)
     ]
     rows.append(["radius", "mm", estimate(1e3 * bar.radius, 2e3 * bar.radius_u, digits=6, signed=False)])
@@ -111,6 +111,12 @@ def blocks(bar: Bar, key: str) -> list[Block]:
         found.append(_named(bar))
     drawn = figure(bar, key)
     return [*found, drawn] if drawn else [*found, Text("The points of the bar are not in the result.", "note")]
+
+
+def _coordinate(value: float, u: float) -> Cell:
+    if u == 0:
+        return Cell(fixed(1e3 * value, 3, signed=True), reason="along the bar, where its centre is not determined")
+    return estimate(1e3 * value, 2e3 * u, digits=7)
 
 
 def _named(bar: Bar) -> Table:

@@ -170,12 +170,14 @@ def lines(beam: Found, key: str) -> Figure | None:
         for i, plane in enumerate(known)
         if steady[i]
     ]
-    check = "Two planes always meet in one point: they do not check one another. " if steady.sum() == 2 else ""
+    check = " Two planes always meet in one point: they do not check one another." if steady.sum() == 2 else ""
     caption = (
         "What each plane says of the direction, seen along the beam, which is in the middle: to each plane every "
-        f"direction on its line is right, in its band within k = 2. {check}The steeper a plane, the narrower its band."
+        "direction on its line is right. Bands: noise of its readings, k = 2; the steeper a plane, the narrower."
     )
-    return Figure(canvas.draw(paint, key, 3.3), caption, f"Lines of the planes about the beam: {'; '.join(words)}.")
+    return Figure(
+        canvas.draw(paint, key, 3.3), caption + check, f"Lines of the planes about the beam: {'; '.join(words)}."
+    )
 
 
 def ellipse(covariance: Array) -> Array | None:
@@ -199,9 +201,9 @@ def round_down(value: float) -> float:
 
 
 def round_up(value: float) -> float:
-    """Return the smallest 1, 2 or 5 times a power of ten that is not smaller."""
+    """Return the smallest 1, 2, 3 or 5 times a power of ten that is not smaller."""
     power = 10.0 ** math.floor(math.log10(value))
-    return float(min(step * power for step in (1, 2, 5, 10) if step * power >= value * (1 - 1e-9)))
+    return float(min(step * power for step in (1, 2, 3, 5, 10) if step * power >= value * (1 - 1e-9)))
 
 
 def number(value: float) -> str:
@@ -316,7 +318,9 @@ def _beside(room: Axes, beam: Found, planes: list[int], flat: list[str]) -> None
         tilt = f": inclination {fixed(degrees[0, plane], 1)}°, rotation {fixed(degrees[1, plane], 0)}°"
         label = f"plane {beam.planes.names[plane]}{tilt if np.isfinite(degrees[:, plane]).all() else ''}"
         handles.append(Line2D([], [], color=look_of(plane), lw=1.1, label=label))
-    handles.append(Patch(facecolor=canvas.VERMILLION, alpha=0.4, label="direction of the beam, k = 2"))
+    handles.append(
+        Patch(facecolor=canvas.VERMILLION, alpha=0.4, label="direction of the beam, all that is uncertain, k = 2")
+    )
     room.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.05, 1.02))
     words = []
     axes_across, names = across(beam.direction)

@@ -170,14 +170,15 @@ def left_out(planes: Planes) -> list[Block]:
                 stroke or Cell(DASH, reason="the places of the stage are not in the result"),
                 where if np.isfinite(at).all() else Cell(DASH, reason="the places of the stage are not in the result"),
                 or_dash(fixed(1e3 * planes.raw[k, i], 4, signed=True), "the reading is not in the result"),
-                or_dash(fixed(1e6 * planes.residual[k, i], 1, signed=True), "no residual"),
+                or_dash(fixed(1e6 * planes.residual[k, i], 1, signed=True), "it was not compared with the plane"),
+                "out of range" if planes.beyond[k, i] else "off its plane",
             ]
         )
     notes = [f"{len(places) - _NAMED} more are in the dataset."] if len(places) > _NAMED else []
     return [
         Table(
-            "Readings that were left out, because they contradict the others of their plane.",
-            ["reading", "stroke", "stage / mm", "reading / mm", "residual / µm"],
+            "Readings that were left out: far off the plane of the others, or out of the sensor's range.",
+            ["reading", "stroke", "stage / mm", "reading / mm", "residual / µm", "why"],
             rows,
             notes=notes,
         )

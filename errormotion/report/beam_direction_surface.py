@@ -17,23 +17,39 @@ from errormotion.kinematics.beams import tilt_vector
 from errormotion.report import canvas, crossbeam_maps
 from errormotion.report.beam_direction_view import Array, Found, Planes
 from errormotion.report.document import Block, Figure, Source, Text
-from errormotion.report.text import finite, fixed, integer, significant
+from errormotion.report.text import finite, fixed, integer, listed, significant
 
 _HATCH = "#9a9a9a"
 _NEAR = np.deg2rad(10.0)  # a setting or plane counts to a section that it lies so near to
 _STEPS = 81
+_DEPTHS = 9  # dots over the depth, at each inclination
 _SECTIONS = (0.0, np.pi / 2)
 
 
 @dataclass(frozen=True)
 class _Tilts:
-    """Settings of the calibration: tilts (n, 2), inclination and rotation, own slope, and which were left out."""
+    """What was calibrated.
 
-    q: Array
+    Attributes
+    ----------
+    inclination, rotation, slope : (setting,)
+        rad, rad, 1.
+    left_out : (setting,) of bool
+    group : (group,) of int
+        Setting of each group of readings.
+    depth, error : (group,)
+        Depth from mid range and error there, m.
+    group_left_out : (group,) of bool
+    """
+
     inclination: Array
     rotation: Array
     slope: Array
     left_out: NDArray[np.bool_]
+    group: NDArray[np.intp]
+    depth: Array
+    error: Array
+    group_left_out: NDArray[np.bool_]
 
 
 def calibration_of(source: Source) -> tuple[InclinationCalibration | None, str]:
@@ -51,7 +67,21 @@ def blocks(beam: Found, calibration: InclinationCalibration | None, why: str, ke
     """Return the section on the calibration; ``why`` says what is the matter where it is None."""
     if calibration is None:
         return [Text(f"No map: {why.rstrip('.')}.", "note")]
-    return [Text(in_words(calibration)), maps(beam.planes, calibration, key)]
+    return [Text(in_words(calibration)), *_extrapolated(beam.planes, calibration), maps(beam.planes, calibration, key)]
+
+
+def _extrapolated(planes: Planes, calibration: InclinationCalibration) -> list[Block]:
+    """Say which planes lie where nothing was calibrated."""
+    known = np.isfinite(planes.inclination) & np.isfinite(planes.rotation)
+    bare = known & ~calibration.supported(tilt_vector(planes.inclination, planes.rotation))
+    if not bare.any():
+        return []
+    names = listed([planes.names[k] for k in np.flatnonzero(bare)])
+    lies = f"planes {names} lie" if bare.sum() > 1 else f"plane {names} lies"
+    words = (
+        f"To the beam, {lies} where the calibration has no settings around: what was taken off there is extrapolated."
+    )
+    return [Text(words, "warning")]
 
 
 def in_words(calibration: InclinationCalibration) -> str:
@@ -83,8 +113,7 @@ def maps(planes: Planes, calibration: InclinationCalibration, key: str) -> Figur
     sections = [_section(calibration, across, depth, rotation) for rotation in _SECTIONS]
     disc = _disc(calibration, across)
     slope_scale = crossbeam_maps.scale_of(1e3 * np.concatenate([disc.ravel(), tilts.slope[~tilts.left_out]]), 20)
-    of_tilts = 1e6 * np.outer(tilts.slope[~tilts.left_out], depth[[0, -1]])
-    error_scale = crossbeam_maps.scale_of(np.concatenate([1e6 * np.ravel(sections), of_tilts.ravel()]), 20)
+    error_scale = crossbeam_maps.scale_of(1e6 * np.ravel(sections), 20)
 
     def paint(figure: Canvas) -> None:
         wide, high = figure.get_figwidth(), figure.get_figheight()
@@ -128,13 +157,17 @@ def maps(planes: Planes, calibration: InclinationCalibration, key: str) -> Figur
 
 def _tilts(calibration: InclinationCalibration) -> _Tilts:
     ds = calibration.dataset
-    alpha, beta = np.asarray(ds["inclination"].values, float), np.asarray(ds["rotation"].values, float)
+    slope = np.asarray(ds["slope"].values, float)
+    group, depth = np.asarray(ds["group_setting"].values, dtype=int), np.asarray(ds["group_depth"].values, float)
     return _Tilts(
-        tilt_vector(alpha, beta),
-        alpha,
-        beta,
-        np.asarray(ds["slope"].values, float),
+        np.asarray(ds["inclination"].values, float),
+        np.asarray(ds["rotation"].values, float),
+        slope,
         np.asarray(ds["setting_left_out"].values > 0),
+        group,
+        depth,
+        depth * slope[group] + np.asarray(ds["group_residual"].values, float),
+        np.asarray(ds["group_left_out"].values > 0),
     )
 
 
@@ -236,14 +269,10 @@ def _draw_section(
     crossbeam_maps.cells(room, degrees, millimetres, 1e6 * error, scale)
     _hatch(room, degrees, millimetres, np.isnan(error))
     room.grid(visible=False)
-    signed, near = _on(tilts.inclination, tilts.rotation, rotation)
-    near &= ~tilts.left_out
-    shown = np.linspace(depth[0], depth[-1], 7)
-    x, y = np.meshgrid(np.rad2deg(signed[near]), 1e3 * shown)
-    values = 1e6 * shown[:, None] * tilts.slope[near]
-    room.scatter(
-        x.ravel(), y.ravel(), c=scale.to_rgba(values.ravel()), s=5, edgecolors="#333333", linewidths=0.25, zorder=4
-    )
+    x, y, values, out = _readings_on(tilts, rotation)
+    colours = scale.to_rgba(1e6 * values[~out])
+    room.scatter(np.rad2deg(x[~out]), 1e3 * y[~out], c=colours, s=5, edgecolors="#333333", linewidths=0.25, zorder=4)
+    room.plot(np.rad2deg(x[out]), 1e3 * y[out], "x", color="#222222", ms=3.5, mew=0.7, zorder=4)
     at, close = _on(planes.inclination, planes.rotation, rotation)
     for k in np.flatnonzero(close):
         used = 1e3 * (planes.raw[k] - mid_range)
@@ -253,6 +282,27 @@ def _draw_section(
     room.set_ylabel("depth / mm")
     turn = fixed(np.rad2deg(rotation), 0)
     room.set_title(f"rotation {turn}°, and {fixed(np.rad2deg(rotation) + 180, 0)}° left of 0")
+
+
+def _readings_on(tilts: _Tilts, rotation: float) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return signed inclination, depth, error and whether they were left out of some readings near a section.
+
+    Of settings at one inclination the one nearest to the section is taken, and of its readings a few over the depth.
+    """
+    signed, near = _on(tilts.inclination, tilts.rotation, rotation)
+    aside = np.abs(np.sin(tilts.rotation - rotation) * tilts.inclination)
+    chosen: dict[int, int] = {}
+    for k in (int(k) for k in np.flatnonzero(near & ~tilts.left_out)):
+        place = round(float(np.rad2deg(signed[k])))
+        if place not in chosen or aside[k] < aside[chosen[place]]:
+            chosen[place] = k
+    picks = [np.zeros(0, dtype=int)]
+    for k in chosen.values():
+        mine = np.flatnonzero(tilts.group == k)
+        mine = mine[np.argsort(tilts.depth[mine])]
+        picks.append(mine[np.unique(np.linspace(0, mine.size - 1, _DEPTHS).astype(int))] if mine.size else mine)
+    some = np.concatenate(picks)
+    return signed[tilts.group[some]], tilts.depth[some], tilts.error[some], tilts.group_left_out[some]
 
 
 def _bar(figure: Canvas, scale: ScalarMappable, place: tuple[float, float, float, float], label: str) -> None:

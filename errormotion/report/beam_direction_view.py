@@ -12,6 +12,7 @@ from errormotion.report.crossbeam_view import field
 
 Array = NDArray[np.float64]
 STROKES = "XYZ"
+_BEYOND = 2  # in `left_out`: out of range
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Planes:
         m.
     left_out, given : (plane, reading) of bool
         What the fit did not use, and where there was a reading at all.
+    beyond : (plane, reading) of bool
+        What of that lay out of the sensor's range.
     stage : (plane, reading, 3)
         m.
     """
@@ -47,6 +50,7 @@ class Planes:
     compensated: Array
     left_out: NDArray[np.bool_]
     given: NDArray[np.bool_]
+    beyond: NDArray[np.bool_]
     stage: Array
 
     def __len__(self) -> int:
@@ -114,7 +118,8 @@ class Found:
 
 def is_direction(errors: xr.Dataset) -> bool:
     """Return whether a dataset is the result of `beam_direction`."""
-    return errors.attrs.get("method") == "beam_direction" and "beam" in errors.dims
+    measured = "beam_direction" in errors and "beam" in errors.dims  # a plan has no direction
+    return measured and errors.attrs.get("method") == "beam_direction"
 
 
 def found(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Found:
@@ -152,7 +157,7 @@ def _planes(errors: xr.Dataset, raw: xr.Dataset | None) -> Planes:
     reading = get("distance_raw", "plane", "reading")
     compensated = get("distance_compensated", "plane", "reading")
     residual = get("residual", "plane", "reading")
-    left_out = np.nan_to_num(get("left_out", "plane", "reading")) > 0
+    code = np.nan_to_num(get("left_out", "plane", "reading"))
     given = np.isfinite(reading) | np.isfinite(compensated) | np.isfinite(residual)
     names = [str(i + 1) for i in range(n)]
     if "plane" in errors.coords and errors["plane"].dtype.kind in "US":
@@ -169,8 +174,9 @@ def _planes(errors: xr.Dataset, raw: xr.Dataset | None) -> Planes:
         get("compensation", "plane", "reading"),
         reading,
         compensated,
-        left_out & given,
+        (code > 0) & given,
         given,
+        (code >= _BEYOND) & given,
         stage,
     )
 

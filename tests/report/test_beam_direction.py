@@ -8,9 +8,11 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import DOF, build_errors, provenance
-from errormotion.datasets.calibration import InclinationCalibration, build, terms
-from errormotion.kinematics.beams import tilt_vector
+from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction.method import BeamDirection
+from errormotion.methods.beam_direction.settings import Settings
 from errormotion.report import write_report
+from errormotion.twin import VirtualMachine
 
 ARCSEC = np.pi / 180 / 3600
 DEGREE = np.pi / 180
@@ -21,44 +23,6 @@ NOISE = 0.4e-6
 def k_of(q):
     """Slope of the inclination error: -0.6 % at 45 degrees in the triangulation plane, little across it."""
     return -4.5e-3 * q[..., 0] ** 2 - 1.5e-3 * q[..., 0] ** 3 - 0.7e-3 * q[..., 1] ** 2
-
-
-def calibration_dataset(rotations=(0, 5, 10, 90, 170, 175, 180)):
-    """A calibration of that error: inclinations to 45 degrees, and nothing between the rotations 10 and 90."""
-    rng = np.random.default_rng(3)
-    alpha, beta = (grid.ravel() * DEGREE for grid in np.meshgrid(np.arange(-45.0, 46.0, 5.0), rotations))
-    q = tilt_vector(alpha, beta)
-    degree = np.array([(i, j) for i in range(4) for j in range(0, 4, 2) if i + j <= 3])
-    J = terms(q, degree)
-    coefficient = np.linalg.lstsq(J, k_of(q), rcond=None)[0]
-    slope = k_of(q) + rng.normal(0, 2e-5, len(q))
-    out = np.arange(len(q)) == 12
-    slope[out] += 2e-3
-    return build(
-        {
-            "coefficient": coefficient,
-            "coefficient_covariance": np.eye(len(degree)) * 1e-5**2,
-            "degree": degree,
-            "tilt_scale": 1.0,
-            "mid_range": 0.0,
-            "reading_low": -10e-3,
-            "reading_high": 10e-3,
-            "support_gap": 0.3,
-            "support_margin": 0.02,
-            "inclination": alpha,
-            "rotation": beta,
-            "slope": slope,
-            "slope_uncertainty": np.full(len(q), 2e-5),
-            "slope_predicted": J @ coefficient,
-            "slope_predicted_uncertainty": np.full(len(q), 1e-5),
-            "setting_left_out": out.astype(int),
-            "noise": 0.3e-6,
-            "repeatability": 2e-5,
-            "remaining_error": 2.2e-5,
-            "remaining_error_interval": [1.9e-5, 2.6e-5],
-        },
-        {"order": 3, "mirror": 1, "provenance": "{}", "name": "lk-h050"},
-    )
 
 
 def axes_of(u, t):
@@ -215,12 +179,25 @@ def number(text):
     return float(text.split()[0].replace("−", "-"))
 
 
+@pytest.fixture(scope="module")
+def calibration():
+    """A calibration with nothing between the rotations 10 and 90 degrees, and one setting that contradicts it."""
+    raw = VirtualMachine("cframe", seed=3).raw_inclination(
+        DEGREE * np.arange(-45, 46, 7.5),
+        DEGREE * np.array([0, 5, 10, 90, 170, 175]),
+        1e-3 * np.arange(-10, 11, 4),
+        seed=1,
+    )
+    wrong = np.isclose(raw["inclination"], 15 * DEGREE) & np.isclose(raw["rotation"], 5 * DEGREE)
+    return calibrate(raw.assign(reading=raw["reading"].where(~wrong, 1.004 * raw["reading"])))
+
+
 @pytest.fixture
-def page(tmp_path, monkeypatch):
+def page(calibration, tmp_path, monkeypatch):
     """Write the report in a folder where the calibration is found by its name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "calibrations").mkdir()
-    InclinationCalibration(calibration_dataset()).save(tmp_path / "calibrations" / "lk-h050.nc")
+    calibration.save(tmp_path / "calibrations" / "lk-h050.nc")
 
     def write(errors, **more):
         return write_report(errors, tmp_path / "report.html", **more).read_text(encoding="utf-8")
@@ -229,11 +206,11 @@ def page(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def html(tmp_path_factory):
+def html(calibration, tmp_path_factory):
     folder = tmp_path_factory.mktemp("beam")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        InclinationCalibration(calibration_dataset()).save(folder / "lk-h050.nc")
+        calibration.save(folder / "lk-h050.nc")
         return write_report(result(compensation="lk-h050.nc"), folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -312,22 +289,24 @@ def test_the_direction_stands_before_and_after_compensation(html):
         assert [number(cell) for cell in row[3:5]] == pytest.approx([spans.min(), spans.max()], abs=5.1e-3)
 
 
-def test_a_tilt_that_the_calibration_does_not_support_is_hatched(page):
-    supported, not_supported = (
+def test_a_tilt_that_the_calibration_does_not_support_is_said(page):
+    supported, bare = (
         page(result(planes)) for planes in (((20, 0), (20, 90), (25, 180)), ((20, 0), (30, 45), (25, 180)))
     )
-    told = [
-        re.search(r'aria-label="(Maps of the inclination error[^"]+)"', html)[1] for html in (supported, not_supported)
-    ]
+    told = [re.search(r'aria-label="(Maps of the inclination error[^"]+)"', html)[1] for html in (supported, bare)]
     assert "not supported" not in told[0]
     assert re.search(r"plane 2 \S+ \(not supported\)", told[1])
-    assert "Hatched: not supported" in words_of(supported)
+    assert "extrapolated" not in supported
+    assert "plane 2 lies where the calibration has no settings around" in words_of(bare)
 
 
-def test_the_calibration_is_told_with_its_remaining_error(html):
-    assert "133 tilts, 1 of them left out, fitted by a polynomial of order 3" in words_of(html)
-    # 0.022 um per mm over 10 mm.
-    assert "0.022 µm per mm (95 %: 0.019 to 0.026), which is 0.22 µm at 10.0 mm" in words_of(html)
+def test_the_calibration_is_told_with_its_remaining_error(html, calibration):
+    found = re.search(r"at 78 tilts, 1 of them left out, fitted by a polynomial of order (\d+)", words_of(html))
+    assert int(found[1]) == calibration.order
+    told = re.search(r"did not know: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
+    ds = calibration.dataset
+    expected = 1e3 * np.array([ds["remaining_error"].item(), *ds["remaining_error_interval"].values])
+    np.testing.assert_allclose([float(number) for number in told.groups()], expected, rtol=0.06)  # two digits
 
 
 def test_a_calibration_that_is_not_there_is_a_sentence(tmp_path, monkeypatch):
@@ -362,7 +341,7 @@ EXTRAS = sorted(set(result().data_vars) - {"covariance", *DOF})
 @pytest.mark.parametrize("lacking", [*(EXTRAS[i::8] for i in range(8)), EXTRAS])
 def test_whatever_extra_is_missing_the_rest_is_reported(page, lacking):
     html = page(result().drop_vars(lacking))
-    assert 'id="direction-1"' in html
+    assert 'id="provenance-1"' in html
     assert "nan" not in words_of(html).lower().split()
 
 
@@ -416,3 +395,46 @@ def test_many_planes_are_told_and_some_are_drawn(page):
     html = page(result(tuple((20, angle) for angle in range(0, 360, 24))))
     assert len(table(html, "The planes.")) == 15
     assert "12 of 15 planes are shown." in words_of(html)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """Four faces of a virtual sine gauge and a check bar, with a reading off its plane and one out of range."""
+    machine = VirtualMachine("cframe", seed=3)
+    faces = [(20 * DEGREE, angle * DEGREE) for angle in (0, 90, 180, 270)]
+    raw = machine.raw_beam_direction(faces, seed=1, check_bar=True, count=12)
+    raw["distance"][0, 4] += 40e-6
+    raw["distance"][2, 0] = 10.2e-3
+    return raw
+
+
+def test_a_result_of_the_method_is_told_whole(page, measured):
+    errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
+    html = page(errors, raw=measured)
+    text = words_of(html)
+    assert "SIMULATED DATA" in text
+    assert len(drawings(html)) == 6
+    assert "nan" not in text.lower().split()
+    assert [(row[0], row[1], row[5]) for row in table(html, "Readings that were left out")] == [
+        ("plane 1, reading 5", "X", "off its plane"),
+        ("plane 3, reading 1", "X", "out of range"),
+    ]
+    bar = {row[0]: row[2] for row in table(html, "Check bar measured")}
+    assert number(bar["radius"]) == pytest.approx(1e3 * float(errors["bar_radius_fitted"]), abs=5.1e-5)
+    assert bar["radius of the bar as known"] == "25.0000"
+    assert [row[0] for row in table(html, "Uncertainty budget")][:2] == [
+        "inclination calibration",
+        "triangulation plane",
+    ]
+
+
+def test_a_result_without_compensation_is_told_with_its_contradiction(page, measured):
+    html = page(BeamDirection().identify(measured, Settings(ordered=False)), raw=measured)
+    assert "The readings were not compensated for the tilt of the planes" in words_of(html)
+    assert "The planes contradict one another" in words_of(html)
+    assert "the plane of triangulation is not known" in words_of(html)
+
+
+def test_a_plan_keeps_its_plain_chapter(page):
+    planned = result().drop_vars("beam_direction")  # a plan says how well it would be known, and nothing else
+    assert "Direction of the beam" not in page(planned)
