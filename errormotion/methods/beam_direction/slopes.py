@@ -208,6 +208,7 @@ def _check_strokes(design: Array, total: float, name: str) -> None:
     open_ = vectors.T[values <= least]
     if not len(open_):
         return
+    open_ = open_ * np.sign(open_[np.arange(len(open_)), np.argmax(np.abs(open_), axis=1)])[:, None]
     spread = float(np.sqrt(max(values[0], 0.0) / len(design)))
     along = ", ".join("({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0)) for v in open_)
     raise MethodError(
