@@ -118,8 +118,8 @@ class Found:
 
 def is_direction(errors: xr.Dataset) -> bool:
     """Return whether a dataset is the result of `beam_direction`."""
-    measured = "beam_direction" in errors and "beam" in errors.dims  # a plan has no direction
-    return measured and errors.attrs.get("method") == "beam_direction"
+    measured = "beam_direction" in errors or "residual" in errors  # a plan has neither
+    return measured and "beam" in errors.dims and errors.attrs.get("method") == "beam_direction"
 
 
 def found(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Found:

@@ -436,5 +436,5 @@ def test_a_result_without_compensation_is_told_with_its_contradiction(page, meas
 
 
 def test_a_plan_keeps_its_plain_chapter(page):
-    planned = result().drop_vars("beam_direction")  # a plan says how well it would be known, and nothing else
+    planned = result().drop_vars(EXTRAS)  # how well the beam would be known, and nothing of it
     assert "Direction of the beam" not in page(planned)
