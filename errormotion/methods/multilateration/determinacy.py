@@ -1,0 +1,194 @@
+"""What distances determine, and which freedom is loose where they do not.
+
+A target with k readings says k - 3 things about the stations, which have 4 n - 6 unknowns together: places and dead
+paths without the six motions of the whole. Four stations need ten targets. Where stations or targets stand badly, these
+equations depend on one another: with stations in one plane two freedoms are loose whatever the targets, and a target in
+one line with two stations, or in one plane with all, has a direction in which no distance changes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.model import Stations
+
+Array = NDArray[np.float64]
+
+LOOSE = 0.05
+"""A freedom with a standard uncertainty above this share of the distances is loose: nothing is linear any more."""
+DIGITS = 1e-13
+"""An eigenvalue below this share of the largest is rounding."""
+FLAT = 0.03
+"""Stations thinner than this share of their extent count as standing in a plane, or on a line."""
+NEAR = 0.05
+"""Stations seen from the targets within this angle, rad, are in one line with them."""
+_TOLD = 3
+
+
+def refuse_too_few(weight: Array, unknown: int) -> None:
+    """Raise MethodError where readings (n, m), by weight, are fewer than unknowns.
+
+    Parameters
+    ----------
+    weight : ndarray (n, m)
+        0 for what is missing.
+    unknown : int
+        Parameters of the stations of which nothing is known beforehand.
+    """
+    n, m = weight.shape
+    if n < 4:
+        raise MethodError(
+            f"expected at least four stations, found {n}: with three every target has as many unknowns as distances, "
+            "and nothing tells where the stations are; measure the targets from a further place"
+        )
+    count = np.count_nonzero(weight, axis=0)
+    equations, needed = int(np.maximum(count - 3, 0).sum()), unknown - 6
+    if equations < needed:
+        full = -(-needed // (n - 3))
+        raise MethodError(
+            f"expected at least {full} targets seen by all {n} stations, or as many readings spread otherwise, for "
+            f"{needed} unknowns of the stations (places and dead paths); found {equations} equations in {m} targets, "
+            f"of which {int(np.count_nonzero(count == n))} are seen by all and {int(np.count_nonzero(count < 3))} by "
+            "fewer than three; measure more targets"
+        )
+    blind = np.flatnonzero(np.count_nonzero(weight, axis=1) < 4)
+    if len(blind):
+        raise MethodError(
+            f"expected at least 4 readings of every station, found "
+            f"{', '.join(f'{np.count_nonzero(weight[j])} of station {j + 1}' for j in blind)}; measure more targets "
+            "from it, or leave the station out"
+        )
+
+
+def refuse_loose(information: Array, basis: Array, stations: Stations, target: Array) -> Array:
+    """Return the eigenvalues of the stations' information; raise MethodError where a freedom is loose.
+
+    Parameters
+    ----------
+    information : ndarray (p, p)
+        1/m^2, within the columns of ``basis``.
+    basis : ndarray (4 n + k, p)
+        Orthonormal.
+    stations : Stations
+        Where they were found.
+    target : ndarray (m, 3)
+        Where the targets were found, m.
+    """
+    values, vectors = np.linalg.eigh(information)
+    centre = target.mean(axis=0)
+    distance = float(np.sqrt(np.mean(np.sum((stations.place - centre) ** 2, axis=1))))
+    sigma = 1.0 / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    loose = (values < DIGITS * values[-1]) | (sigma > LOOSE * distance)
+    if not loose.any():
+        return np.asarray(values, dtype=float)
+    k = int(np.count_nonzero(loose))
+    freedoms = "; ".join(describe(basis @ vectors[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
+    worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
+    raise MethodError(
+        f"expected places of stations and targets whose distances fix them all, found {k} "
+        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {freedoms}. "
+        f"{_reason(stations.place, target)}"
+    )
+
+
+def describe(motion: Array, stations: Stations, centre: Array) -> str:
+    """Say in words what a motion (4 n + k,) of the stations' parameters is, largest parts first."""
+    n = len(stations.place)
+    blocks = motion[: 4 * n].reshape(n, 4)
+    line = centre - stations.place
+    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    along = np.einsum("ja,ja->j", blocks[:, :3], line)
+    across = np.linalg.norm(blocks[:, :3] - along[:, None] * line, axis=1)
+    parts = [(across[j] ** 2, f"station {j + 1} across its line of sight") for j in range(n)]
+    for j in range(n):
+        # Nearer to the targets by as much as the dead path grows shorter: distances change by the difference.
+        parts.append((along[j] ** 2 + blocks[j, 3] ** 2, f"station {j + 1} along its line of sight with its dead path"))
+    parts += [(p**2, f"further parameter {k + 1}") for k, p in enumerate(motion[4 * n :])]
+    parts.sort(reverse=True)
+    total, told = sum(share for share, _ in parts), []
+    for share, name in parts[:_TOLD]:
+        if share > 0.1 * total:
+            told.append(name)
+    return " and ".join(told)
+
+
+def _length(sigma: float) -> str:
+    return "without bound" if not np.isfinite(sigma) or sigma > 1e3 else f"{sigma * 1e3:.3g} mm"
+
+
+def _reason(place: Array, target: Array) -> str:
+    """Say what is special about the places, and what to do."""
+    n, found = len(place), []
+    thin = np.linalg.svd(place - place.mean(axis=0), compute_uv=False)
+    if thin[1] < FLAT * thin[0]:
+        found.append("the stations stand on one line: move two of them off it, to different sides")
+    elif thin[2] < FLAT * thin[0]:
+        found.append(
+            f"the stations stand in one plane (to {thin[2] / thin[0]:.1%} of their extent): move one of them off it, "
+            "by about their distance"
+        )
+    flat = np.linalg.svd(target - target.mean(axis=0), full_matrices=False, compute_uv=False)
+    if flat[1] < FLAT * flat[0]:
+        found.append("the targets lie on one line: add targets beside it")
+    elif flat[2] < FLAT * flat[0]:
+        found.append("the targets lie in one plane: add targets off it")
+    sight = target.mean(axis=0) - place
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    for j in range(n):
+        for k in range(j + 1, n):
+            if np.linalg.norm(np.cross(sight[j], sight[k])) < NEAR:
+                found.append(f"stations {j + 1} and {k + 1} stand in one line with the targets: move one of them aside")
+    if not found:
+        found.append("spread stations and targets wider and in all three directions, or measure more targets")
+    return "What is special: " + "; ".join(found)
+
+
+def weak_targets(target: Array, covariance: Array, place: Array) -> list[str]:
+    """Return notes on targets (m, 3) whose distances leave a direction nearly open, by their covariances (m, 3, 3)."""
+    trace = np.trace(covariance, axis1=1, axis2=2)
+    known = np.isfinite(trace)
+    if not known.any():
+        return []
+    weak = np.flatnonzero(known & (trace > 100**2 * np.median(trace[known])))
+    notes = []
+    for i in weak[:_TOLD]:
+        values, vectors = np.linalg.eigh(covariance[i])
+        direction = ", ".join(f"{c:+.2f}" for c in vectors[:, -1])
+        notes.append(
+            f"target {i + 1} is hardly determined along ({direction}), standard uncertainty "
+            f"{np.sqrt(values[-1]) * 1e3:.3g} mm: {_of_target(target[i], place)}"
+        )
+    if len(weak) > _TOLD:
+        notes.append(f"{len(weak) - _TOLD} further targets are hardly determined in a direction, for like reasons")
+    return notes
+
+
+def _of_target(target: Array, place: Array) -> str:
+    sight = target - place
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    for j in range(len(place)):
+        for k in range(j + 1, len(place)):
+            if np.linalg.norm(np.cross(sight[j], sight[k])) < NEAR:
+                return f"it lies in one line with stations {j + 1} and {k + 1}"
+    return "it lies nearly in one plane with the stations that see it"
+
+
+def swapped_stations(found: Array, rough: Array | None) -> list[str]:
+    """Return a note where the stations found (n, 3) fit their rough places (n, 3) in another order."""
+    if rough is None or not np.isfinite(rough).all():
+        return []
+    from scipy.optimize import linear_sum_assignment
+
+    off = np.linalg.norm(found[:, None] - rough[None], axis=-1)
+    rows, columns = linear_sum_assignment(off)
+    own, other = np.diag(off), off[rows, columns]
+    if (rows == columns).all() or not other.sum() < 0.5 * own.sum():
+        return []
+    pairs = [(j + 1, k + 1) for j, k in zip(rows, columns, strict=True) if j != k]
+    changed = [f"the readings of station {j} are those of station {k}" for j, k in pairs]
+    return [
+        f"stations look swapped: {', '.join(changed)} (as given they are {own.max() * 1e3:.4g} mm off their rough "
+        f"places, swapped {other.max() * 1e3:.4g} mm); the targets are right, the names of the stations are not"
+    ]

@@ -1,0 +1,194 @@
+"""Where the stations are, roughly: from the nominal targets, station by station.
+
+|u - U|^2 = (d + L)^2 is linear in U, L and K = L^2 - |U|^2:
+
+    2 u . U + 2 d L + K = |u|^2 - d^2,
+
+five unknowns for each station. Gauss-Newton on the distances themselves then sharpens U and L. Readings that are far
+off are given little weight, so a few of them do no harm. Targets in one plane leave the side open on which a station
+stands; then its rough place decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.errors import MethodError
+
+Array = NDArray[np.float64]
+
+SOME = 400
+"""Readings of a station that are looked at: enough to tell where it is."""
+FLAT = 1e-3
+"""Targets thinner than this share of their extent lie in a plane, or on a line."""
+FITS = 0.01
+"""A station whose readings fit the nominal targets worse than this share of their extent is not found."""
+_STEPS = 30
+_REWEIGHTED = 8
+
+
+@dataclass(frozen=True)
+class Start:
+    """Rough places (n, 3) and dead paths (n,) of the stations, m, and what was noticed."""
+
+    place: Array
+    dead_path: Array
+    notes: tuple[str, ...] = ()
+
+
+def initial_stations(reading: Array, weight: Array, target: Array, station: Array | None) -> Start:
+    """Return rough stations from readings (n, m) of nominal targets (m, 3).
+
+    Raises
+    ------
+    MethodError
+        Readings of a station that no place explains (with what they look like: another unit, sign reversed), or
+        targets in a plane without the stations' rough places.
+    """
+    n = len(reading)
+    if station is not None and station.shape != (n, 3):
+        raise MethodError(f"expected rough places ({n}, 3) of the stations, found {station.shape}; give one per row")
+    centre = target.mean(axis=0)
+    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
+    axes = np.linalg.svd((target - centre)[_some(len(target), 4 * SOME)], full_matrices=False)
+    spread = axes[1] / axes[1][0]
+    if spread[1] < FLAT:
+        raise MethodError(
+            "expected targets spread in space, found them on one line; distances to these leave every station free "
+            "to turn about that line: add targets beside it"
+        )
+    normal = axes[2][2] if spread[2] < FLAT else None
+    places, dead_paths = np.empty((n, 3)), np.empty(n)
+    for j in range(n):
+        known = np.flatnonzero(weight[j] > 0)
+        some = known[_some(len(known), SOME)]
+        d, u = reading[j, some], target[some] - centre
+        rough = None if station is None or not np.isfinite(station[j]).all() else station[j] - centre
+        if len(d) < 5:
+            if rough is None:
+                raise MethodError(
+                    f"expected at least 5 readings of station {j + 1} to find it, found {len(d)}; measure more "
+                    "targets from it, or state roughly where it stands"
+                )
+            places[j], dead_paths[j] = rough + centre, np.median(np.linalg.norm(u - rough, axis=1) - d)
+            continue
+        found, scale = _best(_guesses(d, u, rough, normal), d, u)
+        if scale > FITS * extent:
+            raise MethodError(_what_is_wrong(j, d, u, extent, scale))
+        places[j], dead_paths[j] = found[:3] + centre, found[3]
+    return Start(places, dead_paths)
+
+
+def _some(count: int, most: int) -> slice:
+    """Return which of so many values to take: at most so many, evenly spread."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> list[Array]:
+    """Return places and dead paths (U, L) to start from."""
+    guesses = [] if rough is None else [np.append(rough, np.median(np.linalg.norm(u - rough, axis=1) - d))]
+    w, middle = np.ones(len(d)), np.median(d)
+    d = d - middle
+    # In the plane of flat targets the normal part of U has no column.
+    B = np.eye(3) if normal is None else np.linalg.svd(normal[None])[2][1:].T
+    A = np.column_stack([2 * u @ B, 2 * d, np.ones(len(d))])
+    b = np.sum(u**2, axis=1) - d**2
+    scale = 1.0 / np.linalg.norm(A, axis=0)
+    for _ in range(_REWEIGHTED):
+        x = scale * np.linalg.lstsq(w[:, None] * A * scale, w * b, rcond=None)[0]
+        off = np.abs(A @ x - b)
+        typical = float(np.median(off))
+        # Straight least squares will do where nothing is far off.
+        if off.max() <= 10 * typical:
+            break
+        w = 1.0 / np.sqrt(1.0 + (off / (3 * typical + 1e-300)) ** 2)
+    U, L, K = B @ x[:-2], x[-2], x[-1]
+    if normal is None:
+        return [*guesses, np.append(U, L - middle)]
+    height = np.sqrt(max(L**2 - K - U @ U, 0.0))
+    if rough is None and height > FLAT * np.linalg.norm(u, axis=1).max():
+        raise MethodError(
+            "expected targets spread in space or the stations' rough places, found targets in one plane: distances "
+            "do not tell on which side of it a station stands; state roughly where the stations are, or measure "
+            "targets off that plane"
+        )
+    sides = (1.0,) if rough is None else (np.sign(normal @ rough) or 1.0,)
+    return [*guesses, *(np.append(U + side * height * normal, L - middle) for side in sides)]
+
+
+def _best(guesses: list[Array], d: Array, u: Array) -> tuple[Array, float]:
+    """Return the best (U, L) from some guesses, and the robust scale of its residuals, m."""
+    found = [_sharpened(guess, d, u) for guess in guesses]
+    return min(found, key=lambda each: each[1])
+
+
+def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
+    """Fit (U, L) to the distances from nominal targets by damped Gauss-Newton with Cauchy's weights."""
+
+    def residual(x: Array) -> tuple[Array, Array]:
+        v = u - x[:3]
+        distance = np.linalg.norm(v, axis=1)
+        return d - (distance - x[3]), np.column_stack([-v / distance[:, None], -np.ones(len(d))])
+
+    r, J = residual(x)
+    scale, mu = _scale(r), 0.0
+    for _ in range(_STEPS):
+        w = 1.0 / (1.0 + (r / (3 * scale + 1e-15)) ** 2)
+        A, g = J.T @ (w[:, None] * J), J.T @ (w * r)
+        step = np.linalg.lstsq(A + mu * np.diag(np.diag(A)), g, rcond=1e-14)[0]
+        tried, J_tried = residual(x + step)
+        size = _scale(tried)
+        if not size <= scale * (1 + 1e-3):
+            mu = max(10 * mu, 1e-3)
+            if mu > 1e8:
+                break
+            continue
+        mu = 0.1 * mu if mu > 1e-3 else 0.0
+        settled = mu == 0.0 and np.linalg.norm(step) < 1e-3 * scale + 1e-9
+        x, r, J, scale = x + step, tried, J_tried, size
+        if settled:
+            break
+    return x, scale
+
+
+def _scale(r: Array) -> float:
+    """Return the robust scale of residuals about zero."""
+    return 1.4826 * float(np.median(np.abs(r)))
+
+
+def _what_is_wrong(j: int, d: Array, u: Array, extent: float, scale: float) -> str:
+    """Say what readings look like that no place of a station explains."""
+    span = float(np.ptp(d))
+    text = (
+        f"expected readings of station {j + 1} that some place of it explains, found none nearer than "
+        f"{scale * 1e3:.3g} mm to the nominal targets (their extent is {extent * 1e3:.4g} mm, the readings span "
+        f"{span * 1e3:.4g} mm)"
+    )
+    factor, reversed_sign = _factor(d, u)
+    for k, name in ((1e3, "millimetres given as metres"), (1e6, "micrometres given as metres"),
+                    (1e-3, "targets in millimetres given as metres"), (2.0, "the double path counted as a single one"),
+                    (0.5, "half of the path counted")):  # fmt: skip
+        if abs(factor / k - 1) < 0.2:
+            return f"{text}; they are about {k:g} times what they should be: it looks like {name}"
+    if reversed_sign:
+        return f"{text}; they fit with their sign reversed: a displacement grows as the target moves away"
+    return (
+        f"{text}; check that displacements and targets are in the same order, that the station stood still, and that "
+        "its count was not lost"
+    )
+
+
+def _factor(d: Array, u: Array) -> tuple[float, bool]:
+    """Return by what readings seem to be multiplied, and whether they fall with distance.
+
+    With a factor k on the readings |u|^2 = 2 u . U + 2 d L / k + K + d^2 / k^2: its square is linear, too.
+    """
+    d = d - np.median(d)
+    A = np.column_stack([2 * u, 2 * d, np.ones(len(d)), d**2])
+    scale = 1.0 / np.linalg.norm(A, axis=0)
+    x = scale * np.linalg.lstsq(A * scale, np.sum(u**2, axis=1), rcond=None)[0]
+    factor = 1.0 / np.sqrt(x[5]) if x[5] > 0 else np.nan
+    return float(factor), bool(x[3] < 0)
