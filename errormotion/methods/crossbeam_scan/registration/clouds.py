@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform
@@ -26,6 +27,7 @@ NEAREST = 0.3e-3
 CELL = 1e-3
 """Edge of the cells of the normal distributions transform, m."""
 _NORMAL_RADIUS = 0.25e-3
+_NEIGHBOURS = 30
 _ICP_STEPS = 60
 
 
@@ -37,6 +39,7 @@ def open3d() -> Any:
     MethodError
         Open3D is not installed.
     """
+    numba.get_num_threads()  # its threads start before Open3D loads a TBB of its own, which numba would warn of
     try:
         import open3d as module
     except (ImportError, OSError) as error:
@@ -71,9 +74,22 @@ def plane_icp(cold: ArrayLike, warm: ArrayLike) -> Found:
     """
     o3d = open3d()
     target, source = _cloud(o3d, cold), _cloud(o3d, warm)
-    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS, 30))
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS, _NEIGHBOURS))
     method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
     return _icp(o3d, source, target, np.eye(4), method)
+
+
+def normals(points: ArrayLike) -> tuple[NDArray[np.float64], float]:
+    """Return the unit normals (n, 3) of a cloud, of either sign, from neighbours within 0.25 mm, and their variance.
+
+    The variance of a normal's tilt about one direction is that of its neighbours about their plane over their spread
+    and number; curvature counts as noise in it, and it does tilt the plane where neighbours are unevenly spread.
+    """
+    cloud = _cloud(open3d(), points)
+    cloud.estimate_covariances(open3d().geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS, _NEIGHBOURS))
+    values, vectors = np.linalg.eigh(np.asarray(cloud.covariances))
+    tilt = np.median(values[:, 0] / np.maximum(values[:, 1], np.finfo(float).tiny)) / _NEIGHBOURS
+    return vectors[:, :, 0], float(tilt)
 
 
 def published_chain(cold: ArrayLike, warm: ArrayLike) -> Found:

@@ -85,7 +85,7 @@ def undetermined(information: Array, scale: Array, blocks: int) -> tuple[Array, 
     return values, vectors[:, values < LEAST_SLOPE**2]
 
 
-def freedoms(information: Array, blocks: int, noise: Array | None = None) -> Freedoms:
+def freedoms(information: Array, blocks: int, noise: Array | None = None, radius: float | None = None) -> Freedoms:
     """Return what an artefact determines.
 
     Parameters
@@ -96,9 +96,11 @@ def freedoms(information: Array, blocks: int, noise: Array | None = None) -> Fre
         Number of blocks in the sum.
     noise : ndarray (6, 6), optional
         As much of the information as may come from noise alone.
+    radius : float, optional
+        Root mean square distance of the points from the centre, m; default: that of a height map.
     """
-    # J's columns for a and b are about y and -x: their squares give the radius.
-    radius = float(np.sqrt((information[3, 3] + information[4, 4]) / information[2, 2]))
+    if radius is None:  # J's columns for a and b are about y and -x: their squares give it
+        radius = float(np.sqrt((information[3, 3] + information[4, 4]) / information[2, 2]))
     scale = scales(radius, 0)
     values = np.linalg.eigvalsh(information * np.outer(scale, scale) / blocks)
     _, motions = undetermined(information - (0.0 if noise is None else noise), scale, blocks)
