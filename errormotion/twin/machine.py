@@ -19,6 +19,7 @@ from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.beam_rawdata import BeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
+from errormotion.twin.multilateration_rawdata import TrackerMeasurements
 from errormotion.twin.profiler import Profiler
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
@@ -34,7 +35,7 @@ WARM_AFTER = 4 * 3600.0
 _PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor"))}
 
 
-class VirtualMachine(BeamMeasurements):
+class VirtualMachine(BeamMeasurements, TrackerMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
@@ -73,6 +74,7 @@ class VirtualMachine(BeamMeasurements):
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
         A point sensor on the stage and what it looks at: see `BeamMeasurements`, also for the measurements with them.
+        Measurements with a laser tracker: see `TrackerMeasurements`.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
