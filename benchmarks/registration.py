@@ -375,7 +375,7 @@ def main() -> None:
         "coverage": lambda: coverage(artefact, 20 if quick else 60),
         "phases": lambda: phases(artefact),
         "yaw": lambda: yaw_of_jittering_lines(artefact, 3 if quick else 5),
-        "dirt": lambda: dirt(artefact, 6 if quick else 16),
+        "dirt": lambda: dirt(artefact, 6 if quick else 60),
         "extra": lambda: extra(artefact, 20 if quick else 60),
     }
     for name in options.only:
