@@ -37,7 +37,7 @@ _UNITS = (("arcsec", ARCSEC), ("mrad", 1e-3), ("°", math.pi / 180))
 def part(source: Source, key: str) -> Part:
     """Return the chapter of one beam; ``key`` keeps its figures' identifiers apart."""
     beam = found(source.errors, source.raw)
-    calibration, why = beam_direction_surface.calibration_of(source)
+    calibration, why = beam_direction_surface.calibration_of(source, beam.planes)
     bar = beam_direction_bar.bar_of(source)
     sections = [
         Section("direction", "Direction and origin", _direction(beam, source.errors, key)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from errormotion.report.text import finite, fixed, integer, listed, significant
 _HATCH = "#9a9a9a"
 _NEAR = np.deg2rad(10.0)  # a setting or plane counts to a section that it lies so near to
 _STEPS = 81
+_SAME = 1e-6  # slopes that differ by less are of one calibration: 10 nm at 10 mm
 _DEPTHS = 9  # dots over the depth, at each inclination
 _SECTIONS = (0.0, np.pi / 2)
 
@@ -52,15 +54,36 @@ class _Tilts:
     group_left_out: NDArray[np.bool_]
 
 
-def calibration_of(source: Source) -> tuple[InclinationCalibration | None, str]:
-    """Return the calibration that the readings were compensated with, or None and why there is none."""
+def calibration_of(source: Source, planes: Planes) -> tuple[InclinationCalibration | None, str]:
+    """Return the calibration that the readings were compensated with, or None and why there is none.
+
+    It is looked for by its name, as the method did, and in the campaign's folder; one of another content is none.
+    """
     named = source.settings.get("compensation")
     if not named:
         return None, "the readings were evaluated without an inclination calibration"
+    campaign = source.run.get("campaign")
+    folder = campaign.get("folder") if isinstance(campaign, Mapping) else None
     try:
-        return InclinationCalibration.find(str(named)), ""
+        calibration = InclinationCalibration.find(str(named), folder)
     except DatasetError as error:
         return None, f"the calibration '{named}' cannot be shown here: {error}"
+    if not _agrees(calibration, planes):
+        return None, f"the calibration '{named}' that is found here is not the one that was taken off the readings"
+    return calibration, ""
+
+
+def _agrees(calibration: InclinationCalibration, planes: Planes) -> bool:
+    """Return whether what was taken off at each plane is what the calibration says there."""
+    k = calibration.slope(tilt_vector(planes.inclination, planes.rotation))[0]
+    for taken, raw, slope in zip(planes.compensation, planes.raw, k, strict=True):
+        known = np.isfinite(taken) & np.isfinite(raw)
+        if not np.isfinite(slope) or known.sum() < 2 or np.ptp(raw[known]) == 0:
+            continue
+        by_reading = float(np.polyfit(raw[known], taken[known], 1)[0])
+        if abs(by_reading - slope / (1 + slope)) > _SAME:
+            return False
+    return True
 
 
 def blocks(beam: Found, calibration: InclinationCalibration | None, why: str, key: str) -> list[Block]:

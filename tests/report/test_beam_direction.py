@@ -1,6 +1,7 @@
 """The chapter of a beam's direction: complete, honest about what is unknown, and readable with whatever is missing."""
 
 import re
+from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,9 +21,21 @@ PLANES = ((20, 0), (20, 90), (25, 180), (30, 270))
 NOISE = 0.4e-6
 
 
+@cache
+def calibration():
+    """A calibration with nothing between the rotations 10 and 90 degrees, and one setting that contradicts it."""
+    raw = VirtualMachine("cframe", seed=3).raw_inclination(
+        DEGREE * np.arange(-45, 46, 7.5),
+        DEGREE * np.array([0, 5, 10, 90, 170, 175]),
+        1e-3 * np.arange(-10, 11, 4),
+        seed=1,
+    )
+    wrong = np.isclose(raw["inclination"], 15 * DEGREE) & np.isclose(raw["rotation"], 5 * DEGREE)
+    return calibrate(raw.assign(reading=raw["reading"].where(~wrong, 1.004 * raw["reading"])))
+
+
 def k_of(q):
-    """Slope of the inclination error: -0.6 % at 45 degrees in the triangulation plane, little across it."""
-    return -4.5e-3 * q[..., 0] ** 2 - 1.5e-3 * q[..., 0] ** 3 - 0.7e-3 * q[..., 1] ** 2
+    return calibration().slope(q)[0]
 
 
 def axes_of(u, t):
@@ -179,25 +192,12 @@ def number(text):
     return float(text.split()[0].replace("−", "-"))
 
 
-@pytest.fixture(scope="module")
-def calibration():
-    """A calibration with nothing between the rotations 10 and 90 degrees, and one setting that contradicts it."""
-    raw = VirtualMachine("cframe", seed=3).raw_inclination(
-        DEGREE * np.arange(-45, 46, 7.5),
-        DEGREE * np.array([0, 5, 10, 90, 170, 175]),
-        1e-3 * np.arange(-10, 11, 4),
-        seed=1,
-    )
-    wrong = np.isclose(raw["inclination"], 15 * DEGREE) & np.isclose(raw["rotation"], 5 * DEGREE)
-    return calibrate(raw.assign(reading=raw["reading"].where(~wrong, 1.004 * raw["reading"])))
-
-
 @pytest.fixture
-def page(calibration, tmp_path, monkeypatch):
+def page(tmp_path, monkeypatch):
     """Write the report in a folder where the calibration is found by its name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "calibrations").mkdir()
-    calibration.save(tmp_path / "calibrations" / "lk-h050.nc")
+    calibration().save(tmp_path / "calibrations" / "lk-h050.nc")
 
     def write(errors, **more):
         return write_report(errors, tmp_path / "report.html", **more).read_text(encoding="utf-8")
@@ -206,11 +206,11 @@ def page(calibration, tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def html(calibration, tmp_path_factory):
+def html(tmp_path_factory):
     folder = tmp_path_factory.mktemp("beam")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        calibration.save(folder / "lk-h050.nc")
+        calibration().save(folder / "lk-h050.nc")
         return write_report(result(compensation="lk-h050.nc"), folder / "report.html").read_text(encoding="utf-8")
 
 
@@ -300,11 +300,11 @@ def test_a_tilt_that_the_calibration_does_not_support_is_said(page):
     assert "plane 2 lies where the calibration has no settings around" in words_of(bare)
 
 
-def test_the_calibration_is_told_with_its_remaining_error(html, calibration):
+def test_the_calibration_is_told_with_its_remaining_error(html):
     found = re.search(r"at 78 tilts, 1 of them left out, fitted by a polynomial of order (\d+)", words_of(html))
-    assert int(found[1]) == calibration.order
+    assert int(found[1]) == calibration().order
     told = re.search(r"did not know: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
-    ds = calibration.dataset
+    ds = calibration().dataset
     expected = 1e3 * np.array([ds["remaining_error"].item(), *ds["remaining_error_interval"].values])
     np.testing.assert_allclose([float(number) for number in told.groups()], expected, rtol=0.06)  # two digits
 
@@ -314,6 +314,23 @@ def test_a_calibration_that_is_not_there_is_a_sentence(tmp_path, monkeypatch):
     html = write_report(result(), tmp_path / "report.html").read_text(encoding="utf-8")
     assert "No map: the calibration 'lk-h050' cannot be shown here" in words_of(html)
     assert len(drawings(html)) == 5
+
+
+def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
+    errors = result()
+    errors["compensation"] = 1.1 * errors["compensation"]
+    html = page(errors)
+    assert "No map: the calibration 'lk-h050' that is found here is not the one that was taken off" in words_of(html)
+
+
+def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, monkeypatch):
+    there = tmp_path / "there"
+    (there / "calibrations").mkdir(parents=True)
+    calibration().save(there / "calibrations" / "lk-h050.nc")
+    monkeypatch.chdir(tmp_path)
+    run = {"campaign": {"folder": str(there)}}
+    html = write_report(result(), tmp_path / "report.html", run=run).read_text(encoding="utf-8")
+    assert "Calibration 'lk-h050': slope k" in words_of(html)
 
 
 def test_the_bar_names_its_point_and_enlarges_residuals(html):
@@ -335,19 +352,21 @@ def test_without_bar_calibration_and_origin_nothing_is_invented(page):
     assert len(drawings(html)) == 3
 
 
-EXTRAS = sorted(set(result().data_vars) - {"covariance", *DOF})
+def extras_of(errors):
+    return sorted(set(errors.data_vars) - {"covariance", *DOF})
 
 
-@pytest.mark.parametrize("lacking", [*(EXTRAS[i::8] for i in range(8)), EXTRAS])
-def test_whatever_extra_is_missing_the_rest_is_reported(page, lacking):
-    html = page(result().drop_vars(lacking))
+@pytest.mark.parametrize("part", [slice(i, None, 8) for i in range(8)] + [slice(None)])
+def test_whatever_extra_is_missing_the_rest_is_reported(page, part):
+    errors = result()
+    html = page(errors.drop_vars(extras_of(errors)[part]))
     assert 'id="provenance-1"' in html
     assert "nan" not in words_of(html).lower().split()
 
 
 def test_extras_of_nothing_but_nan_are_no_values(page):
     errors = result()
-    for name in EXTRAS:
+    for name in extras_of(errors):
         if errors[name].dtype.kind == "f":
             errors[name] = errors[name] * np.nan
     html = page(errors)
@@ -436,5 +455,6 @@ def test_a_result_without_compensation_is_told_with_its_contradiction(page, meas
 
 
 def test_a_plan_keeps_its_plain_chapter(page):
-    planned = result().drop_vars(EXTRAS)  # how well the beam would be known, and nothing of it
+    errors = result()
+    planned = errors.drop_vars(extras_of(errors))  # how well the beam would be known, and nothing of it
     assert "Direction of the beam" not in page(planned)
