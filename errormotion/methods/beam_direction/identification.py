@@ -166,11 +166,13 @@ def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: 
     z = np.abs(found.closure) / np.sqrt(np.diag(found.closure_covariance))
     worst = int(np.argmax(z))
     times = float(np.sqrt(chi2 / freedom))
-    cause = "the sensor's inclination error, which was not compensated," if settled.iterations == 0 else "a calibration"
+    cause = (
+        "a calibration that does not hold" if settled.iterations else "the sensor's inclination error, uncompensated"
+    )
     notes.append(
         f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; worst is "
         f"{data.names[worst].lower()}, off by {found.closure[worst]:.2g}, {z[worst]:.1f} standard uncertainties. "
-        f"Perhaps {cause} that does not hold, or a plane that moved. The uncertainties are raised {times:.3g} times."
+        f"Perhaps {cause}, or a plane that moved. The uncertainties are raised {times:.3g} times."
     )
     return times
 

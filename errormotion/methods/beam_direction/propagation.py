@@ -35,7 +35,7 @@ class Propagated:
     closure : ndarray (k,)
         g . u + 1 by plane.
     closure_covariance : ndarray (k, k)
-        What it should have, sources included; rank k - 2.
+        What it should have, sources included; rank k - 2, so 0 for two planes.
     """
 
     covariance: Array
@@ -77,8 +77,10 @@ def propagate(settled: Settled, origin: Origin | None, point_uncertainty: float)
     sigma2 = np.einsum("i,kij,j->k", u, planes.covariances[:, :3, :3], u)
     slopes = settled.slope_by_source + influence[:, 3:] @ H.T
     closes = slopes * (by_slope[:, :3] @ u) + influence[:, 3:] @ fitted.T
-    own = np.diag(sigma2) - fitted @ direction.covariance @ fitted.T
-    return Propagated(covariance, influence, direction.discrepancy, own + closes.T @ closes)
+    closing = np.diag(sigma2) - fitted @ direction.covariance @ fitted.T + closes.T @ closes
+    if k == 2:  # met exactly, but for rounding
+        return Propagated(covariance, influence, np.zeros(2), np.zeros((2, 2)))
+    return Propagated(covariance, influence, direction.discrepancy, closing)
 
 
 def closure_chi2(propagated: Propagated) -> float:

@@ -1,0 +1,335 @@
+"""From readings on planes to an error dataset of the beam."""
+
+import numpy as np
+import pytest
+
+from errormotion.datasets import load, save, validate
+from errormotion.errors import DatasetError, MethodError
+from errormotion.kinematics.beams import tilt
+from errormotion.methods.beam_direction import BeamDirection, Settings
+from errormotion.methods.beam_direction.direction import bound
+from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.twin import VirtualMachine
+
+FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
+ALPHA = np.radians(20.0)
+FOUR = [(ALPHA, np.radians(b)) for b in (0.0, 90.0, 180.0, 270.0)]
+DEGREE = np.pi / 180
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return VirtualMachine("cframe", seed=4)
+
+
+@pytest.fixture(scope="module")
+def calibration(machine, tmp_path_factory):
+    """All rotations: what is published, with 0 to 10, 90 and 170 to 180 deg alone, leaves holes."""
+    file = tmp_path_factory.mktemp("calibrations") / "sensor.nc"
+    raw = machine.raw_inclination(np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0)
+    calibrate(raw).save(file)
+    return str(file)
+
+
+def identify(raw, **settings):
+    return BeamDirection().identify(raw, Settings(**settings))
+
+
+def notes(errors):
+    return " ".join(errors.attrs["notes"])
+
+
+def angle(errors, machine, name="beam_direction"):
+    return np.linalg.norm(np.cross(errors[name].values[0], machine.point_sensor.true_direction))
+
+
+def twist_error(errors, machine):
+    return np.asarray(errors.em.twist() - machine.truth_beam().em.twist())[0]
+
+
+def test_result_follows_its_schema_and_comes_back_from_a_file(machine, tmp_path):
+    errors = identify(machine.raw_beam_direction(FOUR, seed=0, inclination_error=False), beam="X1")
+    validate(errors)
+    assert errors.attrs["component"] == "beam"
+    assert errors["beam"].values.tolist() == ["X1"]
+    save(errors, tmp_path / "errors.nc")
+    again = load(tmp_path / "errors.nc")
+    assert again["beam_direction"].equals(errors["beam_direction"])
+
+
+def test_recovers_the_beam_within_the_stated_uncertainty(machine):
+    errors = identify(machine.raw_beam_direction(FOUR, seed=0, inclination_error=False, speckle=True))
+    u = np.sqrt(np.diag(errors["covariance"].values[0]))
+    assert (np.abs(twist_error(errors, machine)) < 4 * u).all()
+    # A beam leans by 0.3 deg and starts 0.1 mm off its drawing: seen hundreds of times better than that.
+    assert (u[3:] < 1e-4).all()
+    assert (u[:3] < 5e-6).all()
+
+
+def test_covariance_holds_the_truth_as_often_as_it_says(machine):
+    miss, nees = [], []
+    for seed in range(120):
+        raw = machine.raw_beam_direction(FOUR, seed=seed, inclination_error=False, speckle=True, count=10)
+        errors = identify(raw)
+        e, C = twist_error(errors, machine), errors["covariance"].values[0]
+        miss.append(e / np.sqrt(np.diag(C)))
+        scale = np.sqrt(np.diag(C))
+        nees.append(miss[-1] @ np.linalg.pinv(C / np.outer(scale, scale), rcond=1e-9, hermitian=True) @ miss[-1])
+    # Five freedoms (a beam has no turn about itself), 120 seeds.
+    assert np.mean(nees) == pytest.approx(5, abs=3.5 * np.sqrt(10 / 120))
+    inside = np.mean(np.abs(miss) < 1.96, axis=0)
+    assert (inside > 0.95 - 3.5 * np.sqrt(0.95 * 0.05 / 120)).all()
+
+
+def test_direction_is_as_well_known_as_it_can_be(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=1, inclination_error=False, speckle=True)
+    errors = identify(raw, noise="stated")
+    sensor = machine.point_sensor
+    normals = np.array([machine.sine_gauge.plane(*plane, 1)[0] for plane in FOUR])
+    least = bound(list(raw["stage"].values), normals, sensor.true_direction, sensor.noise, 0.3e-6, 50e-6)
+    stated = errors["beam_covariance"].values[0, 3:, 3:]
+    np.testing.assert_allclose(np.trace(stated), np.trace(least), rtol=0.01)
+
+
+def test_compensation_makes_the_angle_ten_times_better(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=0)
+    errors = identify(raw, compensation=calibration)
+    assert angle(errors, machine) < 0.1 * angle(errors, machine, "uncompensated_direction")
+    u = np.sqrt(np.diag(errors["covariance"].values[0]))
+    assert (np.abs(twist_error(errors, machine)) < 4 * u).all()
+    assert errors["iterations"].values[0] > 1
+    assert set(errors["source_group"].values) == {"inclination calibration", "triangulation plane"}
+    # The raw readings stay beside what was made of them.
+    np.testing.assert_array_equal(errors["distance_raw"], raw["distance"])
+    taken = errors["distance_raw"] - errors["distance_compensated"]
+    np.testing.assert_allclose(taken, errors["compensation"], atol=1e-15)
+    depth = np.abs(raw["distance"].values).max()
+    assert 1e-3 * depth < np.abs(taken.values).max() < 1e-2 * depth
+
+
+def test_planes_stand_as_the_gauge_was_set(machine, calibration):
+    errors = identify(machine.raw_beam_direction(FOUR, seed=3), compensation=calibration)
+    normals = np.array([machine.sine_gauge.plane(*plane, 3)[0] for plane in FOUR])
+    np.testing.assert_allclose(errors["normal"], normals, atol=1e-4)
+    sensor = machine.point_sensor
+    q = tilt(sensor.true_direction, sensor.nominal_triangulation_normal, normals)
+    np.testing.assert_allclose(np.tan(errors["inclination"]), np.hypot(*q.T), atol=2e-4)
+    turned = np.angle(np.exp(1j * (errors["rotation"].values - np.arctan2(q[:, 1], q[:, 0]))))
+    np.testing.assert_allclose(turned, 0, atol=1e-3)
+
+
+def test_calibration_is_part_of_the_uncertainty(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=0)
+    errors = identify(raw, compensation=calibration)
+    influence = errors["influence"].values[:, 0]
+    total = errors["covariance"].values[0]
+    own = total - influence.T @ influence
+    assert np.linalg.eigvalsh(own[3:, 3:]).min() > -1e-3 * np.trace(own[3:, 3:])
+    known = raw.assign(triangulation_normal_uncertainty=((), 0.0, {"units": "rad"}))
+    less = identify(known, compensation=calibration)
+    assert set(less["source_group"].values) == {"inclination calibration"}
+    assert np.trace(less["covariance"].values[0]) < np.trace(total)
+
+
+def test_without_compensation_it_is_said_and_planes_contradict_one_another(machine):
+    told = notes(identify(machine.raw_beam_direction(FOUR, seed=0)))
+    assert "No inclination compensation" in told
+    assert "The planes contradict one another: chi-square" in told
+    assert "The uncertainties are raised" in told
+
+
+def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
+    errors = identify(machine.raw_beam_direction(FOUR[:2], seed=0, inclination_error=False))
+    assert "Two directions fit the planes; the nominal direction decided" in notes(errors)
+    assert "2 planes with a known point" in notes(errors)
+    assert np.isnan(errors["beam_origin"]).all()
+    assert np.isnan([errors[name].values[0] for name in FREEDOMS]).tolist() == [True] * 3 + [False] * 3
+    assert (errors["closure_uncertainty"] == 0).all()
+
+
+def test_a_stage_that_carries_the_target_counts_the_other_way(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    straight, carried = identify(raw), raw.assign(stage=-raw["stage"])
+    carried["stage"].attrs["units"] = "m"
+    by_setting = identify(carried, moves="target")
+    by_attribute = identify(carried.assign_attrs(moves="target"))
+    for errors in (by_setting, by_attribute):
+        np.testing.assert_allclose(errors.em.twist(), straight.em.twist())
+
+
+def test_planes_may_have_different_numbers_of_readings(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance"][2, 15:20] = np.nan
+    raw["stage"][2, 15:20] = np.nan
+    errors = identify(raw)
+    assert "missing" not in notes(errors)
+    u = np.sqrt(np.diag(errors["covariance"].values[0]))
+    assert (np.abs(twist_error(errors, machine)) < 4 * u).all()
+
+
+def test_outliers_are_named_by_plane_and_reading(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance"][1, 8] += 20e-6
+    raw["distance"][3, 40] -= 5e-6
+    errors = identify(raw)
+    assert "Plane 2: 1 readings left out as outliers: reading 9." in notes(errors)
+    assert "Plane 4: 1 readings left out as outliers: reading 41." in notes(errors)
+    assert np.argwhere(errors["left_out"].values).tolist() == [[1, 8], [3, 40]]
+
+
+def test_more_scatter_than_stated_raises_the_uncertainty(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    straight = identify(raw)
+    raw["distance_noise"] = raw["distance_noise"] / 5
+    raw["distance_noise"].attrs["units"] = "m"
+    raised, kept = identify(raw), identify(raw, noise="stated")
+    assert "scatter" in notes(raised)
+    assert "the stated noise was kept (noise = stated)" in notes(kept)
+    assert raised["noise"].values[0] == pytest.approx(machine.point_sensor.noise, rel=0.15)
+    assert float(raised["covariance"][0, 3, 3]) == pytest.approx(float(straight["covariance"][0, 3, 3]), rel=0.3)
+    np.testing.assert_allclose(kept["gradient_covariance"], straight["gradient_covariance"] / 25, atol=1e-20)
+    # That a stated noise was wrong, planes show as well where they do not close.
+    assert "The planes contradict one another" in notes(kept)
+    assert "contradict" not in notes(raised)
+
+
+def test_less_scatter_than_stated_is_said(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance_noise"] = raw["distance_noise"] * 3
+    raw["distance_noise"].attrs["units"] = "m"
+    assert "scatter only" in notes(identify(raw))
+
+
+def test_speckle_that_is_not_stated_is_noticed(machine):
+    raw = machine.raw_beam_direction(
+        FOUR, seed=0, inclination_error=False, speckle=True, half_length=0.5e-3, count=60
+    ).drop_vars(["speckle", "speckle_length"])
+    assert "Residuals of neighbouring readings resemble each other" in notes(identify(raw))
+
+
+def test_sound_data_raise_no_alarm(machine):
+    alarms = [
+        notes(identify(machine.raw_beam_direction(FOUR, seed=seed, inclination_error=False))) for seed in range(25)
+    ]
+    assert set(alarms) == {"No inclination compensation: the readings are taken as they are."}
+
+
+def test_missing_and_out_of_range_readings_are_counted(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance"][0, 3] = np.nan
+    raw["distance"][0, 10] = 10.5e-3
+    errors = identify(raw)
+    assert "Plane 1: 2 of 60 readings are missing (1 without value, 1 out of the sensor's range)" in notes(errors)
+    assert errors["left_out"].values[0, [3, 10]].tolist() == [0, 2]
+
+
+def test_check_bar_is_seen_with_the_beam(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=0, check_bar=True)
+    errors = identify(raw, compensation=calibration)
+    bar = machine.check_bar
+    assert float(errors["bar_radius_fitted"]) == pytest.approx(bar.radius, abs=3 * float(errors["bar_radius_u"]) + 1e-7)
+    across = np.cross(bar.axis, errors["bar_centre"].values - bar.point)
+    assert np.linalg.norm(across) < 30e-6
+    assert errors["bar_residual"].sizes == {"bar_reading": 20}
+
+
+# Wrong inputs
+
+
+def refused(raw, match, kind=MethodError, **settings):
+    with pytest.raises(kind, match=match):
+        identify(raw, **settings)
+
+
+def test_parallel_planes(machine):
+    raw = machine.raw_beam_direction([FOUR[0]] * 3, seed=0, inclination_error=False)
+    refused(raw, r"The planes are parallel .*leave open how far the beam is turned about it")
+
+
+def test_a_stroke_out_of_the_range(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance"][1, 30:] = np.nan
+    refused(
+        raw, r"Plane 2: 30 of 60 readings are missing .*the first of them reading 31: the strokes leave the sensor's"
+    )
+
+
+def test_a_stage_that_steps_back_along_a_stroke(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    order = np.arange(60)
+    order[[7, 8]] = order[[8, 7]]
+    swapped = raw.assign(stage=raw["stage"].isel(reading=order))
+    refused(swapped, r"Plane 1: at reading 9 the stage steps back by .* um along a stroke")
+    # Places and readings that belong together may come in any order, where that is meant.
+    together = raw.isel(reading=order)
+    refused(together, "ordered = false")
+    np.testing.assert_allclose(identify(together, ordered=False).em.twist(), identify(raw).em.twist(), rtol=1e-7)
+
+
+def test_a_stage_that_moves_along_two_directions(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False).isel(reading=slice(0, 40))
+    refused(raw, r"Plane 1: the stage moves along 2 of three independent directions; along \(0.00, 0.00, 1.00\)")
+
+
+def test_a_direction_that_flips_sign(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    refused(raw, r"its sign is turned.*setting moves", moves="target")
+
+
+def test_readings_in_mm(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw["distance"] = (raw["distance"] * 1e3).assign_attrs(units="m")
+    raw["reading_range"] = (raw["reading_range"] * 1e3).assign_attrs(units="m")
+    refused(raw, "is it in mm", DatasetError)
+
+
+def test_places_of_the_stage_in_mm(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False, half_length=5e-3)
+    home = raw["stage"].mean("reading")
+    raw["stage"] = ((raw["stage"] - home) * 1e3).assign_attrs(units="m")
+    refused(raw, "Plane 1: .*Are readings and places of the stage in the same unit")
+
+
+def test_a_plane_that_the_beam_grazes(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    u = machine.point_sensor.true_direction
+    side = np.cross(u, [0.0, 1.0, 0.0])
+    n = side / np.linalg.norm(side) - 0.05 * u
+    g = -n / (n @ u)
+    stage = raw["stage"].values[1] - raw["stage"].values[1].mean(axis=0)
+    raw["stage"][1] = stage * 0.05
+    raw["distance"][1] = stage * 0.05 @ g
+    refused(raw, "Plane 2: the beam grazes it")
+
+
+def test_a_hole_in_the_calibration(machine, tmp_path):
+    holed = machine.raw_inclination(seed=0)  # rotations 0 to 10, 90 and 170 to 180 deg, as published
+    calibrate(holed).save(tmp_path / "holed.nc")
+    raw = machine.raw_beam_direction(FOUR, seed=0)
+    file = str(tmp_path / "holed.nc")
+    refused(raw, r"Plane 2: Calibration 'holed': .* leave a hole; nearest calibrated", compensation=file)
+    errors = identify(raw, compensation=file, extrapolate=True)
+    assert np.trace(errors["covariance"].values[0]) > 0
+
+
+def test_a_calibration_without_triangulation_plane(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=0).drop_vars("triangulation_normal")
+    refused(raw, r"needs triangulation_normal", compensation=calibration)
+
+
+def test_a_calibration_that_is_not_there(machine):
+    refused(machine.raw_beam_direction(FOUR, seed=0), "not found", DatasetError, compensation="nowhere")
+
+
+def test_a_noise_of_nothing(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0)
+    refused(raw.assign(distance_noise=((), 0.0, {"units": "m"})), "distance_noise is 0")
+
+
+def test_speckle_without_its_length(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, speckle=True).drop_vars("speckle_length")
+    refused(raw, "speckle_length")
+
+
+def test_an_unknown_kind_of_stage(machine):
+    refused(machine.raw_beam_direction(FOUR, seed=0).assign_attrs(moves="table"), "expected 'sensor' or 'target'")
