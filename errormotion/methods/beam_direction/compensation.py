@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-CALIBRATION, TRIANGULATION = "inclination calibration", "triangulation plane"
-"""Groups of the sources that a compensation brings."""
+CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
+"""What all planes share: the first two where the inclination error is compensated, the last one where it is not."""
 _STEP = 1e-5
 _LARGEST = 0.2
 _NEGLIGIBLE = 1e-12
@@ -139,11 +139,31 @@ class Settled:
     iterations: int
 
 
-def uncompensated(planes: Planes, nominal: Array) -> Settled:
-    """Return the direction from the readings as they are."""
-    k = len(planes.offsets)
-    nothing = np.zeros((k, 3))
-    return Settled(planes.direction(nominal), planes, None, np.zeros(k), nothing, (), (), np.zeros((0, k)), 0.0, 0)
+def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0, mid_range: float = 0.0) -> Settled:
+    """Return the direction from the readings as they are.
+
+    Parameters
+    ----------
+    planes : Planes
+    nominal : ndarray (3,)
+        Rough direction.
+    scale_uncertainty : float
+        Relative standard uncertainty of the readings' scale about ``mid_range`` (m), common to all planes.
+    """
+    k, known = len(planes.offsets), scale_uncertainty == 0
+    direction = planes.direction(nominal)
+    return Settled(
+        direction,
+        planes,
+        tilt=None,
+        slope=np.zeros(k),
+        slope_by_direction=np.zeros((k, 3)),
+        sources=() if known else (SCALE,),
+        groups=() if known else (SCALE,),
+        slope_by_source=np.full((0 if known else 1, k), scale_uncertainty),
+        mid_range=mid_range,
+        iterations=0,
+    )
 
 
 def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max_iterations: int) -> Settled:

@@ -54,7 +54,8 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         np.array([fit.offset for fit in fits]),
         np.array([fit.covariance for fit in fits]) * factor**2,
     )
-    plain = uncompensated(planes, data.nominal_direction)
+    middle = float(raw["mid_range"]) if "mid_range" in raw else 0.0
+    plain = uncompensated(planes, data.nominal_direction, settings.layout.scale_uncertainty, middle)
     sensor = _sensor(raw, settings)
     if sensor is None:
         settled = plain

@@ -131,6 +131,15 @@ def test_calibration_is_part_of_the_uncertainty(machine, calibration):
     assert np.trace(less["covariance"].values[0]) < np.trace(total)
 
 
+def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    scaled = raw.assign(distance=(raw["distance"] * 1.001).assign_attrs(units="m"))
+    straight, errors = identify(raw), identify(raw, layout={"scale_uncertainty": 1e-3})
+    moved = np.asarray(identify(scaled).em.twist() - straight.em.twist())[0]
+    influence = errors.sel(source="scale of the sensor")["influence"].values[0]
+    np.testing.assert_allclose(np.abs(influence), np.abs(moved), rtol=0.01, atol=1e-9)
+
+
 def test_without_compensation_it_is_said_and_planes_contradict_one_another(machine):
     told = notes(identify(machine.raw_beam_direction(FOUR, seed=0)))
     assert "No inclination compensation" in told
