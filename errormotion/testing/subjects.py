@@ -20,6 +20,7 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "spindle_frame": (-0.05, 0.5),
     "line_profiler": (-0.5, 0.5),
     "thermometer": (-60.0, 400.0),
+    "laser_tracker": (-160.0, 160.0),
 }
 
 #: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.

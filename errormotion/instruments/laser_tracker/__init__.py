@@ -1,0 +1,1 @@
+"""Laser trackers: distances and directions to a reflector, and their exported tables."""

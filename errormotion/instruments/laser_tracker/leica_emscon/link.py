@@ -1,0 +1,231 @@
+"""Asking an emScon server: commands and their answers, with everything that comes unasked in between."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.laser_tracker.leica_emscon import statuses
+from errormotion.instruments.laser_tracker.leica_emscon.codec import (
+    CHANGE,
+    COMMAND,
+    COMMANDS,
+    ERROR,
+    HEADER,
+    POINTS,
+    REFLECTOR,
+    UNKNOWN,
+    Packet,
+    decode_header,
+    decode_packet,
+    encode_command,
+)
+from errormotion.instruments.transports import Transport
+
+BUSY_PAUSE = 0.1  # s between two requests to a busy server
+MOST_EVENTS = 1000
+MOST_EARLY = 100
+
+
+class RefusedError(InstrumentError):
+    """The server refuses a command; ``status`` is its number for why."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class Event:
+    """What the server said unasked.
+
+    Attributes
+    ----------
+    kind : str
+        ``error`` or ``change``.
+    number : int
+        Its number for it.
+    text : str
+        What it means.
+    host_time : float
+        ``time.monotonic()`` when it was read, s.
+    """
+
+    kind: str
+    number: int
+    text: str
+    host_time: float
+
+
+class Link:
+    """One connection to an emScon server.
+
+    Parameters
+    ----------
+    transport : Transport
+    timeout, busy_timeout : float
+        Time limits of an answer, and of a server that says that it is busy, s.
+
+    Attributes
+    ----------
+    events : deque of Event
+        The last ones that came unasked.
+    early : deque of Packet
+        Points of a continuous measurement that came before the answer to the command that starts it.
+    broken : bool
+        Whether the beam has lost its reflector, as far as the server has told.
+    breaks : int
+        How often it has.
+    stale_refraction : bool
+        Whether the refraction index may have changed since somebody took note.
+    """
+
+    def __init__(self, transport: Transport, timeout: float, busy_timeout: float) -> None:
+        self._transport = transport
+        self._timeout = timeout
+        self._busy_timeout = busy_timeout
+        self._lost = ""
+        self._waiting = bytearray()
+        self.events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self.early: deque[Packet] = deque(maxlen=MOST_EARLY)
+        self.broken = False
+        self.breaks = 0
+        self.stale_refraction = True
+
+    def ask(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
+        """Send a command and return its answer; a busy server is asked again.
+
+        Raises
+        ------
+        RefusedError
+            The server refuses.
+        InstrumentTimeoutError, ProtocolError
+            No answer in time, or none that can be read: the connection has to be opened anew.
+        """
+        return next(self.ask_many(number, limit=limit, **values))
+
+    def ask_many(
+        self,
+        number: int,
+        /,
+        *,
+        limit: float | None = None,
+        total: Callable[[Packet], int] = lambda _: 1,
+        **values: Any,
+    ) -> Iterator[Packet]:
+        """Send a command and yield its answers; ``total(first)`` says how many there are, see `ask`."""
+        allowed = self._timeout if limit is None else limit
+        patience = time.monotonic() + self._busy_timeout
+        while True:
+            self._check()
+            self._transport.write(encode_command(number, **values))
+            packet = self._answer(number, allowed)
+            if packet.kind == ERROR or packet.status not in (statuses.OK, statuses.BUSY):
+                raise self._refusal(number, packet.status)
+            if packet.status == statuses.OK:
+                break
+            if time.monotonic() >= patience:
+                raise self._refusal(number, packet.status, f", for {self._busy_timeout:g} s by now")
+            time.sleep(BUSY_PAUSE)
+        yield packet
+        for _ in range(total(packet) - 1):
+            yield self._answer(number, allowed)
+
+    def _answer(self, number: int, limit: float) -> Packet:
+        return self.await_packet(
+            lambda packet: packet.kind in (COMMAND, ERROR) and packet.command == number, limit, COMMANDS[number].name
+        )
+
+    def await_packet(self, wanted: Callable[[Packet], bool], limit: float, what: str) -> Packet:
+        """Return the next packet that is wanted; take note of the others.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            It does not come within ``limit`` s. As it may come later, the connection is of no use any more.
+        """
+        end = time.monotonic() + limit
+        while True:
+            packet = self.next_packet(max(end - time.monotonic(), 0.0))
+            if packet is None:
+                self._lost = f"expected an answer to {what} within {limit:g} s; none came"
+                raise InstrumentTimeoutError(f"{self._transport.url}: {self._lost}")
+            if wanted(packet):
+                return packet
+            if packet.kind in POINTS:
+                self.early.append(packet)
+
+    def next_packet(self, limit: float) -> Packet | None:
+        """Return the next packet, whatever it is, noted; None where none comes within ``limit`` s.
+
+        Raises
+        ------
+        ProtocolError
+            What comes is no packet; the connection is of no use any more.
+        """
+        self._check()
+        end = time.monotonic() + limit
+        try:
+            while (packet := self._take()) is None:
+                try:
+                    self._waiting += self._transport.read(timeout=max(end - time.monotonic(), 0.0))
+                except InstrumentTimeoutError:
+                    return None
+        except ProtocolError as error:
+            self._lost = str(error)
+            raise
+        self._note(packet)
+        return packet
+
+    def _take(self) -> Packet | None:
+        """Return the first whole packet of what has come."""
+        if len(self._waiting) < HEADER.size:
+            return None
+        size, kind = decode_header(self._waiting[: HEADER.size])
+        end = HEADER.size + size
+        if len(self._waiting) < end:
+            return None
+        body = bytes(self._waiting[HEADER.size : end])
+        del self._waiting[:end]
+        return decode_packet(kind, body)
+
+    def _check(self) -> None:
+        if self._lost:
+            raise InstrumentError(
+                f"The connection to {self._transport.url} is out of step since this: {self._lost}. Close it and open "
+                "it again"
+            )
+
+    def _note(self, packet: Packet) -> None:
+        if packet.kind == CHANGE:
+            if packet.status == statuses.MEASURE_NOT_READY:
+                self._break()
+            elif packet.status in (statuses.MEASURE_READY, statuses.DISTANCE_SET):
+                self.broken = False
+            elif packet.status == statuses.REFRACTION_CHANGED:
+                self.stale_refraction = True
+            self._remember("change", packet.status, statuses.CHANGES.get(packet.status, "unknown change"))
+        elif packet.kind == ERROR:
+            if packet.command == UNKNOWN:  # about no command: the tracker itself has a problem
+                self._break()
+            self._remember("error", packet.status, statuses.result_text(packet.status))
+        elif packet.kind == REFLECTOR:
+            self.broken = False
+
+    def _break(self) -> None:
+        self.breaks += not self.broken
+        self.broken = True
+
+    def _remember(self, kind: str, number: int, text: str) -> None:
+        self.events.append(Event(kind, number, text, time.monotonic()))
+
+    def _refusal(self, number: int, status: int, more: str = "") -> RefusedError:
+        return RefusedError(
+            f"{self._transport.url} refuses {COMMANDS[number].name} with status {status}: "
+            f"{statuses.result_text(status)}{more}",
+            status,
+        )

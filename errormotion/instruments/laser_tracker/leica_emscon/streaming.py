@@ -1,0 +1,80 @@
+"""The points of a continuous measurement, put where the tracker's clock says that they belong."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
+from errormotion.instruments.laser_tracker.leica_emscon.link import Link
+from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
+from errormotion.instruments.laser_tracker.measurement import BeamBrokenError
+from errormotion.plugins import Samples
+
+BLOCK_SECONDS = 0.5
+LONGEST_GAP = 600.0  # s
+LOST, BROKEN = "lost", "beam broken"
+_WARNINGS = frozenset({0, 1})
+
+
+def points(link: Link, settings: EmSconSettings, block: int | None = None) -> Iterator[Samples]:
+    """Yield blocks of distances from the packets that come on a link.
+
+    A point's place is its time since the first one over the interval that was set. Places without a point are NaN,
+    ``lost``; or ``beam broken`` where the tracker has told so since the last point.
+
+    Raises
+    ------
+    InstrumentTimeoutError
+        Silence for the settings' ``timeout``.
+    BeamBrokenError
+        The same after a broken beam.
+    ProtocolError
+        The tracker's clock goes back or leaps.
+    """
+    size = block or max(1, round(BLOCK_SECONDS * settings.rate))
+    interval = 1000 * settings.interval  # us
+    waiting: deque[tuple[float, str]] = deque()  # value, and why it is none
+    start: int | None = None
+    expected = first = 0
+    breaks = link.breaks
+    while True:
+        for point in _next_points(link, settings.timeout):
+            clock = 1_000_000 * int(point["seconds"]) + int(point["microseconds"])
+            start = clock if start is None else start
+            place = round((clock - start) / interval)
+            if not 0 <= place - expected <= LONGEST_GAP * settings.rate:
+                raise ProtocolError(
+                    f"The tracker's clock goes from point {expected - 1} to point {place}: expected one after the "
+                    f"other, {settings.interval} ms apart. Is another client measuring?"
+                )
+            waiting.extend([(np.nan, BROKEN if link.breaks > breaks else LOST)] * (place - expected))
+            expected, breaks = place + 1, link.breaks
+            status = int(point["status"])
+            if status in _WARNINGS:
+                waiting.append((float(point["val3"]), ""))
+            else:
+                waiting.append((np.nan, statuses.POINTS.get(status, f"status {status}")))
+        while len(waiting) >= size:
+            taken = [waiting.popleft() for _ in range(size)]
+            invalid = Counter(reason for _, reason in taken if reason)
+            values = np.array([[value for value, _ in taken]])
+            yield Samples(values, first, settings.rate, time.monotonic(), invalid[LOST], dict(invalid))
+            first += size
+
+
+def _next_points(link: Link, timeout: float) -> Sequence[Mapping[str, Any]]:
+    if link.early:
+        return link.early.popleft().points
+    end = time.monotonic() + timeout
+    while (packet := link.next_packet(max(end - time.monotonic(), 0.0))) is not None:
+        if packet.kind in codec.POINTS:
+            return packet.points
+    if link.broken:
+        raise BeamBrokenError(f"The beam is broken, and stayed so for {timeout:g} s")
+    raise InstrumentTimeoutError(f"Expected points of a continuous measurement; none came for {timeout:g} s")
