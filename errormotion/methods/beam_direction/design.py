@@ -16,6 +16,7 @@ worse, so that only the orientations of the planes and their shares of the readi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -164,7 +165,13 @@ def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
 
 def tilts(normals: Array, beam: Array) -> Array:
     """Return the tilts (k, 2) of planes along ``across(beam)``: what g.u gains when the beam turns by an angle."""
-    return np.asarray(normals @ across(beam).T / -(normals @ beam)[:, None])
+    return np.asarray(normals @ _basis(tuple(beam)).T / -(normals @ beam)[:, None])
+
+
+@lru_cache(maxsize=4)
+def _basis(beam: tuple[float, ...]) -> Array:
+    """Return ``across(beam)``, which a search asks for ten thousands of times."""
+    return across(np.array(beam))
 
 
 def inclinations(normals: Array, beam: Array) -> Array:
@@ -293,7 +300,7 @@ def _planes(about_beam: Array, limits: Limits) -> Array:
     gauge's own reach.
     """
     inclination, azimuth = about_beam.reshape(-1, 2).T
-    sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ across(limits.beam)
+    sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ _basis(tuple(limits.beam))
     normals = np.sin(inclination)[:, None] * sideways - np.cos(inclination)[:, None] * limits.beam
     rotation = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), 2 * np.pi)
     planes = np.stack([np.arccos(np.clip(normals[:, 2], -1.0, 1.0)), rotation], axis=-1)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import map_coordinates
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibration import InclinationCalibration
 from errormotion.datasets.units import format_quantity
+from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, beam_errors, tilt
 from errormotion.methods.beam_direction import design
 from errormotion.methods.beam_direction.direction import bound
@@ -28,6 +31,9 @@ if TYPE_CHECKING:
 
 PAPER = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
 """Two faces turned by 90 deg, the widest of the pairs in table 1 of Lu et al.; the inclination is not printed there."""
+_TABLE_STEP = np.radians(1.0)
+_UNCOMPENSATED = 0.03
+"""Slope of an inclination error that is not compensated."""
 SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
 
 
@@ -50,13 +56,15 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     MethodError
         Planes that leave the direction open; settings within which there is no set-up.
     """
-    limits = design.limits_of(settings, slope_uncertainty=_slope_uncertainty(settings))
+    left = _left(settings)
+    slope_uncertainty = left.table(settings.layout.max_inclination) if left is not None else None
+    limits = design.limits_of(settings, slope_uncertainty=slope_uncertainty)
     number = len(settings.planes)
     own = as_set(settings, limits)
     pair = design.optimise(limits, np.array(PAPER))
     best = pair if number == 2 else design.optimise(limits, _angles(settings))
     setups = (design.equal_strokes(np.array(PAPER), limits), own, pair, best)
-    expected = [expected_direction(setup, settings, limits) for setup in setups]
+    expected = [expected_direction(setup, settings, limits, left) for setup in setups]
     totals = [readings + sources.T @ sources for readings, sources in expected]
     angles = np.array([_worse(total, limits) for total in totals])
     gain = float(angles[0] / angles[3])
@@ -93,7 +101,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
             "best_readings": xr.DataArray(best.readings, dims=(*plane, "direction")),
         },
     )
-    return ds.assign_attrs(notes=_notes(setups, angles, limits))
+    return ds.assign_attrs(notes=_notes(setups, angles, limits, left))
 
 
 def as_set(settings: Settings, limits: Limits) -> Design:
@@ -111,10 +119,11 @@ def as_set(settings: Settings, limits: Limits) -> Design:
     return design.Design(planes, strokes, np.tile(counts, (len(planes), 1)), path)
 
 
-def expected_direction(setup: Design, settings: Settings, limits: Limits) -> tuple[Array, Array]:
+def expected_direction(setup: Design, settings: Settings, limits: Limits, left: Left | None) -> tuple[Array, Array]:
     """Return the bound (3, 3) of the direction by its readings, and what single sources add to it (source, 3).
 
-    The sources are the sensor's scale, common to all planes, and what is left of the inclination error at each plane.
+    The sources are the sensor's scale, common to all planes, and what is left of the inclination error at each plane;
+    nothing is added at planes for which the calibration does not speak.
     """
     p, u, stages = settings.layout, limits.beam, setup.stages()
     noise = p.noise / np.sqrt(p.average)
@@ -123,29 +132,68 @@ def expected_direction(setup: Design, settings: Settings, limits: Limits) -> tup
     variance = [u @ gradient_covariance(stage, noise, p.speckle, p.speckle_length) @ u for stage in stages]
     # How the direction follows the conditions of the planes, weighted as the method weights them: by the noise alone.
     follow = readings @ across(u).T @ (t / np.array(variance)[:, None]).T
-    left = limits.slope_uncertainty(t) if limits.slope_uncertainty is not None else np.zeros(len(t))
-    return readings, np.concatenate([follow.sum(axis=1)[None] * limits.scale_uncertainty, (follow * left).T])
+    slopes = np.where(*left.at(t)[::-1], 0.0) if left is not None else np.zeros(len(t))
+    return readings, np.concatenate([follow.sum(axis=1)[None] * limits.scale_uncertainty, (follow * slopes).T])
 
 
-def _slope_uncertainty(settings: Settings) -> Callable[[Array], Array] | None:
-    """Return what the calibration named in the settings leaves of the slope, as a function of the tilts (k, 2)."""
+@dataclass(frozen=True)
+class Left:
+    """What a calibration leaves of the inclination error.
+
+    Attributes
+    ----------
+    calibration : InclinationCalibration
+    beam, triangulation_normal : ndarray (3,)
+        As drawn, unit vectors.
+    extrapolate : bool
+        Whether tilts count that the calibration does not speak for.
+    """
+
+    calibration: InclinationCalibration
+    beam: Array
+    triangulation_normal: Array
+    extrapolate: bool
+
+    def at(self, t: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the standard uncertainty (k,) of the slope at tilts (k, 2), and whether it may be used there."""
+        normals = t @ across(self.beam) - self.beam
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        q = tilt(self.beam, self.triangulation_normal, normals)
+        spoken_for = np.ones(len(q), bool) if self.extrapolate else self.calibration.supported(q)
+        return self.calibration.slope(q)[1], spoken_for
+
+    def table(self, max_inclination: float) -> Callable[[Array], Array]:
+        """Return the uncertainty as a function of tilts (k, 2), from a table: a search asks for it often.
+
+        Beyond what the calibration speaks for it is as if nothing were compensated.
+        """
+        steep = np.linspace(0.0, max_inclination, max(2, round(max_inclination / _TABLE_STEP) + 1))
+        azimuth = np.linspace(-np.pi, np.pi, round(2 * np.pi / _TABLE_STEP) + 1)
+        A, B = np.meshgrid(steep, azimuth, indexing="ij")
+        u, spoken_for = self.at(np.stack([np.tan(A) * np.cos(B), np.tan(A) * np.sin(B)], axis=-1).reshape(-1, 2))
+        values = np.where(spoken_for, u, _UNCOMPENSATED).reshape(A.shape)
+        per_step = np.array([(n - 1) / (x[-1] - x[0]) for x, n in ((steep, steep.size), (azimuth, azimuth.size))])
+
+        def look_up(t: Array) -> Array:
+            at = np.stack([np.arctan(np.hypot(t[:, 0], t[:, 1])), np.arctan2(t[:, 1], t[:, 0]) + np.pi])
+            return np.asarray(map_coordinates(values, at * per_step[:, None], order=1, mode="nearest"))
+
+        return look_up
+
+
+def _left(settings: Settings) -> Left | None:
+    """Return what the calibration named in the settings leaves; None where they name none."""
     if settings.compensation is None:
         return None
+    p = settings.layout
+    if p.triangulation_normal is None:
+        raise MethodError(
+            "A plan with a calibration of the inclination error needs layout.triangulation_normal: the normal of the "
+            "plane of emitted and received beam."
+        )
+    u, t = np.array(p.nominal_direction, np.float64), np.array(p.triangulation_normal, np.float64)
     calibration = InclinationCalibration.find(settings.compensation)
-    u = np.array(settings.layout.nominal_direction, np.float64)
-    u /= np.linalg.norm(u)
-    normal = np.array(settings.layout.triangulation_normal or across(u)[0], np.float64)
-
-    def uncertainty(t: Array) -> Array:
-        normals = t @ across(u) - u
-        q = tilt(u, normal, normals / np.linalg.norm(normals, axis=1, keepdims=True))
-        # A tilt that the calibration does not speak for is as good as not compensated.
-        return np.where(calibration.supported(q), calibration.slope(q)[1], _UNKNOWN_SLOPE)
-
-    return uncertainty
-
-
-_UNKNOWN_SLOPE = 0.03
+    return Left(calibration, u / np.linalg.norm(u), t / np.linalg.norm(t), settings.extrapolate)
 
 
 def _angles(settings: Settings) -> Array:
@@ -157,7 +205,7 @@ def _worse(covariance: Array, limits: Limits) -> float:
     return design.worst_angle(basis @ covariance @ basis.T)
 
 
-def _notes(setups: tuple[Design, ...], angles: Array, limits: Limits) -> list[str]:
+def _notes(setups: tuple[Design, ...], angles: Array, limits: Limits, left: Left | None) -> list[str]:
     paper, own, pair, best = (format_quantity(float(angle), "arcsec", 3) for angle in angles)
     total = limits.readings
     notes = [
@@ -167,6 +215,14 @@ def _notes(setups: tuple[Design, ...], angles: Array, limits: Limits) -> list[st
     ]
     if setups[3] is not setups[2]:
         notes.append(f"The best {len(setups[3].planes)} planes: {best}, {angles[0] / angles[3]:.3g} times better.")
+    if left is not None:
+        for name, setup in (("the published set-up", setups[0]), ("the set-up as set", setups[1])):
+            dumb = np.flatnonzero(~left.at(design.tilts(setup.normals, limits.beam))[1]) + 1
+            if dumb.size:
+                notes.append(
+                    f"The calibration does not speak for plane {' and '.join(map(str, dumb))} of {name}: what the "
+                    "inclination does there is not in these figures, and a measurement would be refused."
+                )
     for i, (face, strokes, counts) in enumerate(
         zip(setups[3].planes, setups[3].strokes, setups[3].readings, strict=True)
     ):

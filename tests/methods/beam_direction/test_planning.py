@@ -6,9 +6,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from errormotion import datasets
+from errormotion.datasets.calibration import InclinationCalibration
 from errormotion.errors import MethodError
-from errormotion.methods.beam_direction import design
+from errormotion.kinematics.beams import tilt
+from errormotion.methods.beam_direction import BeamDirection, design
 from errormotion.methods.beam_direction.direction import bound
+from errormotion.methods.beam_direction.inclination import Settings as CalibrationSettings
+from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction.settings import Settings
+from errormotion.twin import VirtualMachine
 
 BEAM = np.array([np.sin(np.radians(20)), 0.0, -np.cos(np.radians(20))])
 LIMITS = design.Limits(
@@ -125,3 +132,91 @@ def test_what_cannot_be_planned_is_refused():
         design.optimise(replace(LIMITS, readings=12), PAPER)
     with pytest.raises(MethodError, match="looks down on the gauge"):
         design.optimise(replace(LIMITS, beam=-BEAM), PAPER)
+
+
+# What the method says of it
+
+
+def settings(**changes):
+    layout = {"nominal_direction": tuple(BEAM), "triangulation_normal": (0.0, 1.0, 0.0)}
+    return Settings(layout=layout | changes.pop("layout", {}), **changes)
+
+
+def test_a_plan_is_an_error_dataset_of_zeros_with_the_gain_at_as_many_readings():
+    ds = BeamDirection().plan(settings())
+    datasets.validate(ds)
+    for name in ("EA", "EB", "EC"):
+        assert float(ds[name][0]) == 0.0
+    assert int(ds["best_readings"].sum()) == 3 * settings().layout.readings
+    published, own, pair, best = ds["angle_uncertainty"].values
+    assert float(ds["gain"]) == pytest.approx(published / best)
+    assert 3 < published / best < 10
+    assert max(pair, best) < own
+    assert any(f"{published / best:.3g} times better" in note for note in ds.attrs["notes"])
+    # The covariance is that of the set-up as the settings name it.
+    C = ds["covariance"].values[0, 3:, 3:]
+    assert np.sqrt(np.linalg.eigvalsh(C)[-1]) == pytest.approx(own)
+
+
+def test_a_measurement_bears_the_plan_out():
+    machine = VirtualMachine("cframe", seed=4)
+    sensor = machine.point_sensor
+    chosen = settings(layout={"average": 1, "noise": sensor.noise, "nominal_direction": tuple(sensor.true_direction)})
+    planned = BeamDirection().plan(chosen)
+    limits = design.limits_of(chosen)
+    angles = np.array([(face.inclination, face.rotation) for face in chosen.planes])
+    own = design.longest_strokes(design.plane_normals(angles), limits)
+    stage = [machine.home() + design.stroke_points(lengths, np.full(3, 20)) for lengths in own]
+    raw = machine.raw_beam_direction(
+        [tuple(pair) for pair in angles], stage=np.array(stage), seed=7, inclination_error=False
+    )
+    found = BeamDirection().identify(raw, Settings(noise="stated"))
+    u, expected = (np.sqrt(np.diagonal(ds["covariance"].values[0])[3:]) for ds in (found, planned))
+    # Both state turns of their nominal direction, and these are 0.6 deg (1 %) apart.
+    np.testing.assert_allclose(u, expected, rtol=0.02)
+
+
+def test_an_uncertain_scale_is_a_source_of_its_own():
+    ds = BeamDirection().plan(settings(layout={"scale_uncertainty": 1e-4}))
+    effect = ds["influence"].sel(source="scale of the sensor").values[0, 3:]
+    C = ds["covariance"].values[0, 3:, 3:]
+    alone = BeamDirection().plan(settings())["covariance"].values[0, 3:, 3:]
+    np.testing.assert_allclose(C - alone, np.outer(effect, effect), atol=1e-18)
+    assert np.linalg.norm(effect) > 1e-5
+
+
+def test_a_set_up_with_a_path_is_planned_as_it_is():
+    ring = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    path = [(8e-3 * np.cos(a), 8e-3 * np.sin(a), 5e-3 * np.sin(2 * a)) for a in ring]
+    chosen = settings(layout={"path": path})
+    own = design.across(BEAM) @ bound(
+        [np.array(path)] * 3,
+        design.plane_normals(np.array([(face.inclination, face.rotation) for face in chosen.planes])),
+        BEAM,
+        chosen.layout.noise / np.sqrt(chosen.layout.average),
+    ) @ design.across(BEAM).T  # fmt: skip
+    planned = BeamDirection().plan(chosen)["angle_uncertainty"].values[1]
+    assert planned == pytest.approx(design.worst_angle(own))
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    """Return the path of a calibration with the holes of the published one: rotations 0 to 10, 90, 170 to 180 deg."""
+    raw = VirtualMachine("cframe", seed=3).raw_inclination(seed=1)
+    return calibrate(raw, CalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
+
+
+def test_the_best_planes_are_those_that_the_calibration_speaks_for(calibration):
+    ds = BeamDirection().plan(settings(compensation=str(calibration)))
+    best = design.plane_normals(np.stack([ds["best_inclination"], ds["best_rotation"]], axis=-1))
+    q = tilt(BEAM, np.array([0.0, 1.0, 0.0]), best)
+    assert InclinationCalibration.load(calibration).supported(q).all()
+    assert float(ds["gain"]) > 1.5
+    refused = [note for note in ds.attrs["notes"] if "does not speak for" in note]
+    assert "plane 2 of the published set-up" in refused[0]
+    assert "would be refused" in refused[0]
+
+
+def test_a_plan_with_a_calibration_needs_to_know_how_the_sensor_is_turned(calibration):
+    with pytest.raises(MethodError, match=r"needs layout\.triangulation_normal"):
+        BeamDirection().plan(settings(compensation=str(calibration), layout={"triangulation_normal": None}))
