@@ -185,15 +185,89 @@ def _reduce_chunk(
 
 
 @compiled()
+def _reduce_four(
+    reading: Array,
+    weight: Array,
+    station: Array,
+    dead_path: Array,
+    steps: int,
+    target: Array,
+    first: int,
+    last: int,
+    sums: Array,
+) -> float:  # pragma: no cover - compiled
+    """Do the work of `reduce_targets` for one chunk seen by four stations, no further parameters.
+
+    The one row N is the vector of minors of E: four triple products, from two cross products.
+    """
+    E, w, r, c = np.empty((4, 3)), np.empty(4), np.empty(4), np.empty((2, 3))
+    v, filled, furthest = np.empty((17, LANES)), 0, 0.0
+    reach, u = np.empty(4), np.empty(3)
+    for i in range(first, last):
+        for j in range(4):
+            w[j], reach[j] = weight[j, i], reading[j, i] + dead_path[j]
+        u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
+        for k in range(steps):
+            size = _locate(reach, w, station, u)
+            if k == steps - 1:
+                furthest = max(furthest, size)
+        target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
+        for j in range(4):
+            x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+            distance = math.sqrt(x * x + y * y + z * z)
+            k = w[j] / distance
+            E[j, 0], E[j, 1], E[j, 2], r[j] = x * k, y * k, z * k, w[j] * (reach[j] - distance)
+        for h in range(2):
+            a, b = E[2 * h], E[2 * h + 1]
+            c[h, 0], c[h, 1] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
+            c[h, 2] = a[0] * b[1] - a[1] * b[0]
+        n0 = E[1, 0] * c[1, 0] + E[1, 1] * c[1, 1] + E[1, 2] * c[1, 2]
+        n1 = -E[0, 0] * c[1, 0] - E[0, 1] * c[1, 1] - E[0, 2] * c[1, 2]
+        n2 = E[3, 0] * c[0, 0] + E[3, 1] * c[0, 1] + E[3, 2] * c[0, 2]
+        n3 = -E[2, 0] * c[0, 0] - E[2, 1] * c[0, 1] - E[2, 2] * c[0, 2]
+        square = n0 * n0 + n1 * n1 + n2 * n2 + n3 * n3
+        if square == 0.0:
+            continue
+        unit = 1.0 / math.sqrt(square)
+        for j in range(4):
+            n = unit * (n0 if j == 0 else n1 if j == 1 else n2 if j == 2 else n3)
+            v[4 * j, filled], v[4 * j + 1, filled] = -n * E[j, 0], -n * E[j, 1]
+            v[4 * j + 2, filled], v[4 * j + 3, filled] = -n * E[j, 2], -n * w[j]
+        v[16, filled] = unit * (n0 * r[0] + n1 * r[1] + n2 * r[2] + n3 * r[3])
+        filled += 1
+        if filled == LANES:
+            _add_products(v, filled, sums)
+            filled = 0
+    _add_products(v, filled, sums)
+    return furthest
+
+
+@compiled()
+def _reduce_part(
+    reading: Array,
+    weight: Array,
+    station: Array,
+    dead_path: Array,
+    extra: Array,
+    value: Array,
+    steps: int,
+    target: Array,
+    part: int,
+    sums: Array,
+) -> float:  # pragma: no cover - compiled
+    first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
+    if len(station) == 4 and len(value) == 0:
+        return _reduce_four(reading, weight, station, dead_path, steps, target, first, last, sums)
+    return _reduce_chunk(reading, weight, station, dead_path, extra, value, steps, target, first, last, sums)
+
+
+@compiled()
 def _reduce_alone(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, steps: int,
     target: Array, sums: Array, moved: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in range(len(sums)):
-        first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
-        moved[part] = _reduce_chunk(
-            reading, weight, station, dead_path, extra, value, steps, target, first, last, sums[part]
-        )
+        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, steps, target, part, sums[part])
 
 
 @compiled(parallel=True)
@@ -202,10 +276,7 @@ def _reduce_shared(
     target: Array, sums: Array, moved: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in numba.prange(len(sums)):
-        first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
-        moved[part] = _reduce_chunk(
-            reading, weight, station, dead_path, extra, value, steps, target, first, last, sums[part]
-        )
+        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, steps, target, part, sums[part])
 
 
 def chunks(targets: int) -> int:
@@ -304,31 +375,46 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
         DG[k, 5] = D[k, 1] * c[0] - D[k, 0] * c[1]
 
 
-@compiled(parallel=True)
-def _datum_chunks(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
+@compiled()
+def _datum_part(
+    weight: Array, station: Array, extra: Array, target: Array, centre: Array, part: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
     n = len(station)
+    reach, w, r, c = np.zeros(n), np.empty(n), np.empty(n), np.empty(3)
+    e, E, Q, D = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n)), np.empty((3, 3))
+    F, DG = np.empty((3, 4 * n + len(extra))), np.empty((3, 6))
+    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
+        w[:] = weight[:, i]
+        _directions(reach, w, station, target[i], e, r, E, Q)
+        if not _block(E, D):
+            continue
+        c[:] = target[i] - centre
+        _response(e, w, D, extra, i, F)
+        _spread_motions(D, c, DG)
+        _cross(F, c, sums[:, 12:])
+        _cross(DG, c, sums[:, 6:12])
+        for a in range(3):
+            sums[a, a] += 1.0
+        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+        for a in range(3):
+            for b in range(3):
+                sums[3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
+
+
+@compiled()
+def _datum_alone(
+    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
+) -> None:  # pragma: no cover - compiled
+    for part in range(len(sums)):
+        _datum_part(weight, station, extra, target, centre, part, sums[part])
+
+
+@compiled(parallel=True)
+def _datum_shared(
+    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
+) -> None:  # pragma: no cover - compiled
     for part in numba.prange(len(sums)):
-        reach, w, r, c = np.zeros(n), np.empty(n), np.empty(n), np.empty(3)
-        e, E, Q, D = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n)), np.empty((3, 3))
-        F, DG = np.empty((3, 4 * n + len(extra))), np.empty((3, 6))
-        for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-            w[:] = weight[:, i]
-            _directions(reach, w, station, target[i], e, r, E, Q)
-            if not _block(E, D):
-                continue
-            c[:] = target[i] - centre
-            _response(e, w, D, extra, i, F)
-            _spread_motions(D, c, DG)
-            _cross(F, c, sums[part, :, 12:])
-            _cross(DG, c, sums[part, :, 6:12])
-            for a in range(3):
-                sums[part, a, a] += 1.0
-            square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-            for a in range(3):
-                for b in range(3):
-                    sums[part, 3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
+        _datum_part(weight, station, extra, target, centre, part, sums[part])
 
 
 def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centre: Array) -> tuple[Array, Array, Array]:
@@ -338,63 +424,10 @@ def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centr
     the stations' parameters.
     """
     sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
-    _datum_chunks(weight, station, extra, target, centre, sums)
+    work = _datum_shared if len(target) > MANY else _datum_alone
+    work(weight, station, extra, target, centre, sums)
     total = sums.sum(axis=0)
     return total[:, :6], total[:, 6:12], total[:, 12:]
-
-
-@compiled(parallel=True)
-def _examine(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    n, p = W.shape[0], W.shape[1]
-    stations = len(station)
-    for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
-        reach, w, r, c = np.zeros(stations), np.empty(stations), np.empty(stations), np.empty(3)
-        e, E, Q, D = np.empty((stations, 3)), np.empty((stations, 3)), np.empty((stations, stations)), np.empty((3, 3))
-        F, DG, FW, q = np.empty((3, n)), np.empty((3, 6)), np.empty((3, p)), np.empty((stations, p))
-        for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-            _reach(reading, weight, dead_path, extra, value, i, reach, w)
-            _directions(reach, w, station, target[i], e, r, E, Q)
-            for j in range(stations):
-                residual[j, i] = r[j] / w[j] if w[j] > 0.0 else np.nan
-                redundancy[j, i] = np.nan
-            if not _block(E, D):
-                covariance[i] = np.nan
-                continue
-            c[:] = target[i] - centre
-            _spread_motions(D, c, DG)
-            # Readings by the stations' factor, then targets: both sum over the stations.
-            for j in range(stations):
-                for k in range(p):
-                    s = e[j, 0] * W[4 * j, k] + e[j, 1] * W[4 * j + 1, k] + e[j, 2] * W[4 * j + 2, k]
-                    q[j, k] = -w[j] * (s + W[4 * j + 3, k])
-                    for a in range(len(extra)):
-                        q[j, k] += w[j] * extra[a, j, i] * W[4 * stations + a, k]
-            FW[:] = 0.0
-            for j in range(stations):
-                for a in range(3):
-                    s = -w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
-                    for k in range(p):
-                        FW[a, k] += s * q[j, k]
-            # What is left of the readings when the target has taken its part: redundancy 1 - hat matrix.
-            for j in range(stations):
-                if w[j] == 0.0:
-                    continue
-                alone, taken = 0.0, 0.0
-                for a in range(3, stations):
-                    alone += Q[a, j] * Q[a, j]
-                for k in range(p):
-                    s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
-                    taken += s * s
-                redundancy[j, i] = alone - taken
-            # G times the datum's shift, taken off.
-            for k in range(p):
-                FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
-                FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
-                FW[2, k] -= shift[2, k] + shift[3, k] * c[1] - shift[4, k] * c[0]
-            _covariance(D, DG, FW, c, H, K, F, covariance[i])
 
 
 @compiled()
@@ -422,6 +455,84 @@ def _covariance(
             out[a, b] = s
 
 
+@compiled()
+def _examine_part(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+    part: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    n, p = W.shape[0], W.shape[1]
+    stations = len(station)
+    reach, w, r, c = np.zeros(stations), np.empty(stations), np.empty(stations), np.empty(3)
+    e, E, Q, D = np.empty((stations, 3)), np.empty((stations, 3)), np.empty((stations, stations)), np.empty((3, 3))
+    F, DG, FW, q = np.empty((3, n)), np.empty((3, 6)), np.empty((3, p)), np.empty((stations, p))
+    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
+        _reach(reading, weight, dead_path, extra, value, i, reach, w)
+        _directions(reach, w, station, target[i], e, r, E, Q)
+        for j in range(stations):
+            residual[j, i] = r[j] / w[j] if w[j] > 0.0 else np.nan
+            redundancy[j, i] = np.nan
+        if not _block(E, D):
+            covariance[i] = np.nan
+            continue
+        c[:] = target[i] - centre
+        _spread_motions(D, c, DG)
+        # Readings by the stations' factor, then targets: both sum over the stations.
+        for j in range(stations):
+            for k in range(p):
+                s = e[j, 0] * W[4 * j, k] + e[j, 1] * W[4 * j + 1, k] + e[j, 2] * W[4 * j + 2, k]
+                q[j, k] = -w[j] * (s + W[4 * j + 3, k])
+                for a in range(len(extra)):
+                    q[j, k] += w[j] * extra[a, j, i] * W[4 * stations + a, k]
+        FW[:] = 0.0
+        for j in range(stations):
+            for a in range(3):
+                s = -w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
+                for k in range(p):
+                    FW[a, k] += s * q[j, k]
+        # What is left of the readings when the target has taken its part: redundancy 1 - hat matrix.
+        for j in range(stations):
+            if w[j] == 0.0:
+                continue
+            alone, taken = 0.0, 0.0
+            for a in range(3, stations):
+                alone += Q[a, j] * Q[a, j]
+            for k in range(p):
+                s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
+                taken += s * s
+            redundancy[j, i] = alone - taken
+        # G times the datum's shift, taken off.
+        for k in range(p):
+            FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
+            FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
+            FW[2, k] -= shift[2, k] + shift[3, k] * c[1] - shift[4, k] * c[0]
+        _covariance(D, DG, FW, c, H, K, F, covariance[i])
+
+
+@compiled()
+def _examine_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    for part in range((len(target) + CHUNK - 1) // CHUNK):
+        _examine_part(
+            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
+            H, K, covariance, residual, redundancy, part,
+        )  # fmt: skip
+
+
+@compiled(parallel=True)
+def _examine_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
+        _examine_part(
+            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
+            H, K, covariance, residual, redundancy, part,
+        )  # fmt: skip
+
+
 def examine(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
@@ -439,7 +550,8 @@ def examine(
     """
     n, m = reading.shape
     covariance, residual, redundancy = np.empty((m, 3, 3)), np.empty((n, m)), np.empty((n, m))
-    _examine(
+    work = _examine_shared if m > MANY else _examine_alone
+    work(
         reading, weight, station, dead_path, extra, value, target, centre, W, shift, H, K,
         covariance, residual, redundancy,
     )  # fmt: skip

@@ -27,6 +27,7 @@ TOLERANCE = 1e-13
 _PASSES = 200
 _FIRST_STEPS = 3
 _DAMPED = 1e-4
+_LONG = 12
 _ROUNDS = 12
 
 
@@ -166,14 +167,17 @@ def solve(
         known = np.where(fixed, problem.prior[3 : 4 * len(start.place) : 4], stations.dead_path)
         stations = replace(stations, dead_path=known)
     state = descend(problem, stations, problem.nominal.copy(), tolerance)
-    notes = list(start.notes)
     found = outliers.Found.none(problem.weight)
+    network = conclude(problem, state)
     if robust:
-        problem, state, found = _without_wrong(problem, state, tolerance)
-        notes += found.notes
-    network = conclude(problem, state, found, notes)
-    notes += determinacy.swapped_stations(network.station, places)
-    return replace(network, notes=tuple(notes))
+        network, found = _without_wrong(problem, network, tolerance)
+    notes = [
+        *start.notes,
+        *found.notes,
+        *determinacy.weak_targets(network.target, network.target_covariance, network.station),
+        *determinacy.swapped_stations(network.station, places),
+    ]
+    return replace(network, left_out=found.left_out, undecided=found.undecided, notes=tuple(notes))
 
 
 def _problem(
@@ -238,14 +242,14 @@ def descend(problem: Problem, stations: Stations, target: Array, tolerance: floa
             if mu > 1e12:
                 break
             continue
-        gain = sums.square - found.square
         stations, sums, mu = trial, found, (0.1 * mu if mu > _DAMPED else 0.0)
         kept[:] = target
         # Steps shrink at least as fast as they have: the next one is this one times their ratio.
         ahead = found.moved * min(1.0, found.moved / last) if last < np.inf else np.inf
         last = found.moved
-        if mu == 0.0 and (ahead < tolerance or (passes > 20 and abs(gain) < 1e-9 * sums.square)):
-            converged = ahead < max(tolerance, 1e-9)
+        # What no longer shrinks and is far below any noise is rounding.
+        converged = mu == 0.0 and (ahead < tolerance or (passes > _LONG and found.moved < 1e-10))
+        if converged:
             break
     return State(stations, kept, sums, passes, converged)
 
@@ -264,51 +268,47 @@ def _vector(stations: Stations) -> Array:
     return np.concatenate([np.column_stack([stations.place, stations.dead_path]).ravel(), stations.value])
 
 
-def _without_wrong(problem: Problem, state: State, tolerance: float) -> tuple[Problem, State, outliers.Found]:
+def _without_wrong(problem: Problem, network: Network, tolerance: float) -> tuple[Network, outliers.Found]:
     """Leave wrong readings out, the grossest first, until none is left."""
     original, found = problem.weight, outliers.Found.none(problem.weight)
     for _ in range(_ROUNDS):
-        network = conclude(problem, state, found, [])
         now = outliers.search(network, original, problem.nominal, found)
         if now == found:
             break
         found = now
         problem = replace(problem, weight=found.applied(original))
         determinacy.refuse_too_few(problem.weight, int(np.count_nonzero(problem.precision == 0)))
-        state_before = state
-        state = descend(problem, state.stations, state.target.copy(), tolerance)
-        state = replace(state, passes=state.passes + state_before.passes)
-    return problem, state, found
+        target = np.where(np.isfinite(network.target), network.target, problem.nominal)
+        state = descend(problem, network.stations, target, tolerance)
+        network = conclude(problem, replace(state, passes=state.passes + network.iterations))
+    return network, found
 
 
-def conclude(problem: Problem, state: State, found: outliers.Found, notes: list[str]) -> Network:
+def conclude(problem: Problem, state: State) -> Network:
     """Bring a solution into the datum and return it with its covariances."""
     used = np.count_nonzero(problem.weight, axis=0) >= 3
     stations, target = fitted(state.stations, state.target, problem.nominal, used)
     centre = target[used].mean(axis=0)
     Z = problem.basis(stations, centre)
-    # The sums are those of the solution before it was turned: information turns with it.
     sums = problem.reduce(stations, target, 1)
     information = Z.T @ sums.H @ Z
     values = determinacy.refuse_loose(information, Z, stations, target[used])
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
-    datum = _datum(problem, stations, target, W)
+    datum = _datum(problem, stations, target, centre, W)
     covariance, residual, redundancy = examine(
         problem.reading, problem.weight, stations.place, stations.dead_path, problem.extra, stations.value, target,
         datum.centre, W, datum.shift, datum.H, datum.K,
     )  # fmt: skip
-    T = stations.motions(datum.centre)
+    T = stations.motions(centre)
     F = W - T @ datum.shift
     joint = F @ F.T + T @ datum.K @ T.T
-    readings = int(np.count_nonzero(problem.weight))
-    targets = int(np.count_nonzero(used))
-    known = int(np.count_nonzero(np.isfinite(problem.precision) & (problem.precision > 0)))
-    freedom = readings + known - 3 * targets - W.shape[1]
-    target[~used] = np.nan
+    known = int(np.count_nonzero(problem.free & (problem.precision > 0)))
+    freedom = int(np.count_nonzero(problem.weight)) + known - 3 * int(np.count_nonzero(used)) - W.shape[1]
+    target[~np.isfinite(covariance[:, 0, 0])] = np.nan
+    sigma0 = float(np.sqrt(sums.square / freedom)) if freedom > 0 else np.nan
     return Network(
-        target, stations, covariance, joint, residual, redundancy, problem.weight, found.left_out, found.undecided,
-        float(np.sqrt(sums.square / max(freedom, 1))), freedom, state.passes, state.converged,
-        float(values[-1] / values[0]), tuple(notes), problem.extra, datum,
+        target, stations, covariance, joint, residual, redundancy, problem.weight, (), (), sigma0, freedom,
+        state.passes, state.converged, float(values[-1] / values[0]), (), problem.extra, datum,
     )  # fmt: skip
 
 
@@ -321,9 +321,7 @@ def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.b
     return replace(stations, place=(stations.place - a) @ R.T + b), np.ascontiguousarray(moved)
 
 
-def _datum(problem: Problem, stations: Stations, target: Array, W: Array) -> Datum:
-    used = np.count_nonzero(problem.weight, axis=0) >= 3
-    centre = target[used].mean(axis=0)
+def _datum(problem: Problem, stations: Stations, target: Array, centre: Array, W: Array) -> Datum:
     GG, GDG, GF = datum_sums(problem.weight, stations.place, problem.extra, target, centre)
-    H: Array = np.linalg.inv(GG)
+    H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
     return Datum(centre, W, H @ GF @ W, H, H @ GDG @ H)

@@ -20,7 +20,7 @@ from errormotion.errors import MethodError
 
 Array = NDArray[np.float64]
 
-SOME = 400
+SOME = 250
 """Readings of a station that are looked at: enough to tell where it is."""
 FLAT = 1e-3
 """Targets thinner than this share of their extent lie in a plane, or on a line."""
