@@ -40,14 +40,35 @@ def builtin_subjects(
         return (beam_direction(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
         return (InstrumentSubject(cls, str(scan_file())),)
+    if (group, plugin_id) == ("instruments", "tracker_table"):
+        return (InstrumentSubject(cls, str(length_table())),)
     return ()
+
+
+def own_folder() -> Path:
+    """Return a new folder that lasts as long as this process."""
+    folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@cache
+def length_table() -> Path:
+    """Return a table of lengths from three stations to five targets; one beam was broken."""
+    lines = [f"S{k},{i},{1500 + 100 * k + 7 * i:.4f},20.{i},1013.2,45" for k in range(3) for i in range(5)]
+    lines[7] = "S1,2,,20.2,1013.2,45"
+    path = own_folder() / "lengths.csv"
+    path.write_text(
+        "\n".join(["station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]", *lines]) + "\n",
+        encoding="utf-8",
+    )
+    return path
 
 
 @cache
 def scan_file() -> Path:
     """Return a scan of 350 profiles as a file that lasts as long as this process; three heights are unknown."""
-    folder = Path(tempfile.mkdtemp(prefix="errormotion-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = own_folder()
     x, y = 12.5e-6 * np.arange(60), 25e-6 * np.arange(350)
     heights = 1e-3 * np.sin(np.add.outer(700.0 * y, 5000.0 * x))
     heights[10:13, 7] = np.nan

@@ -1,0 +1,272 @@
+"""Exported tables of trackers to lengths by station and target, in SI, with everything that is wrong named at once.
+
+A table has a line of column names with their units, and a line for each measurement, in any order::
+
+    station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]
+    S1,1,1523.40712,20.31,1013.2,45
+    S1,2,,20.31,1013.2,45
+
+An empty length is a broken beam.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from errormotion.datasets.csv_text import Table, blocks
+from errormotion.datasets.log_reader import Complaints
+from errormotion.datasets.units import convert
+from errormotion.errors import DatasetError
+
+Array = np.ndarray[Any, Any]
+Repeats = Literal["refuse", "last", "mean"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of numbers: its unit inside, how a person writes one, what is believable, and its other names."""
+
+    unit: str
+    example: str
+    low: float
+    high: float
+    names: tuple[str, ...] = ()
+
+
+QUANTITIES: Mapping[str, Quantity] = {
+    "length": Quantity("m", "mm", -160.0, 160.0, ("displacement", "distance")),
+    "temperature": Quantity("degC", "degC", -20.0, 60.0, ("air_temperature",)),
+    "pressure": Quantity("Pa", "hPa", 5e4, 1.2e5, ("air_pressure",)),
+    "humidity": Quantity("%", "%", 0.0, 100.0, ("relative_humidity",)),
+}
+KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker",), "target": ("point",)}
+AIR = ("temperature", "pressure", "humidity")
+
+_TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_EMPTY = ("", "NaN", "nan", "-", "---")
+_UNITS = {"°C": "degC", "C": "degC", "K": "kelvin", "mbar": "mbar", "%RH": "%", "% RH": "%", "%rH": "%"}
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What a table says.
+
+    Attributes
+    ----------
+    stations, targets : tuple of str
+    length : ndarray, (station, target)
+        m; NaN where there is none.
+    temperature, pressure, humidity : ndarray, (station, target)
+        degC, Pa, %; NaN where unknown.
+    missing : mapping of str to int
+        Lengths that are not there: ``empty`` (a line without a number) and ``no line``.
+    repeated : int
+        Lines that another one of the same station and target has replaced, or was averaged with.
+    """
+
+    stations: tuple[str, ...]
+    targets: tuple[str, ...]
+    length: Array
+    temperature: Array
+    pressure: Array
+    humidity: Array
+    missing: Mapping[str, int]
+    repeated: int = 0
+
+
+def read_table(
+    path: Path, *, stations: Sequence[str] | None = None, repeats: Repeats = "refuse", least_length: float = 0.0
+) -> Readings:
+    """Read a table of lengths.
+
+    Parameters
+    ----------
+    path : Path
+        UTF-8 text, see the module; separated by tabulator, semicolon or comma, the decimal sign is a point.
+    stations : sequence of str, optional
+        The stations that there are, in their order; default: those of the table, in its order.
+    repeats : {"refuse", "last", "mean"}
+        What becomes of a second line for the same station and target.
+    least_length : float
+        The longest length must be longer than this, m: finds metres that are called millimetres.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read; or every mistake in it, with line, column, what was expected and what came.
+    """
+    _, tables = blocks(path)
+    if len(tables) > 1:
+        line = tables[1].head[0]
+        raise DatasetError(f"{path}, line {line}: a second table begins; expected one, without empty lines in it")
+    (table,) = tables
+    complaints = Complaints(path)
+    columns = _columns(table, complaints)
+    complaints.raise_any()
+    rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, complaints)]
+    if not rows and not complaints.count:
+        complaints.add(table.head[0], "expected lines of measurements below the names; found none")
+    values = {name: _numbers(name, place, unit, rows, table, complaints) for name, (place, unit) in columns.items()}
+    keys = {name: [texts[place] for _, texts in rows] for name, (place, _) in columns.items() if name in KEYS}
+    names = _names(keys, rows, stations, complaints)
+    complaints.raise_any()
+    found = _placed(names, keys, values, rows, repeats, complaints)
+    complaints.raise_any()
+    _check_length(path, found.length, table.head[1][columns["length"][0]], least_length)
+    return found
+
+
+def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]:
+    """Return place and unit of each column that is known."""
+    line, titles = table.head
+    others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
+    others |= {other: name for name, them in KEYS.items() for other in them}
+    found: dict[str, tuple[int, str]] = {}
+    for place, title in enumerate(titles):
+        match = _TITLE.fullmatch(title)
+        name = match[1].lower().replace(" ", "_") if match else ""
+        name = others.get(name, name)
+        unit = ((match[2] or match[3] or "") if match else "").strip()
+        if name in found:
+            complaints.add(line, f"column '{title}': there is a column for the {name} already")
+        elif name in KEYS:
+            found[name] = (place, "")
+        elif name in QUANTITIES:
+            found[name] = (place, _unit(title, name, unit, line, complaints))
+        else:
+            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            complaints.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
+    for name in ("station", "target", "length"):
+        if name not in found and not complaints.count:
+            complaints.add(line, f"expected a column '{name}'; found {', '.join(titles)}")
+    return found
+
+
+def _unit(title: str, name: str, unit: str, line: int, complaints: Complaints) -> str:
+    quantity = QUANTITIES[name]
+    unit = _UNITS.get(unit, unit)
+    if not unit:
+        complaints.add(line, f"column '{title}': expected its unit, such as '{name} [{quantity.example}]'")
+        return quantity.unit
+    try:
+        convert(1.0, unit, quantity.unit)
+    except DatasetError as error:
+        complaints.add(line, f"column '{title}': expected a unit such as {quantity.example}; {error}")
+        return quantity.unit
+    return unit
+
+
+def _whole(line: int, texts: list[str], table: Table, complaints: Complaints) -> bool:
+    wanted = len(table.head[1])
+    if len(texts) == wanted:
+        return True
+    comma = " (the decimal sign is a point)" if len(texts) > wanted else ""
+    complaints.add(line, f"expected {wanted} fields; found {len(texts)}{comma}")
+    return False
+
+
+def _numbers(
+    name: str, place: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, complaints: Complaints
+) -> Array:
+    """Return the numbers of a column in SI; NaN where there is none. Nothing for a column of names."""
+    if name in KEYS:
+        return np.empty(0)
+    quantity, title = QUANTITIES[name], table.head[1][place]
+    values = np.full(len(rows), np.nan)
+    for k, (line, texts) in enumerate(rows):
+        text = texts[place]
+        if text in _EMPTY:
+            continue
+        if not _NUMBER.fullmatch(text) or not np.isfinite(float(text)):
+            comma = " (the decimal sign is a point)" if "," in text else ""
+            complaints.add(line, f"column '{title}': expected a number; found '{text}'{comma}")
+            continue
+        values[k] = float(text)
+    inside = np.asarray(convert(values, unit, quantity.unit), dtype=float)
+    for k in map(int, np.flatnonzero((inside < quantity.low) | (inside > quantity.high))):
+        low, high = (convert(limit, quantity.unit, unit) for limit in (quantity.low, quantity.high))
+        complaints.add(
+            rows[k][0],
+            f"column '{title}': expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Is its unit really {unit}?",
+        )
+    return inside
+
+
+def _names(
+    keys: dict[str, list[str]],
+    rows: list[tuple[int, list[str]]],
+    stations: Sequence[str] | None,
+    complaints: Complaints,
+) -> dict[str, tuple[str, ...]]:
+    """Return the stations in their order, the targets by number or in the table's order."""
+    for name, texts in keys.items():
+        for (line, _), text in zip(rows, texts, strict=True):
+            if not text:
+                complaints.add(line, f"column '{name}': expected a number or name; found nothing")
+    found = {name: tuple(dict.fromkeys(texts)) for name, texts in keys.items()}
+    if stations is not None:
+        for (line, _), text in zip(rows, keys["station"], strict=True):
+            if text and text not in stations:
+                complaints.add(line, f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
+        found["station"] = tuple(stations)
+    if all(re.fullmatch("[0-9]{1,9}", text) for text in found["target"]):
+        found["target"] = tuple(sorted(found["target"], key=int))
+    return found
+
+
+def _placed(
+    names: dict[str, tuple[str, ...]],
+    keys: dict[str, list[str]],
+    values: dict[str, Array],
+    rows: list[tuple[int, list[str]]],
+    repeats: Repeats,
+    complaints: Complaints,
+) -> Readings:
+    """Put every line where it belongs."""
+    shape = len(names["station"]), len(names["target"])
+    places = {name: {text: k for k, text in enumerate(texts)} for name, texts in names.items()}
+    groups: dict[tuple[int, int], list[int]] = {}
+    for k, (station, target) in enumerate(zip(keys["station"], keys["target"], strict=True)):
+        group = groups.setdefault((places["station"][station], places["target"][target]), [])
+        if group and repeats == "refuse":
+            complaints.add(
+                rows[k][0],
+                f"station '{station}', target '{target}': comes again; line {rows[group[0]][0]} has it already. Remove "
+                "one, or say with 'repeats' which counts",
+            )
+        group.append(k)
+    found = {name: np.full(shape, np.nan) for name in QUANTITIES}
+    for place, group in groups.items():
+        for name in values.keys() & QUANTITIES.keys():
+            taken = values[name][group[-1:] if repeats == "last" else group]
+            taken = taken[np.isfinite(taken)]
+            found[name][place] = taken.mean() if taken.size else np.nan
+    empty = sum(not np.isfinite(found["length"][place]) for place in groups)
+    missing = {"empty": int(empty), "no line": shape[0] * shape[1] - len(groups)}
+    return Readings(
+        names["station"],
+        names["target"],
+        **found,
+        missing={why: count for why, count in missing.items() if count},
+        repeated=len(rows) - len(groups),
+    )
+
+
+def _check_length(path: Path, length: Array, title: str, least: float) -> None:
+    if not np.isfinite(length).any():
+        raise DatasetError(f"{path}: column '{title}': not a single length in it; is it the whole table?")
+    longest = float(np.nanmax(np.abs(length)))
+    if longest <= least:
+        raise DatasetError(
+            f"{path}: column '{title}': the longest length is {longest:.4g} m; is its unit right? Set 'least_length' "
+            f"below {least:g} m if it is"
+        )

@@ -1,0 +1,172 @@
+"""Exported tables of trackers that publish no wire, as if the tracker measured now."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import xarray as xr
+from pydantic import Field
+
+from errormotion.datasets.units import Length
+from errormotion.errors import DatasetError, InstrumentError, ReplayError
+from errormotion.instruments.laser_tracker.measurement import Environment
+from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+
+UNITS = {"displacement": "m", "temperature": "degC", "pressure": "Pa", "humidity": "%"}
+
+
+class TrackerTableSettings(PluginSettings):
+    """Settings of ``tracker_table``."""
+
+    stations: tuple[str, ...] | None = Field(
+        default=None, description="names of the stations, in their order; those of the table where not given"
+    )
+    repeats: Repeats = Field(
+        default="refuse", description="a second line for a station and target: refuse, take the last, or the mean"
+    )
+    least_length: Length = Field(
+        default=0.01, description="the longest length must be longer, else its unit is doubted; 0: never", ge=0
+    )
+    noise: Length = Field(default=0.5e-6, description="standard deviation of a length", ge=0)
+
+
+class TrackerTable:
+    """Lengths by station and target from a table that a tracker's own software has exported.
+
+    Parameters
+    ----------
+    address : str
+        The table: a path, or ``file://path``; ``replay://path`` reads a recording, which is a copy of the table.
+    settings : TrackerTableSettings, optional
+    record : Path, optional
+        Copy that is written.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="tracker_table",
+        kind="laser_tracker",
+        summary="Exported tables of trackers (LaserTRACER and others): station, target, length, air",
+        status="simulated_only",
+    )
+    Settings: ClassVar[type[TrackerTableSettings]] = TrackerTableSettings
+
+    def __init__(
+        self, address: str, settings: TrackerTableSettings | None = None, *, record: Path | None = None
+    ) -> None:
+        self.address = address
+        self.settings = TrackerTableSettings() if settings is None else settings
+        self._record = record
+        self._digest = ""
+        self._readings: Readings | None = None
+
+    def open(self) -> None:
+        """Read the table; idempotent.
+
+        Raises
+        ------
+        InstrumentError
+            There is no such file, or it is not as it should be: every mistake with its line, see `table_reader`.
+        """
+        if self._readings is not None:
+            return
+        scheme, mark, rest = self.address.rpartition("://")
+        if mark and scheme not in ("file", "replay"):
+            raise InstrumentError(f"Expected the path of a table, such as lengths.csv; found '{self.address}'")
+        wrong = ReplayError if scheme == "replay" else InstrumentError
+        path = Path(rest)
+        try:
+            data = path.read_bytes()
+            readings = read_table(
+                path,
+                stations=self.settings.stations,
+                repeats=self.settings.repeats,
+                least_length=self.settings.least_length,
+            )
+        except OSError as error:
+            raise wrong(f"The table {path} cannot be read: {error.strerror}") from None
+        except DatasetError as error:
+            raise wrong(str(error)) from error
+        if self._record is not None:
+            try:
+                with self._record.open("xb") as copy:
+                    copy.write(data)
+            except OSError as error:
+                raise InstrumentError(f"The recording {self._record} cannot be made: {error.strerror}") from None
+        self._digest, self._readings = hashlib.sha256(data).hexdigest(), readings
+
+    def close(self) -> None:
+        """Forget the table; idempotent."""
+        self._readings = None
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def distance_is_displacement(self) -> bool:
+        """Lengths may count from anywhere: the dead path of each station is unknown."""
+        return True
+
+    @property
+    def readings(self) -> Readings:
+        """The table; InstrumentError before ``open``."""
+        if self._readings is None:
+            raise InstrumentError(
+                f"The tracker_table at {self.address} is not open: use it in a 'with' block, or call open() first"
+            )
+        return self._readings
+
+    def identify(self) -> Identity:
+        """Tell the table by its hash, its stations and targets, and what is missing."""
+        readings = self.readings
+        return Identity(
+            manufacturer="table",
+            model="exported lengths",
+            serial_number=self._digest[:16],
+            details={
+                "address": self.address,
+                "stations": list(readings.stations),
+                "targets": len(readings.targets),
+                "missing": dict(readings.missing),
+                "repeated": readings.repeated,
+            },
+        )
+
+    def read(self) -> np.ndarray[Any, Any]:
+        """Return all lengths, m, (station, target); NaN where there is none."""
+        return self.readings.length.copy()
+
+    def environment(self) -> Environment:
+        """Return the mean air of all measurements; NaN where the table has none."""
+        means = []
+        for name in AIR:
+            values = getattr(self.readings, name)
+            known = values[np.isfinite(values)]
+            means.append(float(known.mean()) if known.size else float("nan"))
+        return Environment(*means)
+
+    def table(self) -> xr.Dataset:
+        """Return ``displacement(station, target)`` in m, and the air: ``temperature``, ``pressure``, ``humidity``.
+
+        Air is in degC, Pa and %. Quantities of which the table knows nothing are left out.
+        """
+        readings, dims = self.readings, ("station", "target")
+        found = {"displacement": readings.length, **{name: getattr(readings, name) for name in AIR}}
+        return xr.Dataset(
+            {
+                name: (dims, values, {"units": UNITS[name]})
+                for name, values in found.items()
+                if name == "displacement" or np.isfinite(values).any()
+            },
+            {"station": list(readings.stations), "target": list(readings.targets)},
+        )
