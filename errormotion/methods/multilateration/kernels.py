@@ -31,6 +31,9 @@ MANY = 3000
 FAST = {"reassoc", "contract", "nsz"}
 # A target with its directions this close to a plane is not moved.
 _FLAT = 1e-13
+# Steps of a target in one pass, and below which length, m, one is the last.
+_STEPS = 8
+_SHORT = 3e-5
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
@@ -75,6 +78,19 @@ def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragm
     u[1] += share * s1
     u[2] += share * s2
     return size
+
+
+@compiled()
+def _place(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
+    """Move a target to where its distances put it; return how far the first step took it, m."""
+    first = _locate(reach, w, station, u)
+    size = first
+    for _ in range(_STEPS):
+        # The next step goes as the square of this one over the distance.
+        if size < _SHORT:
+            break
+        size = _locate(reach, w, station, u)
+    return first
 
 
 @compiled()
@@ -146,7 +162,7 @@ def _reach(
 
 @compiled()
 def _reduce_chunk(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, steps: int,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     target: Array, first: int, last: int, sums: Array,
 ) -> float:  # pragma: no cover - compiled  # fmt: skip
     """Do the work of `reduce_targets` for one chunk."""
@@ -158,10 +174,7 @@ def _reduce_chunk(
     for i in range(first, last):
         _reach(reading, weight, dead_path, extra, value, i, reach, w)
         u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
-        for k in range(steps):
-            size = _locate(reach, w, station, u)
-            if k == steps - 1:
-                furthest = max(furthest, size)
+        furthest = max(furthest, _place(reach, w, station, u))
         target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
         _directions(reach, w, station, u, e, r, E, Q)
         for a in range(3, n):
@@ -190,7 +203,6 @@ def _reduce_four(
     weight: Array,
     station: Array,
     dead_path: Array,
-    steps: int,
     target: Array,
     first: int,
     last: int,
@@ -207,10 +219,7 @@ def _reduce_four(
         for j in range(4):
             w[j], reach[j] = weight[j, i], reading[j, i] + dead_path[j]
         u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
-        for k in range(steps):
-            size = _locate(reach, w, station, u)
-            if k == steps - 1:
-                furthest = max(furthest, size)
+        furthest = max(furthest, _place(reach, w, station, u))
         target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
         for j in range(4):
             x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
@@ -250,33 +259,32 @@ def _reduce_part(
     dead_path: Array,
     extra: Array,
     value: Array,
-    steps: int,
     target: Array,
     part: int,
     sums: Array,
 ) -> float:  # pragma: no cover - compiled
     first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
     if len(station) == 4 and len(value) == 0:
-        return _reduce_four(reading, weight, station, dead_path, steps, target, first, last, sums)
-    return _reduce_chunk(reading, weight, station, dead_path, extra, value, steps, target, first, last, sums)
+        return _reduce_four(reading, weight, station, dead_path, target, first, last, sums)
+    return _reduce_chunk(reading, weight, station, dead_path, extra, value, target, first, last, sums)
 
 
 @compiled()
 def _reduce_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, steps: int,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     target: Array, sums: Array, moved: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in range(len(sums)):
-        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, steps, target, part, sums[part])
+        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, target, part, sums[part])
 
 
 @compiled(parallel=True)
 def _reduce_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, steps: int,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     target: Array, sums: Array, moved: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in numba.prange(len(sums)):
-        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, steps, target, part, sums[part])
+        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, target, part, sums[part])
 
 
 def chunks(targets: int) -> int:
@@ -285,7 +293,7 @@ def chunks(targets: int) -> int:
 
 
 def reduce_targets(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, steps: int,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     target: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """Move every target and add up what the targets say about the stations.
@@ -298,8 +306,6 @@ def reduce_targets(
         m.
     extra, value : ndarray (k, n, m), (k,)
         What a unit of each further parameter adds to a reading, and the parameters.
-    steps : int
-        Gauss-Newton steps of each target before it is eliminated.
     target : ndarray (m, 3)
         m; changed in place.
 
@@ -309,12 +315,12 @@ def reduce_targets(
         V V^T; the columns of V are the equations of the targets, derivatives of the readings by (U, L) of every
         station and by the further parameters, and last the residual.
     moved : float
-        Longest last step of a target, m.
+        Longest first step of a target, m.
     """
     q = 4 * len(station) + len(value) + 1
     sums, moved = np.zeros((chunks(len(target)), q, q)), np.zeros(chunks(len(target)))
     work = _reduce_shared if len(target) > MANY else _reduce_alone
-    work(reading, weight, station, dead_path, extra, value, steps, target, sums, moved)
+    work(reading, weight, station, dead_path, extra, value, target, sums, moved)
     total = sums.sum(axis=0)
     return total + np.triu(total, 1).T, float(moved.max())
 
@@ -457,7 +463,8 @@ def _covariance(
 
 @compiled()
 def _examine_part(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    target: Array,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
     part: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
@@ -511,7 +518,8 @@ def _examine_part(
 
 @compiled()
 def _examine_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    target: Array,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in range((len(target) + CHUNK - 1) // CHUNK):
@@ -523,7 +531,8 @@ def _examine_alone(
 
 @compiled(parallel=True)
 def _examine_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    target: Array,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
@@ -534,7 +543,8 @@ def _examine_shared(
 
 
 def examine(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array,
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    target: Array,
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return covariances (m, 3, 3) of the targets, residuals (n, m), m, and redundancies (n, m) of the readings.

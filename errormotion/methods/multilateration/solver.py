@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-13
 """What a further step may still move a target, m."""
 _PASSES = 200
-_FIRST_STEPS = 3
-_DAMPED = 1e-4
+_DAMPED = 1e-8
+_UNDAMPED = 1e-11
 _LONG = 12
 _ROUNDS = 12
 
@@ -69,10 +69,10 @@ class Problem:
         Z[self.free] = full[:, 6:]
         return Z
 
-    def reduce(self, stations: Stations, target: Array, steps: int) -> Sums:
+    def reduce(self, stations: Stations, target: Array) -> Sums:
         """Move the targets in place and return what they say about the stations."""
         sums, moved = reduce_targets(
-            self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, steps, target
+            self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, target
         )
         known = np.isfinite(self.precision) & (self.precision > 0)
         H, h, square = sums[:-1, :-1], sums[:-1, -1].copy(), float(sums[-1, -1])
@@ -227,22 +227,22 @@ def _problem(
 def descend(problem: Problem, stations: Stations, target: Array, tolerance: float) -> State:
     """Take steps until a further one would move no target by more than ``tolerance``; ``target`` is used up."""
     centre = problem.nominal.mean(axis=0)
-    sums = problem.reduce(stations, target, _FIRST_STEPS)
+    sums = problem.reduce(stations, target)
     mu, last, passes, converged = 0.0, np.inf, 1, False
     kept = target.copy()
     while passes < _PASSES:
         Z = problem.basis(stations, centre)
         step = _step(Z, sums, mu)
         trial = stations.stepped(step)
-        found = problem.reduce(trial, target, 1)
+        found = problem.reduce(trial, target)
         passes += 1
         if not found.square <= sums.square * (1 + 1e-9) + 1e-6:
             target[:] = kept
             mu = max(10 * mu, _DAMPED)
-            if mu > 1e12:
+            if mu > 1e8:
                 break
             continue
-        stations, sums, mu = trial, found, (0.1 * mu if mu > _DAMPED else 0.0)
+        stations, sums, mu = trial, found, (0.1 * mu if mu > _UNDAMPED else 0.0)
         kept[:] = target
         # Steps shrink at least as fast as they have: the next one is this one times their ratio.
         ahead = found.moved * min(1.0, found.moved / last) if last < np.inf else np.inf
@@ -290,7 +290,7 @@ def conclude(problem: Problem, state: State) -> Network:
     stations, target = fitted(state.stations, state.target, problem.nominal, used)
     centre = target[used].mean(axis=0)
     Z = problem.basis(stations, centre)
-    sums = problem.reduce(stations, target, 1)
+    sums = problem.reduce(stations, target)
     information = Z.T @ sums.H @ Z
     values = determinacy.refuse_loose(information, Z, stations, target[used])
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
