@@ -56,7 +56,7 @@ def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
             origin=sensor.true_origin,
             points=raw["plane_point"].values,
             point_uncertainty=float(raw["plane_point_uncertainty"]),
-        )
+        ).covariance
         chart = error_jacobian(sensor.nominal_direction[None], sensor.true_direction[None])[0]
         known = np.isfinite(miss[-1])
         chart = chart[np.ix_(known, known)]
@@ -83,10 +83,11 @@ def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
         )
     return [
         f"{seeds} virtual machines, each with its own beam (0.3 deg and 0.1 mm off its drawing); {len(rotations)} "
-        f"planes of a sine gauge at 20 deg, turned to {', '.join(map(str, rotations))} deg, 60 readings on each with 0.1 um "
-        f"noise and 0.3 um speckle that correlates over 50 um. Over {seeds} seeds the ratio of spreads has a standard "
-        f"deviation of {1 / np.sqrt(2 * seeds):.1%}, a coverage of {np.sqrt(0.05 * 0.95 / seeds):.1%}. All freedoms "
-        f"together: mean squared error over the stated covariance {np.mean(chi2):.3f} per freedom "
+        f"planes of a sine gauge at 20 deg, turned to {', '.join(map(str, rotations))} deg, 60 readings on each "
+        "with 0.1 um noise and 0.3 um speckle that correlates over 50 um. "
+        f"Over {seeds} seeds the ratio of spreads has a standard deviation of {1 / np.sqrt(2 * seeds):.1%}, a coverage "
+        f"of {np.sqrt(0.05 * 0.95 / seeds):.1%}. All freedoms together: mean squared error over the stated covariance "
+        f"{np.mean(chi2):.3f} per freedom "
         f"(standard deviation {np.sqrt(2 / seeds / (known.sum() - 1)):.3f}).",
         "",
         *rows,
@@ -139,9 +140,9 @@ def compensation(seeds: int) -> list[str]:
     return [
         f"{seeds} virtual machines, each with its own beam, inclination error and calibration (inclinations -45 to 45 "
         "deg every 5, rotations 0 to 170 deg every 10, depths -10 to 10 mm every 1); beam about 20 deg from the "
-        "vertical, pairs of planes at 20 deg as in table 1 of Lu et al., 60 readings on each with noise and speckle, strokes of "
-        "four fifths of the range. Mean absolute errors, deg: of the angle to the vertical, which is what the paper "
-        "states, and of the direction in space.",
+        "vertical, pairs of planes at 20 deg as in table 1 of Lu et al., 60 readings on each with noise and speckle, "
+        "strokes of four fifths of the range. Mean absolute errors, deg: of the angle to the vertical, which is what "
+        "the paper states, and of the direction in space.",
         "",
         *rows,
         "",

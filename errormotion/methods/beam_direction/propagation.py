@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -106,8 +106,9 @@ def expected_beam(
     origin: Array | None = None,
     points: Array | None = None,
     point_uncertainty: float = 0.0,
-) -> Array:
-    """Return the covariance (6, 6) of (origin, direction) to expect from readings on planes, SI.
+    slope_by_source: Array | None = None,
+) -> Propagated:
+    """Return how uncertain a beam is to be expected from readings on planes.
 
     Parameters
     ----------
@@ -125,10 +126,12 @@ def expected_beam(
         Known points of the planes, m.
     point_uncertainty : float
         Standard uncertainty of these points along the normals, m.
+    slope_by_source : ndarray (source, k), optional
+        Relative change of each plane's slope, about the reading 0, with one standard uncertainty of each shared source.
 
     Returns
     -------
-    ndarray (6, 6)
+    Propagated
         NaN for the origin where ``origin`` or ``points`` is not given, or the planes leave it open.
 
     Raises
@@ -145,4 +148,6 @@ def expected_beam(
     names = tuple(f"Plane {i + 1}" for i in range(k))
     settled = uncompensated(Planes(names, gradients, offsets, C), direction)
     found = locate(settled.direction, offsets, C, P, point_uncertainty)
-    return propagate(settled, found, point_uncertainty).covariance
+    if slope_by_source is not None:
+        settled = replace(settled, slope_by_source=slope_by_source)
+    return propagate(settled, found, point_uncertainty)
