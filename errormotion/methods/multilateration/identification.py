@@ -1,0 +1,308 @@
+"""From displacements to the errors of every target, and to those of the axes."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.drift import Drift, estimate_drift, places
+from errormotion.methods.multilateration.expansion import (
+    Shared,
+    air_scale,
+    along_beams,
+    expansion_sources,
+    scale_strain,
+)
+from errormotion.methods.multilateration.model import directions
+from errormotion.methods.multilateration.moving import find_move
+from errormotion.methods.multilateration.parameters import fit_machine
+from errormotion.methods.multilateration.reading import Readings, read
+from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.volume import parametric_extras
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.multilateration.network import Network
+    from errormotion.methods.multilateration.settings import Settings
+
+    Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
+
+FALSE_ALARM = 1e-3
+"""Chance at which sound readings are called noisier than stated."""
+MANY_WRONG = 0.05
+"""Share of readings left out above which a cause is looked for."""
+DATUM = (
+    "best rigid fit of all targets to their commanded places; six motions of the whole, three shifts and three "
+    "rotations, are not seen"
+)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The network, what was taken off the readings, and how uncertain that is."""
+
+    network: Network
+    factor: float
+    corrected: Array
+    drift: Drift
+    sources: list[Shared]
+    scale: dict[str, float]
+
+
+def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return an error dataset of component ``tool`` over ``target``: estimated places minus commanded ones.
+
+    Raises
+    ------
+    MethodError
+        Readings that do not determine the network, contradict one another, or are in another unit.
+    """
+    notes: list[str] = []
+    data = read(raw, notes)
+    found = _solved(raw, data, settings, notes)
+    network = found.network
+    notes.extend(network.notes)
+    own, influence, names, groups = _uncertainty(found)
+    error = network.target - data.nominal
+    unknown = np.isnan(error[:, 0])
+    covariance = np.full((*error.shape[:1], 6, 6), np.nan)
+    shared = influence[[not name.startswith("station.") for name in names]]
+    covariance[:, :3, :3] = found.factor**2 * network.target_covariance + np.einsum("sta,stb->tab", shared, shared)
+    values = np.full((len(error), 6), np.nan)
+    values[:, :3] = error
+    full = np.full((*influence.shape[:2], 6), np.nan)
+    full[..., :3] = np.where(unknown[:, None], np.nan, influence)
+    extras = _extras(data, found)
+    extras |= _axes(raw, data, settings, error, own, influence, notes)
+    for note in notes:
+        log.warning(note)
+    position = data.position
+    ds = build_errors(
+        values,
+        covariance,
+        dims=("target",),
+        coords={
+            "target": data.targets,
+            "direction": ("direction", list("xyz")),
+            **{name: ("target", position[:, k], {"units": "m"}) for k, name in enumerate("xyz")},
+        },
+        component="tool",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=data.reflector.mean(axis=0),
+        reference=DATUM,
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, raw, None, steps=_steps(found, settings)),
+        influence=full,
+        sources=names,
+        source_groups=groups,
+        extras=extras,
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+def _solved(raw: xr.Dataset, data: Readings, settings: Settings, notes: list[str]) -> Solution:
+    """Solve the network, correct the readings for what its directions are needed for, and solve it again."""
+    times, scale = air_scale(raw, settings.air, notes)
+    d = data.displacement * times
+    noise = np.full(d.shape, data.noise if settings.together else np.hypot(data.noise, settings.repeatability))
+    first = _network(d, data, noise, settings)
+    e = directions(np.where(np.isnan(first.target), data.nominal, first.target), first.stations)
+    drift = _drift(d, e, data, noise, settings, notes)
+    correction, sources = drift.correction, list(drift.sources)
+    if settings.expansion is not None:
+        warmer, strain = scale_strain(raw, settings.expansion)
+        correction = correction + along_beams(strain, data.position - data.position.mean(axis=0), e)
+        sources += expansion_sources(warmer, data.position, e, settings.expansion)
+    corrected = d - correction
+    network = first if not correction.any() else _network(corrected, data, noise, settings)
+    factor = _noise_factor(network, corrected, data, noise, settings, notes)
+    if settings.scale_uncertainty > 0:
+        scale["tracker scale"] = settings.scale_uncertainty
+    if not network.converged:
+        notes.append(f"The network has not settled after {network.iterations} passes; its figures are rough.")
+    return Solution(network, factor, corrected, drift, sources, scale)
+
+
+def _network(d: Array, data: Readings, noise: Array, settings: Settings) -> Network:
+    """Solve; where readings fit no network, say whether a station moved."""
+    rough = data.station if settings.start == "nominal" else None
+    try:
+        return solve(d, data.nominal, rough, noise=noise, robust=settings.robust)
+    except MethodError as error:
+        if _solvable(d, data, rough, noise):
+            _refuse_move(d, data, rough, noise, error)
+        raise
+
+
+def _solvable(d: Array, data: Readings, rough: Array | None, noise: Array) -> bool:
+    """Whether the readings give a network at all, however badly they fit."""
+    try:
+        solve(d, data.nominal, rough, noise=noise, robust=False)
+    except MethodError:
+        return False
+    return True
+
+
+def _drift(d: Array, e: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]) -> Drift:
+    n, m = d.shape
+    none = Drift(np.full((n, 4), np.nan), np.zeros((n, m)), [], float("nan"), 0)
+    if settings.drift == "none" or settings.together:
+        return none
+    if not data.timed:
+        notes.append("The times of the readings are not in the data (reading_time): drift is not seen.")
+        return none
+    return estimate_drift(d, data.time, places(data.nominal), e, noise, data.stations, notes)
+
+
+def _noise_factor(
+    network: Network, d: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]
+) -> float:
+    """Return by how much the stated noise is raised; refuse readings of a station that moved."""
+    square, freedom = network.sigma0**2 * network.freedom, network.freedom
+    wrong = len(network.left_out) + 4 * len(network.undecided)
+    excess = freedom > 0 and square > stats.chi2.ppf(1 - FALSE_ALARM, freedom)
+    if excess or wrong > MANY_WRONG * np.isfinite(d).sum():
+        _refuse_move(d, data, network.station, noise, None)
+    if not excess:
+        if freedom > 0 and square < stats.chi2.ppf(FALSE_ALARM, freedom):
+            notes.append(
+                f"The readings scatter only {network.sigma0:.3g} times as much as stated; the stated noise was kept."
+            )
+        return 1.0
+    raised = settings.noise == "auto"
+    what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
+    cause = "" if settings.together or settings.repeatability else " Perhaps the machine repeats worse (repeatability)."
+    notes.append(f"The readings scatter {network.sigma0:.3g} times as much as stated; {what}.{cause}")
+    return network.sigma0 if raised else 1.0
+
+
+def _refuse_move(d: Array, data: Readings, rough: Array | None, noise: Array, error: Exception | None) -> None:
+    move = find_move(d, data.nominal, rough, noise, data.time)
+    if move is None:
+        return
+    name, target = data.stations[move.station], data.targets[move.target]
+    raise MethodError(
+        f"Expected every station to stay where it is; the readings say that station {name} stood elsewhere from target "
+        f"{target} on, by about {move.distance * 1e3:.3g} mm: taken as two stations the readings scatter "
+        f"{move.sigma0:.3g} times their noise, as one {move.sigma0_before:.3g} times. Measure this set-up again, or "
+        "give its readings from there on as a further station."
+    ) from error
+
+
+def _uncertainty(found: Solution) -> tuple[Array, Array, list[str], list[str]]:
+    """Return each target's own covariance (m, 3, 3), influences (source, m, 3), their names and groups."""
+    network = found.network
+    own, factor, _ = network.blocks()
+    rows = [found.factor * factor.transpose(2, 0, 1)]
+    names = [f"station.{k}" for k in range(factor.shape[2])]
+    groups = ["stations"] * len(names)
+    if found.scale:
+        stretched, _ = network.response(np.nan_to_num(found.corrected))
+        for name, relative in found.scale.items():
+            if relative > 0:
+                rows.append(relative * stretched[None])
+                names.append(name)
+                groups.append("scale of the tracker" if name == "tracker scale" else "refraction")
+    for shared in found.sources:
+        rows.append(network.response(np.nan_to_num(shared.change))[0][None])
+        names.append(shared.name)
+        groups.append(shared.group)
+    return found.factor**2 * own, np.concatenate(rows), names, groups
+
+
+def _axes(
+    raw: xr.Dataset, data: Readings, settings: Settings, error: Array, own: Array, influence: Array, notes: list[str]
+) -> dict[str, xr.DataArray]:
+    """Return the errors of the axes as extra results; where there are none, a note says why."""
+    if not settings.parametric:
+        return {}
+    chain = settings.chain or raw.attrs.get("chain")
+    if not isinstance(chain, str):
+        notes.append("No errors of the axes: the chain of the machine is not known (setting or attribute 'chain').")
+        return {}
+    try:
+        axes = fit_machine(
+            chain,
+            data.position,
+            error,
+            own,
+            np.nan_to_num(influence),
+            reflector=data.reflector,
+            max_order=settings.max_order,
+        )
+    except MethodError as refusal:
+        notes.append(f"No errors of the axes. {refusal}")
+        return {}
+    notes.extend(axes.notes)
+    if axes.unseen:
+        told = "; ".join(f"{name}: {why}" for name, why in axes.unseen.items())
+        notes.append(f"Errors of the axes that these targets do not determine: {told}.")
+    return parametric_extras(axes)
+
+
+def _steps(found: Solution, settings: Settings) -> list[str]:
+    steps = ["Gauss-Newton of targets, stations and dead paths, targets eliminated"]
+    if found.network.left_out:
+        steps.append(f"{len(found.network.left_out)} readings left out")
+    if found.drift.correction.any():
+        steps.append("drift taken off the readings")
+    if settings.expansion is not None:
+        steps.append(f"scales brought to {settings.expansion.reference:g} degC")
+    return [*steps, "free network on the commanded places"]
+
+
+def _extras(data: Readings, found: Solution) -> dict[str, xr.DataArray]:
+    network, f2 = found.network, found.factor**2
+    n = len(data.stations)
+    coords: dict[str, Any] = {
+        "station": data.stations,
+        "target": data.targets,
+        "direction": list("xyz"),
+        "direction_": list("xyz"),
+        "drift_term": ["dead path", "x", "y", "z"],
+    }
+
+    def array(values: Any, dims: tuple[str, ...], unit: str, meaning: str = "") -> xr.DataArray:
+        attrs = ({"units": unit} if unit else {}) | ({"long_name": meaning} if meaning else {})
+        return xr.DataArray(values, {d: coords[d] for d in dims if d in coords}, dims, attrs=attrs)
+
+    left_out = np.zeros(data.displacement.shape, np.int8)
+    for j, i in network.left_out:
+        left_out[j, i] = 1
+    left_out[:, list(network.undecided)] = 2
+    dead_path_variance = np.diag(network.joint_covariance)[3 : 4 * n : 4]
+    by_reading, vector = ("station", "target"), ("station", "direction")
+    extras = {
+        "target_nominal": array(data.nominal, ("target", "direction"), "m", "commanded place of the reflector"),
+        "target_place": array(network.target, ("target", "direction"), "m", "estimated place of the reflector"),
+        "station_place": array(network.station, vector, "m", "estimated place of the tracker"),
+        "station_covariance": array(f2 * network.station_covariance, (*vector, "direction_"), "m^2"),
+        "dead_path": array(network.dead_path, ("station",), "m"),
+        "dead_path_u": array(np.sqrt(f2 * dead_path_variance), ("station",), "m"),
+        "residual": array(network.residual, by_reading, "m", "reading minus model"),
+        "redundancy": array(network.redundancy, by_reading, "1", "share of a reading's error that its residual shows"),
+        "left_out": array(left_out, by_reading, "", "1: wrong; 2: target given up, nothing tells which is wrong"),
+        "iterations": array(network.iterations, (), ""),
+        "condition": array(network.condition, (), "1", "of what distances can determine"),
+        "sigma0": array(network.sigma0, (), "1", "scatter of the readings over what was stated"),
+        "freedom": array(network.freedom, (), "", "readings less unknowns"),
+        "noise": array(found.factor * 1 / np.max(network.weight), (), "m", "of a reading, repeatability included"),
+    }
+    if data.station is not None:
+        extras["station_nominal"] = array(data.station, vector, "m", "rough place of the tracker")
+    if found.drift.pairs:
+        extras["drift_rate"] = array(found.drift.rate, ("station", "drift_term"), "m/s", "during each set-up")
+        extras["repeatability"] = array(found.drift.repeatability, (), "m", "that the returns show beyond the noise")
+    return extras

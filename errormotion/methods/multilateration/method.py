@@ -1,0 +1,91 @@
+"""The plugin ``multilateration``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SCHEMA = "errormotion.raw.multilateration/1"
+
+
+class Multilateration:
+    """Errors of the volume and of the axes from distances of a reflector to four or more places of a tracker."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="multilateration",
+        summary="Volumetric error and the errors of three axes from tracker distances, stations and dead paths unknown",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "six motions of the whole: where the machine's coordinates lie and how they are turned is fitted",
+            "rotations of the tool at a target: a reflector is a point",
+            "with one place of the reflector: rotations of the axis that carries it, and others that only shift it",
+            "drift that shifts and turns the machine as a whole from one set-up to the next",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(
+        instruments=("laser_tracker",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
+    )
+    Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
+
+    def acquire(
+        self,
+        bench: Bench,  # noqa: ARG002 - part of the protocol
+        settings: MultilaterationSettings,  # noqa: ARG002
+        *,
+        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002
+        done: xr.Dataset | None = None,  # noqa: ARG002
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield one raw dataset a set-up."""
+        raise MethodError(
+            "multilateration: expected an instrument of kind laser_tracker and, to move the machine, one of kind "
+            "controller; measuring with them is not there yet. Import a table of displacements, and identify it."
+        )
+
+    def append_dim(self, settings: MultilaterationSettings) -> str:  # noqa: ARG002 - part of the protocol
+        """Return ``station``."""
+        return "station"
+
+    def progress(self, settings: MultilaterationSettings) -> float:
+        """Return the number of set-ups."""
+        return float(len(settings.layout.stations))
+
+    def identify(self, raw: xr.Dataset, settings: MultilaterationSettings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset of component ``tool`` over ``target``.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.multilateration/1``; stays as it is.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset does not follow its schema; all violations at once.
+        MethodError
+            The data do not determine the answer, or contradict one another.
+        """
+        from errormotion.methods.multilateration.identification import identify_targets
+
+        settings = settings or MultilaterationSettings()
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        validate(checked)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"multilateration reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        return identify_targets(checked, settings, self.info.id, self.info.version)
+
+    def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect of the layout."""
+        from errormotion.methods.multilateration.planning import plan
+
+        return plan(self.info, settings or MultilaterationSettings())
