@@ -156,7 +156,7 @@ def solve(
     Model of Takeuchi et al. (estimation of volumetric errors by a laser tracker), with dead paths free in place of
     L_j = |u_1 - U_j|, so that the noise of the first target stays its own.
     """
-    problem = _problem(displacement, target, noise, dead_path, extra, extra_prior)
+    problem = state_problem(displacement, target, noise, dead_path, extra, extra_prior)
     determinacy.refuse_too_few(problem.weight, int(np.count_nonzero(problem.precision == 0)))
     places = None if station is None else np.asarray(station, dtype=float)
     start = initial_stations(problem.reading, problem.weight, problem.nominal, places)
@@ -180,13 +180,13 @@ def solve(
     return replace(network, left_out=found.left_out, undecided=found.undecided, notes=tuple(notes))
 
 
-def _problem(
+def state_problem(
     displacement: ArrayLike,
     target: ArrayLike,
     noise: ArrayLike,
-    dead_path: tuple[ArrayLike, ArrayLike] | None,
-    extra: ArrayLike | None,
-    extra_prior: ArrayLike | None,
+    dead_path: tuple[ArrayLike, ArrayLike] | None = None,
+    extra: ArrayLike | None = None,
+    extra_prior: ArrayLike | None = None,
 ) -> Problem:
     """Check shapes and values, and turn them into a problem."""
     d, u = np.asarray(displacement, dtype=float), np.array(target, dtype=float, order="C")
