@@ -1,8 +1,8 @@
 """Multilateration: volumetric errors from displacements of a reflector, measured from four or more places.
 
-``method`` is the plugin, ``identification`` what it does with raw data (``reading``), ``refraction`` and ``expansion`` the
-scale, ``drift`` what places visited again tell, ``moving`` which station was moved, ``parameters`` the errors of the axes
-and ``volume`` what these make of any grid.
+``method`` is the plugin, ``identification`` what it does with raw data (``reading``): ``refraction`` and ``expansion``
+are the scale, ``drift`` is what places visited again tell, ``moving`` which station was moved, ``parameters`` are the
+errors of the axes, and ``volume`` is what these make of any grid.
 
 The numbers: ``solver`` (Gauss-Newton with every target eliminated), over ``model`` (the equations), ``kernels``
 (compiled loops), ``start`` (where the stations are, roughly), ``outliers`` (readings that are wrong), ``determinacy``
