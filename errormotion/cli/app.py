@@ -134,6 +134,20 @@ def import_(
 
 @app.command()
 @guarded
+def plan(
+    campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
+    test: Annotated[str | None, typer.Option(help="One test; default: every test.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="A file for the plan of one test.")] = None,
+    json_: Json = False,
+) -> None:
+    """Say what uncertainty to expect of the tests of a campaign, and how to make it smaller."""
+    from errormotion.cli import planning
+
+    planning.expect(campaign, test, out, json_)
+
+
+@app.command()
+@guarded
 def program(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     out: Annotated[Path, typer.Option(help="The folder for the programs; no file in it is replaced.")],

@@ -178,7 +178,7 @@ def test_a_measurement_bears_the_plan_out():
 
 def test_an_uncertain_scale_is_a_source_of_its_own():
     ds = BeamDirection().plan(settings(layout={"scale_uncertainty": 1e-4}))
-    effect = ds["influence"].sel(source="scale of the sensor").values[0, 3:]
+    effect = ds["influence"].sel(source="scale").values[0, 3:]
     C = ds["covariance"].values[0, 3:, 3:]
     alone = BeamDirection().plan(settings())["covariance"].values[0, 3:, 3:]
     np.testing.assert_allclose(C - alone, np.outer(effect, effect), atol=1e-18)

@@ -1,0 +1,33 @@
+"""``errormotion plan``."""
+
+from pathlib import Path
+
+from errormotion import datasets
+
+ROOT = Path(__file__).parents[2]
+BEAM = ROOT / "examples" / "virtual_beam" / "campaign.toml"
+GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"
+
+
+def test_a_plan_says_what_to_expect_and_how_much_better_it_could_be(run, tmp_path):
+    shown = run("plan", BEAM, "--out", tmp_path / "plan.nc").stdout
+    assert "beam (beam_direction):" in shown
+    assert "U (k=2)" in shown
+    assert "times better than the published ones" in shown
+    ds = datasets.load(tmp_path / "plan.nc")
+    datasets.validate(ds)
+    assert f"{float(ds['gain']):.3g} times better" in shown
+
+
+def test_every_test_of_a_campaign_is_planned_for_a_program_too(answer):
+    said = answer("plan", GANTRY)["plans"]
+    assert [part["test"] for part in said] == ["pose", "scan"]
+    rows = {row["name"]: row for row in said[1]["expected"]}
+    assert rows["EA"]["unit"] == "arcsec"
+    # A profiler of 1 um sees the carriage turn to a few seconds of arc.
+    assert 0.01 < rows["EA"]["expanded_uncertainty"] < 20
+
+
+def test_wrong_calls_say_what_was_expected(run, tmp_path):
+    assert "expected one of the tests beam; found 'bean'" in run("plan", BEAM, "--test", "bean", code=1).stderr
+    assert "name it with --test" in run("plan", GANTRY, "--out", tmp_path / "plan.nc", code=1).stderr
