@@ -19,7 +19,6 @@ from typing import Any
 
 from errormotion.errors import ProtocolError
 
-PORT = 700
 HEADER = struct.Struct("<iI")
 LARGEST = 1 << 20  # bytes; 4 points a millisecond for 7 s
 NAME = "64s"

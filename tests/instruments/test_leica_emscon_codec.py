@@ -1,0 +1,130 @@
+"""Packets of an emScon server: layouts of the interface's C definitions."""
+
+import importlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion.errors import ProtocolError
+from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
+
+NUMBERS = {
+    "i": st.integers(-(2**31), 2**31 - 1),
+    "I": st.integers(0, 2**32 - 1),
+    "d": st.floats(allow_nan=False),
+    codec.NAME: st.text(st.characters(min_codepoint=1, max_codepoint=0xD7FF), max_size=31),
+}
+
+
+def values_of(layout: codec.Layout) -> st.SearchStrategy[dict[str, object]]:
+    return st.fixed_dictionaries({name: NUMBERS[code] for name, code in layout.fields})
+
+
+def command_and_values(part: str) -> st.SearchStrategy[tuple[int, dict[str, object]]]:
+    numbers = st.sampled_from(sorted(codec.COMMANDS))
+    return numbers.flatmap(lambda n: st.tuples(st.just(n), values_of(getattr(codec.COMMANDS[n], part))))
+
+
+def decoded(data: bytes) -> codec.Packet:
+    size, kind = codec.decode_header(data[: codec.HEADER.size])
+    assert size == len(data) - codec.HEADER.size
+    return codec.decode_packet(kind, data[codec.HEADER.size :])
+
+
+@given(command_and_values("request"))
+def test_a_command_comes_back_from_its_bytes(pair: tuple[int, dict[str, object]]) -> None:
+    number, values = pair
+    assert codec.decode_command(codec.encode_command(number, **values)) == (number, values)
+
+
+@given(command_and_values("answer"))
+def test_an_answer_comes_back_from_its_bytes(pair: tuple[int, dict[str, object]]) -> None:
+    number, values = pair
+    packet = decoded(codec.encode_answer(number, 0, **values))
+    assert (packet.kind, packet.command, packet.status, packet.values) == (codec.COMMAND, number, 0, values)
+
+
+@given(st.sampled_from([codec.MULTI, codec.MULTI2]), st.data())
+def test_points_come_back_from_their_bytes(kind: int, data: st.DataObject) -> None:
+    points = data.draw(st.lists(values_of(codec.POINTS[kind]), max_size=5))
+    packet = decoded(codec.encode_result(kind, {"temperature": 21.5}, points=points))
+    assert list(packet.points) == points
+    assert (packet.values["count"], packet.values["temperature"]) == (len(points), 21.5)
+
+
+def test_a_single_measurement_has_156_bytes_with_the_distance_behind_two_angles() -> None:
+    # size, type, status, mode, try flag; 3 values, 4 deviations, 3 pointing errors, 4 a priori, 3 of the air
+    numbers = [float(k) for k in range(1, 18)]
+    data = struct.pack("<iIIIi17d", 156, 2, 0, 0, 0, *numbers)
+    packet = decoded(data)
+    assert len(data) == 156
+    assert [packet.values[f"val{k}"] for k in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    assert [packet.values[name] for name in ("temperature", "pressure", "humidity")] == [15.0, 16.0, 17.0]
+    assert codec.encode_result(codec.SINGLE, packet.values) == data
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [(codec.SINGLE2, 204), (codec.LEVEL, 40), (codec.REFLECTOR, 36), (codec.MULTI, 48)]
+)
+def test_results_have_the_sizes_of_the_c_structures(kind: int, size: int) -> None:
+    assert len(codec.encode_result(kind, {})) == size
+
+
+def test_a_refusal_has_no_values_behind_its_status() -> None:
+    packet = decoded(codec.encode_answer(codec.GET_REFLECTORS, statuses.BUSY))
+    assert (packet.status, dict(packet.values)) == (statuses.BUSY, {})
+
+
+def test_a_command_that_is_not_known_here_is_told_by_its_number() -> None:
+    assert codec.decode_command(struct.pack("<iII", 12, 0, 9999)) == (9999, {})
+    assert decoded(codec.encode_answer(9999, statuses.NOT_IMPLEMENTED)).command == 9999
+
+
+@pytest.mark.parametrize(
+    "header", [b"HTTP/1.1", struct.pack("<iI", 4, 0), struct.pack("<iI", -12, 8), struct.pack("<iI", 156, 77)]
+)
+def test_what_is_no_header_is_named_so(header: bytes) -> None:
+    with pytest.raises(ProtocolError, match="Expected the header of an emScon packet"):
+        codec.decode_header(header)
+
+
+def test_a_packet_that_ends_early_is_refused() -> None:
+    data = codec.encode_result(codec.SINGLE, {})
+    with pytest.raises(ProtocolError, match="too short"):
+        codec.decode_packet(codec.SINGLE, data[8:100])
+
+
+def test_points_that_do_not_fill_their_packet_are_refused() -> None:
+    data = codec.encode_result(codec.MULTI, {}, points=[{}, {}])
+    with pytest.raises(ProtocolError, match="2 points with 36 bytes"):
+        codec.decode_packet(codec.MULTI, data[8:-1])
+
+
+@given(st.binary(min_size=12, max_size=300))
+def test_any_bytes_are_a_packet_or_a_protocol_error(data: bytes) -> None:
+    try:
+        _, kind = codec.decode_header(data[:8])
+        codec.decode_packet(kind, data[8:])
+    except ProtocolError:
+        return
+
+
+@pytest.mark.parametrize("number", sorted(codec.COMMANDS.keys() - {codec.SET_CONTINUOUS_TIME}))
+def test_commands_are_byte_for_byte_those_of_another_implementation(number: int) -> None:
+    """CESAPI (PyPI) was generated from the maker's C definitions for the AT4xx; each field gets a number of its own."""
+    pytest.importorskip("CESAPI", reason="the package CESAPI, another implementation, is not installed")
+    theirs = importlib.import_module("CESAPI.packet")
+    for suffix, layout in (("CT", codec.COMMANDS[number].request), ("RT", codec.COMMANDS[number].answer)):
+        packet = getattr(theirs, codec.COMMANDS[number].name + suffix)()
+        packed = packet.pack()
+        head = 12 if suffix == "CT" else 16
+        values = {
+            name: "Name" if code == codec.NAME else k if code != "d" else k + 0.5
+            for k, (name, code) in enumerate(layout.fields, 1)
+        }
+        ours = codec.encode_command(number, **values) if suffix == "CT" else codec.encode_answer(number, 0, **values)
+        assert ours[:head] == packed[:head]
+        packet.unpack(ours)
+        assert packet.pack() == ours
