@@ -61,7 +61,7 @@ def bound(
     problem = state_problem(d, u, noise, known)
     determinacy.refuse_too_few(problem.weight, int(np.count_nonzero(problem.precision == 0)))
     target_now = u.copy()
-    return conclude(problem, State(stations, target_now, problem.reduce(stations, target_now), 0, True))
+    return conclude(problem, State(stations, target_now, problem.reduce(stations, target_now), 0, True), U)
 
 
 def relative_bound(

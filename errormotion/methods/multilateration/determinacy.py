@@ -22,9 +22,13 @@ DIGITS = 1e-13
 """An eigenvalue below this share of the largest is rounding."""
 FLAT = 0.03
 """Stations thinner than this share of their extent count as standing in a plane, or on a line."""
+WEAK = 20.0
+"""Noise multiplied by more than this in a target is worth a note."""
 NEAR = 0.05
 """Stations seen from the targets within this angle, rad, are in one line with them."""
 _TOLD = 3
+_LISTED = 12
+_SHARE = 0.1
 
 
 def refuse_too_few(weight: Array, unknown: int) -> None:
@@ -43,6 +47,13 @@ def refuse_too_few(weight: Array, unknown: int) -> None:
             f"expected at least four stations, found {n}: with three every target has as many unknowns as distances, "
             "and nothing tells where the stations are; measure the targets from a further place"
         )
+    blind = np.flatnonzero(np.count_nonzero(weight, axis=1) < 4)
+    if len(blind):
+        raise MethodError(
+            f"expected at least 4 readings of every station, found "
+            f"{', '.join(f'{np.count_nonzero(weight[j])} of station {j + 1}' for j in blind)}; measure more targets "
+            "from it, or leave the station out"
+        )
     count = np.count_nonzero(weight, axis=0)
     equations, needed = int(np.maximum(count - 3, 0).sum()), unknown - 6
     if equations < needed:
@@ -53,16 +64,9 @@ def refuse_too_few(weight: Array, unknown: int) -> None:
             f"of which {int(np.count_nonzero(count == n))} are seen by all and {int(np.count_nonzero(count < 3))} by "
             "fewer than three; measure more targets"
         )
-    blind = np.flatnonzero(np.count_nonzero(weight, axis=1) < 4)
-    if len(blind):
-        raise MethodError(
-            f"expected at least 4 readings of every station, found "
-            f"{', '.join(f'{np.count_nonzero(weight[j])} of station {j + 1}' for j in blind)}; measure more targets "
-            "from it, or leave the station out"
-        )
 
 
-def refuse_loose(information: Array, basis: Array, stations: Stations, target: Array) -> Array:
+def refuse_loose(information: Array, basis: Array, stations: Stations, target: Array, rough: Array) -> Array:
     """Return the eigenvalues of the stations' information; raise MethodError where a freedom is loose.
 
     Parameters
@@ -75,6 +79,8 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
         Where they were found.
     target : ndarray (m, 3)
         Where the targets were found, m.
+    rough : ndarray (n, 3)
+        Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
     values, vectors = np.linalg.eigh(information)
     centre = target.mean(axis=0)
@@ -89,7 +95,7 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     raise MethodError(
         f"expected places of stations and targets whose distances fix them all, found {k} "
         f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {freedoms}. "
-        f"{_reason(stations.place, target)}"
+        f"What is special: {_reason(rough, target)}"
     )
 
 
@@ -101,17 +107,28 @@ def describe(motion: Array, stations: Stations, centre: Array) -> str:
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     along = np.einsum("ja,ja->j", blocks[:, :3], line)
     across = np.linalg.norm(blocks[:, :3] - along[:, None] * line, axis=1)
-    parts = [(across[j] ** 2, f"station {j + 1} across its line of sight") for j in range(n)]
-    for j in range(n):
-        # Nearer to the targets by as much as the dead path grows shorter: distances change by the difference.
-        parts.append((along[j] ** 2 + blocks[j, 3] ** 2, f"station {j + 1} along its line of sight with its dead path"))
-    parts += [(p**2, f"further parameter {k + 1}") for k, p in enumerate(motion[4 * n :])]
-    parts.sort(reverse=True)
-    total, told = sum(share for share, _ in parts), []
-    for share, name in parts[:_TOLD]:
-        if share > 0.1 * total:
-            told.append(name)
-    return " and ".join(told)
+    # Along the line of sight it is the sum with the dead path that distances see.
+    shares = {
+        ("across its line of sight", "across their lines of sight"): across**2,
+        ("along its line of sight with its dead path", "along their lines of sight with their dead paths"): (
+            along**2 + blocks[:, 3] ** 2
+        ),
+    }
+    parts = []
+    for (of_one, of_some), share in shares.items():
+        which = np.flatnonzero(share > _SHARE * motion @ motion)
+        if len(which):
+            parts.append((share.sum(), f"{_stations(which)} {of_one if len(which) == 1 else of_some}"))
+    parts += [
+        (p**2, f"further parameter {k + 1}") for k, p in enumerate(motion[4 * n :]) if p**2 > _SHARE * motion @ motion
+    ]
+    return " and ".join(name for _, name in sorted(parts, reverse=True))
+
+
+def _stations(which: NDArray[np.intp]) -> str:
+    """Return stations, counted from 0, by name."""
+    names = [str(j + 1) for j in which]
+    return f"station {names[0]}" if len(names) == 1 else f"stations {', '.join(names[:-1])} and {names[-1]}"
 
 
 def _length(sigma: float) -> str:
@@ -138,11 +155,36 @@ def _reason(place: Array, target: Array) -> str:
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     for j in range(n):
         for k in range(j + 1, n):
-            if np.linalg.norm(np.cross(sight[j], sight[k])) < NEAR:
+            if np.linalg.norm(place[j] - place[k]) < NEAR * np.linalg.norm(target.mean(axis=0) - place[j]):
+                found.append(f"stations {j + 1} and {k + 1} stand nearly at one place: move one of them away")
+            elif np.linalg.norm(np.cross(sight[j], sight[k])) < NEAR:
                 found.append(f"stations {j + 1} and {k + 1} stand in one line with the targets: move one of them aside")
     if not found:
         found.append("spread stations and targets wider and in all three directions, or measure more targets")
-    return "What is special: " + "; ".join(found)
+    return "; ".join(found)
+
+
+def weak_layout(covariance: Array, weight: Array, place: Array, target: Array) -> list[str]:
+    """Return a note where the layout makes much of the noise: covariances (m, 3, 3) against weights (n, m)."""
+    trace = np.trace(covariance, axis1=1, axis2=2)
+    known = np.isfinite(trace)
+    factor = float(np.sqrt(np.median(trace[known]) / 3) * np.median(weight[weight > 0]))
+    if factor < WEAK:
+        return []
+    what = f"this layout makes {factor:.3g} times the noise of a reading of it in each direction of a target"
+    return [f"{what}: {_reason(place, target[known])}"]
+
+
+def without_place(weight: Array, told: tuple[int, ...]) -> list[str]:
+    """Return a note on the targets that have too few readings, by weight (n, m), but for those ``told`` already."""
+    few = np.setdiff1d(np.flatnonzero(np.count_nonzero(weight, axis=0) < 3), told)
+    if not len(few):
+        return []
+    more = f" and {len(few) - _LISTED} more" if len(few) > _LISTED else ""
+    return [
+        f"targets with fewer than three readings in use have no place ({len(few)} of them): "
+        f"{', '.join(str(i + 1) for i in few[:_LISTED])}{more}"
+    ]
 
 
 def weak_targets(target: Array, covariance: Array, place: Array) -> list[str]:

@@ -94,7 +94,7 @@ def _place(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma
 
 
 @compiled()
-def _directions(
+def reflect(
     reach: Array, w: Array, station: Array, u: Array, e: Array, r: Array, E: Array, Q: Array
 ) -> None:  # pragma: no cover - compiled
     """Fill directions e (n, 3), weighted residuals r (n,), and the reflections' result: E = Q^T R, Q (n, n)."""
@@ -148,7 +148,7 @@ def _add_products(v: Array, count: int, sums: Array) -> None:  # pragma: no cove
 
 
 @compiled()
-def _reach(
+def reach_of(
     reading: Array, weight: Array, dead_path: Array, extra: Array, value: Array, i: int, reach: Array, w: Array
 ) -> None:  # pragma: no cover - compiled
     """Fill the distances (n,) that target i's readings stand for, and their weights."""
@@ -172,11 +172,11 @@ def _reduce_chunk(
     e, E, Q = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n))
     v, filled, furthest = np.empty((q + 1, LANES)), 0, 0.0
     for i in range(first, last):
-        _reach(reading, weight, dead_path, extra, value, i, reach, w)
+        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
         u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
         furthest = max(furthest, _place(reach, w, station, u))
         target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
-        _directions(reach, w, station, u, e, r, E, Q)
+        reflect(reach, w, station, u, e, r, E, Q)
         for a in range(3, n):
             rest = 0.0
             for k in range(more):
@@ -323,246 +323,3 @@ def reduce_targets(
     work(reading, weight, station, dead_path, extra, value, target, sums, moved)
     total = sums.sum(axis=0)
     return total + np.triu(total, 1).T, float(moved.max())
-
-
-@compiled()
-def _block(E: Array, D: Array) -> bool:  # pragma: no cover - compiled
-    """Fill D (3, 3), the inverse of R^T R, from the reflected E; False where that has no inverse."""
-    largest = max(abs(E[0, 0]), abs(E[1, 1]), abs(E[2, 2]))
-    if not min(abs(E[0, 0]), abs(E[1, 1]), abs(E[2, 2])) > 1e-7 * largest:
-        return False
-    i00, i11, i22 = 1.0 / E[0, 0], 1.0 / E[1, 1], 1.0 / E[2, 2]
-    i01 = -i00 * E[0, 1] * i11
-    i12 = -i11 * E[1, 2] * i22
-    i02 = -(i00 * E[0, 2] + i01 * E[1, 2]) * i22
-    D[0, 0] = i00 * i00 + i01 * i01 + i02 * i02
-    D[0, 1] = i01 * i11 + i02 * i12
-    D[0, 2] = i02 * i22
-    D[1, 1] = i11 * i11 + i12 * i12
-    D[1, 2] = i12 * i22
-    D[2, 2] = i22 * i22
-    D[1, 0], D[2, 0], D[2, 1] = D[0, 1], D[0, 2], D[1, 2]
-    return True
-
-
-@compiled()
-def _response(e: Array, w: Array, D: Array, extra: Array, i: int, F: Array) -> None:  # pragma: no cover - compiled
-    """Fill F (3, q): how a target moves by the parameters of the stations, D E^T (-Q)."""
-    n = len(e)
-    F[:, 4 * n :] = 0.0
-    for j in range(n):
-        for c in range(3):
-            k = w[j] * w[j] * (D[c, 0] * e[j, 0] + D[c, 1] * e[j, 1] + D[c, 2] * e[j, 2])
-            F[c, 4 * j], F[c, 4 * j + 1], F[c, 4 * j + 2], F[c, 4 * j + 3] = k * e[j, 0], k * e[j, 1], k * e[j, 2], k
-            for p in range(len(extra)):
-                F[c, 4 * n + p] -= k * extra[p, j, i]
-
-
-@compiled()
-def _cross(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compiled
-    """Add G^T F (6, q), G = [1, -(c x)], to ``out``."""
-    for k in range(F.shape[1]):
-        x, y, z = F[0, k], F[1, k], F[2, k]
-        out[0, k] += x
-        out[1, k] += y
-        out[2, k] += z
-        out[3, k] += c[1] * z - c[2] * y
-        out[4, k] += c[2] * x - c[0] * z
-        out[5, k] += c[0] * y - c[1] * x
-
-
-@compiled()
-def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover - compiled
-    """Fill D G (3, 6), G = [1, -(c x)]."""
-    for k in range(3):
-        DG[k, 0], DG[k, 1], DG[k, 2] = D[k, 0], D[k, 1], D[k, 2]
-        DG[k, 3] = D[k, 2] * c[1] - D[k, 1] * c[2]
-        DG[k, 4] = D[k, 0] * c[2] - D[k, 2] * c[0]
-        DG[k, 5] = D[k, 1] * c[0] - D[k, 0] * c[1]
-
-
-@compiled()
-def _datum_part(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, part: int, sums: Array
-) -> None:  # pragma: no cover - compiled
-    n = len(station)
-    reach, w, r, c = np.zeros(n), np.empty(n), np.empty(n), np.empty(3)
-    e, E, Q, D = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n)), np.empty((3, 3))
-    F, DG = np.empty((3, 4 * n + len(extra))), np.empty((3, 6))
-    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-        w[:] = weight[:, i]
-        _directions(reach, w, station, target[i], e, r, E, Q)
-        if not _block(E, D):
-            continue
-        c[:] = target[i] - centre
-        _response(e, w, D, extra, i, F)
-        _spread_motions(D, c, DG)
-        _cross(F, c, sums[:, 12:])
-        _cross(DG, c, sums[:, 6:12])
-        for a in range(3):
-            sums[a, a] += 1.0
-        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-        for a in range(3):
-            for b in range(3):
-                sums[3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
-
-
-@compiled()
-def _datum_alone(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
-) -> None:  # pragma: no cover - compiled
-    for part in range(len(sums)):
-        _datum_part(weight, station, extra, target, centre, part, sums[part])
-
-
-@compiled(parallel=True)
-def _datum_shared(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
-) -> None:  # pragma: no cover - compiled
-    for part in numba.prange(len(sums)):
-        _datum_part(weight, station, extra, target, centre, part, sums[part])
-
-
-def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centre: Array) -> tuple[Array, Array, Array]:
-    """Return sums over the targets of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
-
-    G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
-    the stations' parameters.
-    """
-    sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
-    work = _datum_shared if len(target) > MANY else _datum_alone
-    work(weight, station, extra, target, centre, sums)
-    total = sums.sum(axis=0)
-    return total[:, :6], total[:, 6:12], total[:, 12:]
-
-
-@compiled()
-def _covariance(
-    D: Array, DG: Array, FW: Array, c: Array, H: Array, K: Array, room: Array, out: Array
-) -> None:  # pragma: no cover - compiled
-    """Fill the covariance (3, 3) of a target in the datum: D + F F^T - D G H G^T - G H G^T D + G K G^T."""
-    G = np.zeros((3, 6))
-    G[0, 0], G[1, 1], G[2, 2] = 1.0, 1.0, 1.0
-    G[0, 4], G[0, 5], G[1, 3], G[1, 5], G[2, 3], G[2, 4] = c[2], -c[1], -c[2], c[0], c[1], -c[0]
-    for a in range(3):
-        for k in range(6):
-            # 1/2 G K - D G H: G times its transpose, and the transpose of that, make both sides of the datum.
-            s = 0.0
-            for b in range(6):
-                s += 0.5 * G[a, b] * K[b, k] - DG[a, b] * H[b, k]
-            room[a, k] = s
-    for a in range(3):
-        for b in range(3):
-            s = D[a, b]
-            for k in range(FW.shape[1]):
-                s += FW[a, k] * FW[b, k]
-            for k in range(6):
-                s += room[a, k] * G[b, k] + room[b, k] * G[a, k]
-            out[a, b] = s
-
-
-@compiled()
-def _examine_part(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
-    part: int,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    n, p = W.shape[0], W.shape[1]
-    stations = len(station)
-    reach, w, r, c = np.zeros(stations), np.empty(stations), np.empty(stations), np.empty(3)
-    e, E, Q, D = np.empty((stations, 3)), np.empty((stations, 3)), np.empty((stations, stations)), np.empty((3, 3))
-    F, DG, FW, q = np.empty((3, n)), np.empty((3, 6)), np.empty((3, p)), np.empty((stations, p))
-    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-        _reach(reading, weight, dead_path, extra, value, i, reach, w)
-        _directions(reach, w, station, target[i], e, r, E, Q)
-        for j in range(stations):
-            residual[j, i] = r[j] / w[j] if w[j] > 0.0 else np.nan
-            redundancy[j, i] = np.nan
-        if not _block(E, D):
-            covariance[i] = np.nan
-            continue
-        c[:] = target[i] - centre
-        _spread_motions(D, c, DG)
-        # Readings by the stations' factor, then targets: both sum over the stations.
-        for j in range(stations):
-            for k in range(p):
-                s = e[j, 0] * W[4 * j, k] + e[j, 1] * W[4 * j + 1, k] + e[j, 2] * W[4 * j + 2, k]
-                q[j, k] = -w[j] * (s + W[4 * j + 3, k])
-                for a in range(len(extra)):
-                    q[j, k] += w[j] * extra[a, j, i] * W[4 * stations + a, k]
-        FW[:] = 0.0
-        for j in range(stations):
-            for a in range(3):
-                s = -w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
-                for k in range(p):
-                    FW[a, k] += s * q[j, k]
-        # What is left of the readings when the target has taken its part: redundancy 1 - hat matrix.
-        for j in range(stations):
-            if w[j] == 0.0:
-                continue
-            alone, taken = 0.0, 0.0
-            for a in range(3, stations):
-                alone += Q[a, j] * Q[a, j]
-            for k in range(p):
-                s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
-                taken += s * s
-            redundancy[j, i] = alone - taken
-        # G times the datum's shift, taken off.
-        for k in range(p):
-            FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
-            FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
-            FW[2, k] -= shift[2, k] + shift[3, k] * c[1] - shift[4, k] * c[0]
-        _covariance(D, DG, FW, c, H, K, F, covariance[i])
-
-
-@compiled()
-def _examine_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in range((len(target) + CHUNK - 1) // CHUNK):
-        _examine_part(
-            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
-            H, K, covariance, residual, redundancy, part,
-        )  # fmt: skip
-
-
-@compiled(parallel=True)
-def _examine_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
-        _examine_part(
-            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
-            H, K, covariance, residual, redundancy, part,
-        )  # fmt: skip
-
-
-def examine(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return covariances (m, 3, 3) of the targets, residuals (n, m), m, and redundancies (n, m) of the readings.
-
-    Parameters
-    ----------
-    W : ndarray (4 n + k, p)
-        Factor of the covariance of the stations' parameters, in any datum.
-    shift : ndarray (6, p)
-        How the datum's fit to the targets moves with the factor.
-    H, K : ndarray (6, 6)
-        Inverse of the sum of G^T G; and H (sum of G^T D G) H.
-    """
-    n, m = reading.shape
-    covariance, residual, redundancy = np.empty((m, 3, 3)), np.empty((n, m)), np.empty((n, m))
-    work = _examine_shared if m > MANY else _examine_alone
-    work(
-        reading, weight, station, dead_path, extra, value, target, centre, W, shift, H, K,
-        covariance, residual, redundancy,
-    )  # fmt: skip
-    return covariance, residual, redundancy

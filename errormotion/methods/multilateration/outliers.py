@@ -26,6 +26,7 @@ CLEAR = 2.5
 NEAR = 4.0
 """Within so many usual deviations a target lies where the machine puts its targets."""
 _WEAK = 1e-3
+_GROSS = 50.0
 _SHOWN = 12
 
 
@@ -53,13 +54,13 @@ class Found:
         if self.left_out:
             shown = ", ".join(f"station {j + 1} of target {i + 1}" for j, i in self.left_out[:_SHOWN])
             more = f" and {len(self.left_out) - _SHOWN} more" if len(self.left_out) > _SHOWN else ""
-            notes.append(f"{len(self.left_out)} wrong readings left out: {shown}{more}")
+            notes.append(f"wrong readings left out ({len(self.left_out)}): {shown}{more}")
         if self.undecided:
             shown = ", ".join(str(i + 1) for i in self.undecided[:_SHOWN])
             more = f" and {len(self.undecided) - _SHOWN} more" if len(self.undecided) > _SHOWN else ""
             notes.append(
-                f"{len(self.undecided)} targets given up, since one of their readings is wrong and nothing tells "
-                f"which: {shown}{more}; a fifth station would tell"
+                f"targets given up ({len(self.undecided)}), since a reading of theirs is wrong and nothing tells "
+                f"which: {shown}{more}; readings from a further station would tell"
             )
         return notes
 
@@ -78,6 +79,19 @@ def gate(t: Array) -> float:
     return scale * float(norm.isf(0.5 * FALSE_ALARMS / checks))
 
 
+def gross(reading: Array, weight: Array, nominal: Array, place: Array, dead_path: Array) -> Found:
+    """Return the readings (n, m) so far off the nominal targets (m, 3) that no network can bear them.
+
+    Off by more than the stations' rough places (n, 3) and dead paths (n,) make any other reading, by far.
+    """
+    off = np.empty_like(reading)
+    for j in range(len(reading)):
+        off[j] = np.abs(np.linalg.norm(nominal - place[j], axis=1) - dead_path[j] - reading[j])
+    off[weight == 0] = np.nan
+    out = off > _GROSS * np.nanmedian(off, axis=1, keepdims=True)
+    return Found(tuple((int(j), int(i)) for j, i in np.argwhere(out)), (), out)
+
+
 def search(network: Network, weight: Array, nominal: Array, before: Found) -> Found:
     """Return what was found before, and the grossest of the wrong readings that are still in use.
 
@@ -92,7 +106,8 @@ def search(network: Network, weight: Array, nominal: Array, before: Found) -> Fo
     before : Found
         What was found before.
     """
-    t = np.abs(normalised(network))
+    with np.errstate(invalid="ignore"):
+        t = np.abs(normalised(network))
     if not np.isfinite(t).any():
         return before
     limit = gate(t)

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration import determinacy, outliers
-from errormotion.methods.multilateration.kernels import datum_sums, examine, reduce_targets
+from errormotion.methods.multilateration.examination import datum_sums, examine
+from errormotion.methods.multilateration.kernels import reduce_targets
 from errormotion.methods.multilateration.model import Stations
 from errormotion.methods.multilateration.network import Datum, Network
 from errormotion.methods.multilateration.start import initial_stations
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-13
 """What a further step may still move a target, m."""
 _PASSES = 200
+_HOPELESS = 100.0
 _DAMPED = 1e-8
 _UNDAMPED = 1e-11
 _LONG = 12
@@ -167,13 +169,19 @@ def solve(
         known = np.where(fixed, problem.prior[3 : 4 * len(start.place) : 4], stations.dead_path)
         stations = replace(stations, dead_path=known)
     state = descend(problem, stations, problem.nominal.copy(), tolerance)
-    found = outliers.Found.none(problem.weight)
-    network = conclude(problem, state)
+    found, original = outliers.Found.none(problem.weight), problem.weight
+    if robust and not state.sums.square < _HOPELESS**2 * problem.reading.size:
+        # Gross ones have led it astray: without them, from the start.
+        found = outliers.gross(problem.reading, original, problem.nominal, start.place, start.dead_path)
+        problem = _without(problem, original, found)
+        state = descend(problem, stations, problem.nominal.copy(), tolerance)
+    network = conclude(problem, state, start.place)
     if robust:
-        network, found = _without_wrong(problem, network, tolerance)
+        network, found = _without_wrong(problem, original, network, found, start.place, tolerance)
     notes = [
-        *start.notes,
         *found.notes,
+        *determinacy.without_place(network.weight, found.undecided),
+        *determinacy.weak_layout(network.target_covariance, network.weight, network.station, network.target),
         *determinacy.weak_targets(network.target, network.target_covariance, network.station),
         *determinacy.swapped_stations(network.station, places),
     ]
@@ -268,31 +276,40 @@ def _vector(stations: Stations) -> Array:
     return np.concatenate([np.column_stack([stations.place, stations.dead_path]).ravel(), stations.value])
 
 
-def _without_wrong(problem: Problem, network: Network, tolerance: float) -> tuple[Network, outliers.Found]:
+def _without(problem: Problem, original: Array, found: outliers.Found) -> Problem:
+    """Return the problem without readings that were found wrong; ``original`` are the weights (n, m) of all."""
+    weight = found.applied(original)
+    # A target with fewer than three readings has no place.
+    weight[:, np.count_nonzero(weight, axis=0) < 3] = 0.0
+    determinacy.refuse_too_few(weight, int(np.count_nonzero(problem.precision == 0)))
+    return replace(problem, weight=weight)
+
+
+def _without_wrong(
+    problem: Problem, original: Array, network: Network, found: outliers.Found, rough: Array, tolerance: float
+) -> tuple[Network, outliers.Found]:
     """Leave wrong readings out, the grossest first, until none is left."""
-    original, found = problem.weight, outliers.Found.none(problem.weight)
     for _ in range(_ROUNDS):
         now = outliers.search(network, original, problem.nominal, found)
         if now == found:
             break
         found = now
-        problem = replace(problem, weight=found.applied(original))
-        determinacy.refuse_too_few(problem.weight, int(np.count_nonzero(problem.precision == 0)))
+        problem = _without(problem, original, found)
         target = np.where(np.isfinite(network.target), network.target, problem.nominal)
         state = descend(problem, network.stations, target, tolerance)
-        network = conclude(problem, replace(state, passes=state.passes + network.iterations))
+        network = conclude(problem, replace(state, passes=state.passes + network.iterations), rough)
     return network, found
 
 
-def conclude(problem: Problem, state: State) -> Network:
-    """Bring a solution into the datum and return it with its covariances."""
+def conclude(problem: Problem, state: State, rough: Array) -> Network:
+    """Bring a solution into the datum and return it with its covariances; ``rough`` (n, 3) are rough stations."""
     used = np.count_nonzero(problem.weight, axis=0) >= 3
     stations, target = fitted(state.stations, state.target, problem.nominal, used)
     centre = target[used].mean(axis=0)
     Z = problem.basis(stations, centre)
     sums = problem.reduce(stations, target)
     information = Z.T @ sums.H @ Z
-    values = determinacy.refuse_loose(information, Z, stations, target[used])
+    values = determinacy.refuse_loose(information, Z, stations, target[used], rough)
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
     datum = _datum(problem, stations, target, centre, W)
     covariance, residual, redundancy = examine(

@@ -28,15 +28,15 @@ FITS = 0.01
 """A station whose readings fit the nominal targets worse than this share of their extent is not found."""
 _STEPS = 30
 _REWEIGHTED = 8
+_DRAWS, _FEW = 60, 8
 
 
 @dataclass(frozen=True)
 class Start:
-    """Rough places (n, 3) and dead paths (n,) of the stations, m, and what was noticed."""
+    """Rough places (n, 3) and dead paths (n,) of the stations, m."""
 
     place: Array
     dead_path: Array
-    notes: tuple[str, ...] = ()
 
 
 def initial_stations(reading: Array, weight: Array, target: Array, station: Array | None) -> Start:
@@ -76,7 +76,9 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
             places[j], dead_paths[j] = rough + centre, np.median(np.linalg.norm(u - rough, axis=1) - d)
             continue
         found, scale = _best(_guesses(d, u, rough, normal), d, u)
-        if scale > FITS * extent:
+        if scale > FITS * extent and normal is None:
+            found, scale = min((found, scale), _best(_from_few(d, u), d, u), key=lambda each: each[1])
+        if scale > FITS * extent or _reversed(d, u, found, scale):
             raise MethodError(_what_is_wrong(j, d, u, extent, scale))
         places[j], dead_paths[j] = found[:3] + centre, found[3]
     return Start(places, dead_paths)
@@ -117,6 +119,23 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> l
         )
     sides = (1.0,) if rough is None else (np.sign(normal @ rough) or 1.0,)
     return [*guesses, *(np.append(U + side * height * normal, L - middle) for side in sides)]
+
+
+def _from_few(d: Array, u: Array) -> list[Array]:
+    """Return the best of guesses from a few readings each: some of these have no wrong one among them."""
+    rng = np.random.default_rng(0)
+    tried = []
+    for _ in range(_DRAWS):
+        some = rng.permutation(len(d))[:_FEW]
+        x = _guesses(d[some], u[some], None, None)[0]
+        tried.append((_scale(d - np.linalg.norm(u - x[:3], axis=1) + x[3]), x))
+    return [x for _, x in sorted(tried, key=lambda each: each[0])[:3]]
+
+
+def _reversed(d: Array, u: Array, found: Array, scale: float) -> bool:
+    """Return whether readings fit much better with their sign reversed: far stations bear either nearly as well."""
+    x = _guesses(d, u, None, None)[0] if np.linalg.matrix_rank(u, tol=FLAT * np.abs(u).max()) == 3 else found
+    return bool(x[3] + np.median(d) < 0 and _sharpened(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
 
 
 def _best(guesses: list[Array], d: Array, u: Array) -> tuple[Array, float]:
@@ -173,7 +192,7 @@ def _what_is_wrong(j: int, d: Array, u: Array, extent: float, scale: float) -> s
                     (0.5, "half of the path counted")):  # fmt: skip
         if abs(factor / k - 1) < 0.2:
             return f"{text}; they are about {k:g} times what they should be: it looks like {name}"
-    if reversed_sign:
+    if reversed_sign or scale < FITS * extent:
         return f"{text}; they fit with their sign reversed: a displacement grows as the target moves away"
     return (
         f"{text}; check that displacements and targets are in the same order, that the station stood still, and that "
