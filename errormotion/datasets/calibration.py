@@ -77,7 +77,7 @@ ROWS = (
     Row("slope_predicted_uncertainty", ("setting",), "1", 0.0, 1.0, "standard uncertainty of that prediction"),
     Row("setting_left_out", ("setting",), "", 0, 1, "1: the setting contradicts all the others and was left out"),
     Row("noise", (), "m", 0.0, 1e-3, "standard deviation of one reading about the line of its setting"),
-    Row("repeatability", (), "1", 0.0, 1.0, "standard deviation of k from setting to setting, beyond the noise"),
+    Row("scatter", (), "1", 0.0, 1e3, "how many times as much as their noise the settings scatter about the surface"),
     Row("group_setting", ("group",), "", 0, 1e7, "setting of each group of readings that was fitted"),
     Row("group_depth", ("group",), "m", *_DEPTH, "its reference minus `mid_range`"),
     Row("group_residual", ("group",), "m", -0.1, 0.1, "its reading minus the line of its setting"),

@@ -43,7 +43,7 @@ def calibration(
         "rotation": b,
         "setting_left_out": np.zeros(n, dtype=np.int8),
         "noise": 1e-7,
-        "repeatability": 1e-6,
+        "scatter": 1.0,
         "group_setting": np.arange(n),
         "group_left_out": np.zeros(n, dtype=np.int8),
         "remaining_error": 2e-6,

@@ -184,7 +184,7 @@ def _variables(
         "slope_predicted_uncertainty": np.sqrt(variance),
         "setting_left_out": (~kept).astype(np.int8),
         "noise": lines.noise,
-        "repeatability": surface.scatter,
+        "scatter": surface.scatter,
         "group_setting": readings.setting,
         "group_depth": readings.depth,
         "group_residual": lines.residual,

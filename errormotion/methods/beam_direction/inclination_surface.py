@@ -1,11 +1,11 @@
 """A smooth surface k through the slopes of calibrated settings, its order chosen by leaving settings out.
 
 k is a sum of products of Legendre polynomials. A smooth function has coefficients that fall geometrically with their
-degree n, so each is held at 0 within a standard deviation s rho^n, and every setting scatters by tau beyond its noise.
-How well s, rho and tau suit the data is told by predictions of settings that were left out, one at a time: the sum of
-the log densities of these predictions (Rasmussen and Williams, Gaussian Processes for Machine Learning, section 5.4.2).
-Few settings tell the three only roughly, so the surface is the average over those that suit, and its covariance holds
-how they differ.
+degree n, so each is held at 0 within a standard deviation s rho^n, and the settings scatter f times as much as their
+noise says. How well s, rho and f suit the data is told by predictions of settings that were left out, one at a time:
+the sum of the log densities of these predictions (Rasmussen and Williams, Gaussian Processes for Machine Learning,
+section 5.4.2). Few settings tell the three only roughly, so the surface is the average over a grid of them, each with
+the weight of how well it suits, and its covariance holds how they differ.
 
 The order is the smallest one that predicts no worse than all degrees together. The degrees beyond it stay in the fit,
 held at what they may be: they are what the order leaves out, and make the uncertainty grow where there are no settings.
@@ -22,23 +22,24 @@ from errormotion.datasets.calibration import terms
 
 Array = NDArray[np.float64]
 
-HIGHEST = 10
+HIGHEST = 12
 """Highest order that is tried."""
 BEYOND = 3
 """Degrees in the fit beyond that."""
 
 _MOST = 600
-"""Settings that decide on s, rho and tau; more would only take longer."""
-_STEPS = 120
-"""Evaluations of the predictions while the best s, rho and tau are sought."""
-_WALK, _BETWEEN = 120, 8
-"""Steps of the walk over those that suit, and from which step on and how often one is taken."""
-_STRIDE = np.array([0.5, 0.2, 0.6])
-"""Standard deviations of one step, see `_Problem.habit`."""
+"""Settings that decide on s, rho and f; more would only take longer."""
+_SIZES = 10.0 ** np.arange(-6.0, 1.1, 0.2)
+"""Standard deviations of the coefficients of degree `_MIDDLE`, over the largest slope."""
 _MIDDLE = 4
-"""Degree at which the size of the coefficients is told; it hardly depends on rho there."""
-_DECAY = (0.03, 1.0)
-"""Bounds of rho: one coefficient tells all; no decay at all."""
+_DECAYS = 1.4 ** np.arange(-7.0, 1.0)
+"""rho, from a tenth up to 1."""
+_SCATTERS = np.array([1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0])
+"""f."""
+_LEAST_WEIGHT = 1e-3
+"""Weight, over the largest, below which a place of the grid does not count."""
+_ROUNDING = 1e-9
+"""Least share of a slope that its own reading does not determine."""
 _ON_LINE = 1e-6
 """x2 below which a setting lies on the line of symmetry."""
 
@@ -78,7 +79,7 @@ class Surface:
     mirror : bool
         Whether k is even in x2.
     scatter : float
-        tau: standard deviation of k from setting to setting beyond the noise.
+        f: how many times as much as their noise the settings scatter.
     prediction : Prediction
         Of every setting by all the others.
     """
@@ -117,24 +118,26 @@ def fit_surface(
         Whether k is even in x2; default: if that predicts no worse, and there are settings on both sides to tell.
     """
     both_sides = bool((x[:, 1] > _ON_LINE).any() and (x[:, 1] < -_ON_LINE).any())
-    kinds = [mirror] if mirror is not None else [True, False] if both_sides else [False]
     last = HIGHEST + BEYOND if order is None else order
-    found = []
-    for kind in kinds:
-        problem = _Problem.of(x, slope, variance, degrees_to(last, kind))
-        place = problem.thinned().search()
-        found.append((problem, place, problem.predict(place)))
-    problem, place, prediction = found[-1] if _worse(found[0][2].density, found[-1][2].density) else found[0]
-    coefficients, covariance = problem.average(problem.thinned().walk(place))
+    problem = _Problem.of(x, slope, variance, degrees_to(last, both_sides if mirror is None else mirror))
+    places, weights = problem.thinned().grid()
+    prediction = problem.predict(places[0])
+    if mirror is None and both_sides:
+        free = _Problem.of(x, slope, variance, degrees_to(last, mirror=False))
+        if _worse(prediction.density, free.predict(places[0]).density):
+            problem = free
+            places, weights = problem.thinned().grid()
+            prediction = problem.predict(places[0])
+    coefficients, covariance = problem.average(places, weights)
     # Nothing says that the prior fits: the covariance is no smaller than the settings that were left out show.
     widening = max(1.0, float(np.mean(prediction.z**2)))
     return Surface(
         problem.degrees,
         coefficients,
         covariance * widening,
-        problem.choose_order(place, prediction, highest) if order is None else order,
+        problem.choose_order(places[0], prediction, highest) if order is None else order,
         not (problem.degrees[:, 1] % 2).any(),
-        problem.habit(place)[1],
+        places[0].scatter,
         Prediction(prediction.density, prediction.slope, prediction.variance * widening, prediction.z),
     )
 
@@ -146,115 +149,120 @@ def _worse(density: Array, best: Array) -> bool:
 
 
 @dataclass(frozen=True)
+class _Place:
+    """One place of the grid: s rho^4 over the largest slope, rho, f."""
+
+    size: float
+    decay: float
+    scatter: float
+
+
+@dataclass(frozen=True)
 class _Problem:
-    """Slopes and terms; a *place* (3,) is where the search stands: logs of s rho^4, rho, tau."""
+    """Terms and slopes over the standard deviations of the slopes."""
 
     Phi: Array
     degrees: NDArray[np.int64]
-    slope: Array
-    variance: Array
+    y: Array
+    deviation: Array
 
     @classmethod
     def of(cls, x: Array, slope: Array, variance: Array, degrees: NDArray[np.int64]) -> _Problem:
-        return cls(terms(x, degrees), degrees, slope, variance)
+        deviation = np.sqrt(variance)
+        return cls(terms(x, degrees) / deviation[:, None], degrees, slope / deviation, deviation)
 
     def thinned(self) -> _Problem:
-        """Return the problem with so many settings as are needed to find the place."""
-        if len(self.slope) <= _MOST:
+        """Return the problem with so many settings as are needed to weigh the grid."""
+        if len(self.y) <= _MOST:
             return self
-        some = np.linspace(0, len(self.slope) - 1, _MOST).astype(int)
-        return _Problem(self.Phi[some], self.degrees, self.slope[some], self.variance[some])
+        some = np.linspace(0, len(self.y) - 1, _MOST).astype(int)
+        return _Problem(self.Phi[some], self.degrees, self.y[some], self.deviation[some])
 
     def up_to(self, degree: int) -> _Problem:
         """Return the problem with the terms up to a total degree."""
         kept = self.degrees.sum(axis=1) <= degree
-        return _Problem(self.Phi[:, kept], self.degrees[kept], self.slope, self.variance)
+        return _Problem(self.Phi[:, kept], self.degrees[kept], self.y, self.deviation)
 
-    def bounds(self) -> tuple[Array, Array]:
-        """Return the lowest and the highest place."""
-        noise = float(np.sqrt(np.median(self.variance)))
-        size = max(float(np.abs(self.slope).max()), noise)
-        return np.log([size * 1e-7, _DECAY[0], noise * 1e-2]), np.log([size * 10, _DECAY[1], size])
+    def prior(self, decay: float) -> Array:
+        """Return the standard deviation of each coefficient (term,) where that of degree `_MIDDLE` is 1."""
+        return np.asarray(decay ** (self.degrees.sum(axis=1) - float(_MIDDLE)))
 
-    def habit(self, place: Array) -> tuple[Array, float]:
-        """Return the standard deviation of each coefficient (term,), and tau."""
-        middle, decay, scatter = np.exp(np.clip(place, *self.bounds()))
-        return np.asarray(middle * decay ** (self.degrees.sum(axis=1) - float(_MIDDLE))), float(scatter)
+    def spectrum(self, decay: float) -> tuple[Array, Array]:
+        """Return eigenvalues (term,) and eigenvectors of the normal matrix in units of the prior."""
+        X = self.Phi * self.prior(decay)
+        values, vectors = np.linalg.eigh(X.T @ X)
+        return np.maximum(values, 0.0), vectors
 
-    def whitened(self, place: Array) -> tuple[Array, Array, Array, Array]:
-        """Return design and slopes over their deviations, the design in units of the prior; deviations and prior."""
-        prior, scatter = self.habit(place)
-        deviation = np.sqrt(self.variance + scatter**2)
-        return self.Phi * prior / deviation[:, None], self.slope / deviation, deviation, prior
+    def unit(self) -> float:
+        """Return the largest slope, which the sizes of the grid are told in."""
+        return float(np.max(np.abs(self.y * self.deviation)))
 
-    def predict(self, place: Array) -> Prediction:
+    def grid(self) -> tuple[list[_Place], Array]:
+        """Return the places that suit, the best first, and their weights, sum 1."""
+        sizes, scatters = (part.ravel() for part in np.meshgrid(_SIZES, _SCATTERS))
+        square, noise = (sizes * self.unit()) ** 2, scatters**2
+        suits = np.empty((len(_DECAYS), len(sizes)))
+        for row, decay in enumerate(_DECAYS):
+            values, vectors = self.spectrum(decay)
+            T = (self.Phi * self.prior(decay)) @ vectors
+            shrink = square / (square * values[:, None] + noise)
+            suits[row] = _density(self.y[:, None] - T @ (shrink * (T.T @ self.y)[:, None]), T**2 @ shrink, noise)
+        weights = np.exp(suits - suits.max()).ravel()
+        order = np.argsort(-weights, kind="stable")
+        order = order[weights[order] >= _LEAST_WEIGHT]
+        places = [
+            _Place(float(sizes[k % len(sizes)]), float(_DECAYS[k // len(sizes)]), float(scatters[k % len(sizes)]))
+            for k in order
+        ]
+        return places, weights[order] / weights[order].sum()
+
+    def average(self, places: list[_Place], weights: Array) -> tuple[Array, Array]:
+        """Return the mean of the coefficients over places of the grid, and their covariance."""
+        means = np.empty((len(places), len(self.degrees)))
+        C = np.zeros((len(self.degrees), len(self.degrees)))
+        for decay in {place.decay for place in places}:
+            values, vectors = self.spectrum(decay)
+            D = self.prior(decay)
+            along = vectors.T @ (D * (self.Phi.T @ self.y))
+            rows = [k for k, place in enumerate(places) if place.decay == decay]
+            square = np.array([(places[k].size * self.unit()) ** 2 for k in rows])[:, None]
+            noise = np.array([places[k].scatter ** 2 for k in rows])[:, None]
+            shrink = square / (square * values + noise)
+            means[rows] = D * ((shrink * along) @ vectors.T)
+            basis = D[:, None] * vectors
+            C += (basis * (weights[rows] @ (shrink * noise))) @ basis.T
+        mean = weights @ means
+        off = (means - mean) * np.sqrt(weights)[:, None]
+        C += off.T @ off
+        return mean, (C + C.T) / 2
+
+    def predict(self, place: _Place) -> Prediction:
         """Return the prediction of each setting by all the others, in closed form."""
         from scipy.linalg import solve_triangular
 
-        X, y, deviation, _ = self.whitened(place)
+        square, noise = (place.size * self.unit()) ** 2, place.scatter**2
+        X = self.Phi * (self.prior(place.decay) * np.sqrt(square / noise))
         L = np.linalg.cholesky(X.T @ X + np.eye(X.shape[1]))
         B = solve_triangular(L, X.T, lower=True, check_finite=False)
-        rest = y - B.T @ (B @ y)
-        free = np.maximum(1.0 - (B**2).sum(axis=0), 1e-9)  # 1 - leverage
-        z = rest / np.sqrt(free)
-        density = -0.5 * (z**2 + np.log(2 * np.pi * deviation**2 / free))
-        return Prediction(density, self.slope - deviation * rest / free, deviation**2 * (1.0 / free - 1.0), z)
-
-    def suits(self, place: Array) -> float:
-        """Return the sum of the log densities of the predictions."""
-        low, high = self.bounds()
-        if (place < low).any() or (place > high).any():
-            return -np.inf
-        return float(self.predict(place).density.sum())
-
-    def search(self) -> Array:
-        """Return the place that suits best."""
-        from scipy.optimize import minimize
-
-        low, high = self.bounds()
-        start = np.array([high[0] - np.log(1e3), np.log(0.4), low[2] + np.log(50.0)])
-        simplex = np.vstack([start, start + np.diag([2.0, 0.7, 1.5])])
-
-        def badness(place: Array) -> float:
-            return -self.suits(np.clip(place, low, high))
-
-        found = minimize(
-            badness,
-            start,
-            method="Nelder-Mead",
-            options={"maxfev": _STEPS, "initial_simplex": simplex, "fatol": 0.05, "xatol": 0.05},
+        rest, leverage = self.y - B.T @ (B @ self.y), (B**2).sum(axis=0)
+        free = np.maximum(1.0 - leverage, _ROUNDING)
+        z = rest / np.sqrt(noise * free)
+        return Prediction(
+            -0.5 * (z**2 + np.log(2 * np.pi * noise * self.deviation**2 / free)),
+            self.deviation * (self.y - rest / free),
+            self.deviation**2 * noise * (1.0 / free - 1.0),
+            z,
         )
-        return np.asarray(np.clip(found.x, low, high))
 
-    def walk(self, place: Array) -> list[Array]:
-        """Return places as often as they suit: a random walk (Metropolis), the same every time."""
-        rng = np.random.default_rng(0)
-        suits, taken = self.suits(place), []
-        for step in range(1, _WALK + 1):
-            other = place + _STRIDE * rng.normal(size=3)
-            there = self.suits(other)
-            if np.log(rng.uniform()) < there - suits:
-                place, suits = other, there
-            if step % _BETWEEN == 0:
-                taken.append(place)
-        return taken
-
-    def average(self, places: list[Array]) -> tuple[Array, Array]:
-        """Return the mean of the coefficients over places, and their covariance."""
-        means, covariances = [], []
-        for place in places:
-            X, y, _, prior = self.whitened(place)
-            C = np.linalg.inv(X.T @ X + np.eye(X.shape[1]))
-            means.append(prior * (C @ (X.T @ y)))
-            covariances.append(prior[:, None] * C * prior)
-        mean = np.mean(means, axis=0)
-        off = np.array(means) - mean
-        C = np.mean(covariances, axis=0) + off.T @ off / len(places)
-        return mean, (C + C.T) / 2
-
-    def choose_order(self, place: Array, best: Prediction, highest: int) -> int:
+    def choose_order(self, place: _Place, best: Prediction, highest: int) -> int:
         """Return the smallest order that predicts no worse than all degrees."""
         for order in range(highest):
             if not _worse(self.up_to(order).predict(place).density, best.density):
                 return order
         return highest
+
+
+def _density(rest: Array, leverage: Array, noise: Array) -> Array:
+    """Return the sums of the log densities of left-out slopes, up to a constant, for residuals (setting, place)."""
+    free = np.maximum(1.0 - leverage, _ROUNDING)
+    return np.asarray(-0.5 * (rest**2 / (noise * free) + np.log(noise / free)).sum(axis=0))
