@@ -54,7 +54,7 @@ def calibration() -> InclinationCalibration:
         "slope_predicted_uncertainty": np.full(n, K_UNCERTAINTY),
         "setting_left_out": np.zeros(n, dtype=np.int8),
         "noise": 0.1e-6,
-        "repeatability": 0.0,
+        "scatter": 1.0,
         "remaining_error": K_UNCERTAINTY,
         "remaining_error_interval": [0.0, 2 * K_UNCERTAINTY],
     }
