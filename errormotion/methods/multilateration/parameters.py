@@ -9,7 +9,10 @@ series of Legendre polynomials over the measured part of its axis, from the firs
 * what an error does to no reflector, or nothing but what others do, is not seen. With one reflector these are the
   rotations of the axis that carries it, and of others whose lever never changes across.
 
-How many terms each error motion has is decided by the Bayesian information criterion, term by term.
+How many terms an error motion has is decided by the evidence: the coefficient of order k has the prior standard
+deviation tau / k^p, with tau of each error motion and one p for all of largest marginal likelihood (MacKay, Bayesian
+interpolation, Neural Computation 4, 1992). Terms that the targets say nothing about keep their prior, so that what may
+be between the targets is in the uncertainty. Squareness and the slope of positioning have no prior.
 """
 
 from __future__ import annotations
@@ -32,6 +35,12 @@ AXES = ("X", "Y", "Z")
 UNSEEN = 1e-6
 """A term of which less than this share is its own is not told from the others."""
 FALSE_ALARM = 1e-3
+FALLOFFS = (1.0, 2.0, 3.0, 4.0)
+"""How fast coefficients may fall with their order: p of the prior."""
+_PASSES = 100
+_SETTLED = 0.01
+_POOLED = 1.0
+"""Terms' worth of weight that the other error motions of the same kind have in the size of one."""
 _BLOCK = 4096
 
 
@@ -117,11 +126,14 @@ class Parametric:
         Of ``coefficient``.
     coefficient, covariance : ndarray (term,), (term, term)
         m, rad; squareness rad.
+    determined : ndarray (term,)
+        How far the targets determine each, 0 (its prior stands) to 1.
     unseen : mapping of str to str
         Error that the targets do not determine, to why.
     sigma0 : float
         Root mean square of what is left over what was expected: 1 where the axes explain the errors.
-    freedom : int
+    freedom : float
+        Values less what they have determined.
     datum : ndarray (6, term)
         What has to be taken off the displacements of each term, so that the measured targets have no motion with the
         whole; about ``centre`` (3,).
@@ -131,20 +143,21 @@ class Parametric:
     terms: list[Term]
     coefficient: Array
     covariance: Array = field(repr=False)
+    determined: Array
     unseen: dict[str, str]
     sigma0: float
-    freedom: int
+    freedom: float
     datum: Array = field(repr=False)
     centre: Array = field(repr=False)
     notes: tuple[str, ...] = ()
 
     @property
     def orders(self) -> dict[str, int]:
-        """Highest order of every error motion that is seen; squareness is not among them."""
+        """Highest order of every error motion that the targets determine rather than its prior; 0 where none."""
         found: dict[str, int] = {}
-        for term in self.terms:
+        for term, share in zip(self.terms, self.determined, strict=True):
             if term.order >= 0:
-                found[term.error] = max(found.get(term.error, 0), term.order)
+                found[term.error] = max(found.get(term.error, 0), term.order if share > 0.5 else 0)
         return found
 
     def curve(self, error: str, position: Array) -> tuple[Array, Array]:
@@ -197,7 +210,7 @@ def fit_machine(
     reflector : ndarray (m, 3), optional
         Where the reflector of each target is with all axes at zero, m; the origin where not given.
     max_order : int
-        Of the polynomials; no more than the positions of an axis allow.
+        Of the polynomials.
 
     Raises
     ------
@@ -212,35 +225,32 @@ def fit_machine(
     at = np.zeros_like(position) if reflector is None else reflector
     position, error, own, at, influence = position[known], error[known], own[known], at[known], influence[:, known]
     model = Chain.of(chain, position, at)
-    terms = _candidates(model, position, max_order)
+    terms, levels = _candidates(model, position, max_order)
     place = position + at
     centre = place.mean(axis=0)
     N, b, square = _normal_equations(model, terms, position, at, centre, error, own, influence)
-    nuisance = list(range(len(terms), len(N)))
-    seen, unseen = _seen(model, terms, N, nuisance)
-    chosen, notes = _choose(terms, seen, N, b, nuisance, 3 * len(position))
-    S = chosen + nuisance
-    C = linalg.inv(N[np.ix_(S, S)])
-    x = C @ b[S]
-    freedom = 3 * len(position) - 6 - len(chosen)
-    ratio = max(float(square - b[S] @ x), 0.0) / max(freedom, 1)
-    scale = 1.0
-    if freedom > 0 and ratio * freedom > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    unseen = _unseen(terms, levels, N, len(N) - len(terms))
+    kept = [k for k, term in enumerate(terms) if term.error not in unseen]
+    S = kept + list(range(len(terms), len(N)))
+    terms = [terms[k] for k in kept]
+    found = _most_evident(terms, N[np.ix_(S, S)], b[S], len(influence), square)
+    freedom = 3 * len(position) - 6 - float(found.determined.sum())
+    ratio = found.left / max(freedom, 1.0)
+    scale, notes = 1.0, []
+    if freedom > 0 and found.left > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
         scale = ratio
         notes.append(
             f"Errors of the axes leave {np.sqrt(ratio):.3g} times as much of the targets' errors as their uncertainty "
             "explains: a machine that is not rigid, hysteresis, or error motions of higher order than "
             f"{max_order}. The uncertainties of the axes are raised to match."
         )
-    k = len(chosen)
-    kept = [terms[i] for i in chosen]
-    A = model.columns(kept, position, at)
+    A = model.columns(terms, position, at)
     G = model.motions(place, centre)
-    GG = np.einsum("mai,maj->ij", G, G)
-    datum = np.linalg.lstsq(GG, np.einsum("mai,mat->it", G, A))[0]
+    datum = np.linalg.lstsq(np.einsum("mai,maj->ij", G, G), np.einsum("mai,mat->it", G, A))[0]
     return Parametric(
-        model, kept, x[:k], scale * C[:k, :k], unseen, float(np.sqrt(ratio)), freedom, datum, centre, tuple(notes)
-    )
+        model, terms, found.value, scale * found.covariance, found.determined, unseen, float(np.sqrt(ratio)), freedom,
+        datum, centre, tuple(notes),
+    )  # fmt: skip
 
 
 def first_order(error: str) -> int:
@@ -249,18 +259,16 @@ def first_order(error: str) -> int:
     return 2 if freedom < 3 and freedom != axis else 1
 
 
-def _candidates(model: Chain, position: Array, max_order: int) -> list[Term]:
-    """Return all terms that the positions of each axis allow: squareness, displacements, then rotations."""
+def _candidates(model: Chain, position: Array, max_order: int) -> tuple[list[Term], list[int]]:
+    """Return all terms (squareness, displacements, then rotations), and the number of positions of each axis."""
     levels = [len(np.unique(np.round(column, 6))) for column in position.T]
     terms = [Term(name, -1) for name in model.machine.error_names[18:]]
     motions = model.machine.error_names[:18]
     for rotations in (False, True):
         for name in motions:
-            if (DOF.index(name[:2]) >= 3) != rotations:
-                continue
-            top = min(max_order, levels[AXES.index(name[2])] - 1)
-            terms += [Term(name, order) for order in range(first_order(name), top + 1)]
-    return terms
+            if (DOF.index(name[:2]) >= 3) == rotations:
+                terms += [Term(name, order) for order in range(first_order(name), max(max_order, 2) + 1)]
+    return terms, levels
 
 
 def _normal_equations(
@@ -287,70 +295,98 @@ def _normal_equations(
     return N, b, square
 
 
-def _seen(model: Chain, terms: list[Term], N: Array, nuisance: list[int]) -> tuple[set[int], dict[str, str]]:
-    """Return the terms that are told from all before them, and the errors that are not seen, with the reason."""
+def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, str]:
+    """Return the errors whose first term moves no reflector, or is not told from those before it, with the reason."""
     size = np.sqrt(np.diag(N))
-    reference = max(size[: len(terms)])
-    motions = nuisance[:6]
-    R = N / np.outer(np.where(size > 0, size, 1.0), np.where(size > 0, size, 1.0))
-    taken, unseen = list(motions), {}
-    seen: set[int] = set()
-    present = {term.error for term in terms}
-    for name in model.machine.error_names:
-        if name not in present:
-            axis = name[2] if name[2] in AXES else name[3]
-            unseen[name] = f"too few positions of {axis}"
+    reference = size[: len(terms)].max()
+    unit = np.where(size > 0, size, 1.0)
+    R = N / np.outer(unit, unit)
+    taken = list(range(len(terms), len(terms) + min(nuisance, 6)))
+    unseen: dict[str, str] = {}
     for k, term in enumerate(terms):
-        if term.error in unseen:
+        name = term.error
+        axes = {AXES.index(letter) for letter in (name[2], name[3:]) if letter in AXES}
+        few = [AXES[i] for i in axes if levels[i] < (2 if term.order < 0 else first_order(name) + 1)]
+        if name in unseen or (term.order >= 0 and term.order >= levels[AXES.index(name[2])]):
+            if few and name not in unseen:
+                unseen[name] = f"too few positions of {few[0]}"
             continue
-        start = term.order < 0 or term.order == first_order(term.error)
-        if size[k] < 1e-9 * reference:
-            if start:
-                unseen[term.error] = "it moves no reflector"
-            continue
-        with_ = linalg.solve(R[np.ix_(taken, taken)], R[taken, k], assume_a="sym") if taken else np.zeros(0)
-        share = 1.0 - float(R[taken, k] @ with_)
-        if share > UNSEEN:
-            seen.add(k)
-            taken.append(k)
-        elif start:
-            parts = {terms[i].error: 0.0 for i in taken if i < len(terms)}
-            for i, weight in zip(taken, with_, strict=True):
-                if i < len(terms):
-                    parts[terms[i].error] += abs(float(weight))
-            others = [name for name, weight in parts.items() if weight > 1e-3]
-            unseen[term.error] = f"not told from {' and '.join(others) or 'a motion of the whole'}"
-    return seen, unseen
+        if few:
+            unseen[name] = f"too few positions of {few[0]}"
+        elif size[k] < 1e-9 * reference:
+            if term.order <= first_order(name):
+                unseen[name] = "it moves no reflector"
+        else:
+            others = linalg.solve(R[np.ix_(taken, taken)], R[taken, k], assume_a="sym")
+            if 1.0 - float(R[taken, k] @ others) > UNSEEN:
+                taken.append(k)
+            elif term.order <= first_order(name):
+                unseen[name] = _like(terms, taken, others)
+    return unseen
 
 
-def _choose(
-    terms: list[Term], seen: set[int], N: Array, b: Array, nuisance: list[int], readings: int
-) -> tuple[list[int], list[str]]:
-    """Return the terms that the data ask for: squareness and the first of every motion, then one or two at a time."""
-    by_error: dict[str, list[int]] = {}
-    for k in sorted(seen):
-        by_error.setdefault(terms[k].error, []).append(k)
-    chosen = [motion.pop(0) for motion in by_error.values()]
-    penalty = float(np.log(readings))
-    while True:
-        S = chosen + nuisance
-        steps = [motion[: 1 + more] for motion in by_error.values() for more in (0, 1, 2) if len(motion) > more]
-        if not steps:
+def _like(terms: list[Term], taken: list[int], weight: Array) -> str:
+    """Say which errors do what another one does."""
+    parts: dict[str, float] = {}
+    for i, share in zip(taken, weight, strict=True):
+        if i < len(terms):
+            parts[terms[i].error] = parts.get(terms[i].error, 0.0) + abs(float(share))
+    return f"not told from {' and '.join(name for name, part in parts.items() if part > 1e-3) or 'a shift'}"
+
+
+@dataclass(frozen=True)
+class _Evident:
+    """Coefficients, their covariance, how far the data determine each (0 to 1), and the residual sum of squares."""
+
+    value: Array
+    covariance: Array
+    determined: Array
+    left: float
+    evidence: float
+
+
+def _most_evident(terms: list[Term], N: Array, b: Array, sources: int, square: float) -> _Evident:
+    found = [_with_falloff(terms, N, b, sources, square, p) for p in FALLOFFS]
+    return max(found, key=lambda each: each.evidence)
+
+
+def _with_falloff(terms: list[Term], N: Array, b: Array, sources: int, square: float, p: float) -> _Evident:
+    """Maximise the evidence over tau of every error motion, by expectation and maximisation."""
+    n = len(terms)
+    order = np.array([term.order for term in terms], dtype=float)
+    flat = np.array([term.order < 0 or (term.order == 1 and term.error[1] == term.error[2]) for term in terms])
+    names = [term.error for term in terms]
+    groups = {name: np.flatnonzero([(e == name) and not f for e, f in zip(names, flat, strict=True)]) for name in names}
+    groups = {name: group for name, group in groups.items() if len(group)}
+    shape = np.where(flat, np.inf, np.maximum(order, 1.0) ** -p)
+    kinds = {name: "EA EB EC".find(name[:2]) >= 0 for name in groups}
+    # Columns of one size: metres and radians weigh alike.
+    unit = 1 / np.sqrt(np.diag(N))
+    scaled, right = N * np.outer(unit, unit), b * unit
+    guess = {kind: float(np.median([unit[i] for name, g in groups.items() if kinds[name] == kind for i in g] or [1.0]))
+             for kind in (False, True)}  # fmt: skip
+    tau = {name: 30 * guess[kinds[name]] for name in groups}
+    for _ in range(_PASSES):
+        prior = np.zeros(len(N))
+        for name, group in groups.items():
+            prior[group] = 1 / (tau[name] * shape[group]) ** 2
+        factor = linalg.cho_factor(scaled + np.diag(prior * unit**2))
+        C = linalg.cho_solve(factor, np.eye(len(N))) * np.outer(unit, unit)
+        x = unit * linalg.cho_solve(factor, right)
+        second = {name: float(np.sum((x[g] ** 2 + np.diag(C)[g]) / shape[g] ** 2)) for name, g in groups.items()}
+        typical = {
+            kind: float(np.exp(np.mean([np.log(tau[name] ** 2) for name in groups if kinds[name] == kind] or [0.0])))
+            for kind in (False, True)
+        }
+        before = dict(tau)
+        for name, group in groups.items():
+            tau[name] = float(np.sqrt((second[name] + _POOLED * typical[kinds[name]]) / (len(group) + _POOLED)))
+        if max(abs(np.log(tau[name] / before[name])) for name in groups) < _SETTLED:
             break
-        open_ = sorted({k for step in steps for k in step})
-        factor = linalg.cho_factor(N[np.ix_(S, S)])
-        X = linalg.cho_solve(factor, N[np.ix_(S, open_)])
-        M = N[np.ix_(open_, open_)] - N[np.ix_(open_, S)] @ X
-        r = b[open_] - X.T @ b[S]
-        at = {k: i for i, k in enumerate(open_)}
-        gains = []
-        for step in steps:
-            i = [at[k] for k in step]
-            gains.append(float(r[i] @ linalg.solve(M[np.ix_(i, i)], r[i], assume_a="pos")) - penalty * len(step))
-        best = int(np.argmax(gains))
-        if gains[best] <= 0:
-            break
-        chosen += steps[best]
-        motion = by_error[terms[steps[best][0]].error]
-        del motion[: len(steps[best])]
-    return sorted(chosen), []
+    determined = 1 - np.diag(C)[:n] * prior[:n]
+    # Twice the logarithm of the marginal likelihood, up to a constant that no choice changes.
+    log_det = 2 * float(np.log(np.diag(factor[0])).sum()) - 2 * float(np.log(unit).sum())
+    evidence = float(b @ x) - log_det + float(np.log(prior[prior > 0]).sum())
+    shared = slice(len(N) - sources, len(N))
+    left = max(square - 2 * float(b @ x) + float(x @ N @ x), float(x[shared] @ x[shared]))
+    return _Evident(x[:n], C[:n, :n], determined, left, evidence)

@@ -27,7 +27,8 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as variables of an error dataset.
 
     ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen; ``EC0Y`` ...
-    and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance`` and what `volumetric_errors` needs.
+    and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and what `volumetric_errors`
+    needs.
     """
     extras: dict[str, xr.DataArray] = {}
     chain = axes.chain
@@ -52,6 +53,9 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     about = {"chain": chain.machine.chain, "unseen": [f"{k}: {why}" for k, why in axes.unseen.items()] or [""]}
     extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=about)
     extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
+    extras["determined"] = xr.DataArray(
+        axes.determined, dims="term", attrs={"units": "1", "long_name": "by the targets: 1, by the prior: 0"}
+    )
     extras["axes_datum"] = xr.DataArray(axes.datum, dims=("motion", "term"))
     m = {"units": "m"}
     for name, vector in {
@@ -88,8 +92,8 @@ def axes_of(errors: xr.Dataset) -> Parametric:
     unseen = dict(text.split(": ", 1) for text in told if ": " in text)
     covariance, datum = errors["coefficient_covariance"].values, errors["axes_datum"].values
     return Parametric(
-        model, terms, c.values, covariance, unseen, float(errors["axes_sigma0"]), int(errors["axes_freedom"]), datum,
-        vector["centre"],
+        model, terms, c.values, covariance, errors["determined"].values, unseen, float(errors["axes_sigma0"]),
+        float(errors["axes_freedom"]), datum, vector["centre"],
     )  # fmt: skip
 
 
@@ -177,7 +181,7 @@ def _unit(error: str) -> str:
 
 def _inside(axes: Parametric, q: Array) -> NDArray[np.bool_]:
     low, high = axes.chain.low, axes.chain.high
-    return np.all((q >= low - 1e-9) & (q <= high + 1e-9), axis=1)
+    return np.asarray(((q >= low - 1e-9) & (q <= high + 1e-9)).all(axis=1), dtype=bool)
 
 
 def _field(axes: Parametric, q: Array, tool: Array) -> Array:
@@ -196,7 +200,7 @@ def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
     """
     J = axes.chain.machine.jacobian(q, tool)
     unseen = [axes.chain.machine.error_names.index(name) for name in axes.unseen]
-    known = np.all(J[:, :, unseen] == 0, axis=2)
+    known = np.asarray((J[:, :, unseen] == 0).all(axis=2), dtype=bool)
     if np.allclose(tool, axes.chain.reference, rtol=0, atol=1e-9):
         known[:, :3] = True
     return known
