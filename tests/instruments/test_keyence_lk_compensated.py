@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.polynomial.legendre import legvander2d
 
-from errormotion.datasets.calibration import InclinationCalibration, build
+from errormotion.datasets.calibration import InclinationCalibration, build, half_tilt, terms
 from errormotion.errors import DatasetError, InstrumentError, MethodError
 from errormotion.instruments.point_lds.compensated import CompensatedSensor
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings
@@ -30,11 +29,9 @@ def calibration() -> InclinationCalibration:
     )
     q = np.concatenate([[[0.0, 0.0]], tilt_vector(alpha, beta)])
     slope = VirtualMachine("cframe", seed=3).point_sensor.slope(q)
-    scale = math.tan(math.radians(45.0))
+    scale = math.tan(math.radians(45.0) / 2)
     degrees = np.array([(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)])
-    rows = legvander2d(*(q / scale).T, [DEGREE, DEGREE]).reshape(len(q), DEGREE + 1, DEGREE + 1)
-    rows = rows[:, degrees[:, 0], degrees[:, 1]]
-    coefficients = np.linalg.lstsq(rows, slope, rcond=None)[0]
+    coefficients = np.linalg.lstsq(terms(half_tilt(q) / scale, degrees), slope, rcond=None)[0]
     n = len(q)
     values = {
         "coefficient": coefficients,
@@ -42,6 +39,8 @@ def calibration() -> InclinationCalibration:
         "degree": degrees,
         "tilt_scale": scale,
         "mid_range": 0.0,
+        "mid_range_found": math.nan,
+        "mid_range_uncertainty": math.nan,
         "reading_low": -10e-3,
         "reading_high": 10e-3,
         "support_gap": 0.4,
@@ -50,11 +49,16 @@ def calibration() -> InclinationCalibration:
         "rotation": inclination_rotation(q)[1],
         "slope": slope,
         "slope_uncertainty": np.full(n, K_UNCERTAINTY),
+        "offset": np.zeros(n),
         "slope_predicted": slope,
         "slope_predicted_uncertainty": np.full(n, K_UNCERTAINTY),
         "setting_left_out": np.zeros(n, dtype=np.int8),
         "noise": 0.1e-6,
         "scatter": 1.0,
+        "group_setting": np.arange(n),
+        "group_depth": np.full(n, 10e-3),
+        "group_residual": np.zeros(n),
+        "group_left_out": np.zeros(n, dtype=np.int8),
         "remaining_error": K_UNCERTAINTY,
         "remaining_error_interval": [0.0, 2 * K_UNCERTAINTY],
     }
