@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from errormotion.datasets import calibration
 from errormotion.datasets.import_map import Channel, Format, ImportMap, SpeedColumn, TemperatureColumn, TimeColumn
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RAW_SCHEMAS, Row
 
@@ -34,6 +35,13 @@ def test_the_table_of_each_raw_dataset_is_the_schema(number: int) -> None:
     assert len(sections) == len(RAW_SCHEMAS)
     assert f"`{RAW_SCHEMAS[number].id}`" in sections[number]
     assert rows_of(sections[number]) == [line(row) for row in RAW_SCHEMAS[number].rows]
+
+
+def test_the_table_of_calibrations_is_the_schema() -> None:
+    section = PAGE.partition("\n## Inclination calibration")[2].partition("\n## ")[0]
+    assert rows_of(section) == [line(row) for row in calibration.ROWS]
+    for name, meaning in calibration.ATTRIBUTES.items():
+        assert f"| `{name}` | {meaning} |" in section
 
 
 def test_the_how_to_names_every_key_of_a_map() -> None:
