@@ -12,6 +12,7 @@ from scipy import stats
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.alternating import alternate
 from errormotion.methods.multilateration.drift import Drift, estimate_drift, places
 from errormotion.methods.multilateration.expansion import (
     Shared,
@@ -39,6 +40,8 @@ log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3
 """Chance at which sound readings are called noisier than stated."""
+LEAST = 10
+"""Targets that four stations need."""
 MANY_WRONG = 0.05
 """Share of readings left out above which a cause is looked for."""
 DATUM = (
@@ -76,13 +79,14 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
     error = network.target - data.nominal
     unknown = np.isnan(error[:, 0])
     covariance = np.full((*error.shape[:1], 6, 6), np.nan)
-    shared = influence[[not name.startswith("station.") for name in names]]
+    shared = influence[[not name.startswith("stations.") for name in names]]
     covariance[:, :3, :3] = found.factor**2 * network.target_covariance + np.einsum("sta,stb->tab", shared, shared)
     values = np.full((len(error), 6), np.nan)
     values[:, :3] = error
     full = np.full((*influence.shape[:2], 6), np.nan)
     full[..., :3] = np.where(unknown[:, None], np.nan, influence)
     extras = _extras(data, found)
+    extras |= _alternated(data, found, notes) if settings.alternating else {}
     extras |= _axes(raw, data, settings, error, own, influence, notes)
     for note in notes:
         log.warning(note)
@@ -206,7 +210,7 @@ def _uncertainty(found: Solution) -> tuple[Array, Array, list[str], list[str]]:
     network = found.network
     own, factor, _ = network.blocks()
     rows = [found.factor * factor.transpose(2, 0, 1)]
-    names = [f"station.{k}" for k in range(factor.shape[2])]
+    names = [f"stations.{k}" for k in range(factor.shape[2])]
     groups = ["stations"] * len(names)
     if found.scale:
         stretched, _ = network.response(np.nan_to_num(found.corrected))
@@ -250,6 +254,28 @@ def _axes(
         told = "; ".join(f"{name}: {why}" for name, why in axes.unseen.items())
         notes.append(f"Errors of the axes that these targets do not determine: {told}.")
     return parametric_extras(axes)
+
+
+def _alternated(data: Readings, found: Solution, notes: list[str]) -> dict[str, xr.DataArray]:
+    """Return what the published scheme makes of the same readings, where it can: it needs every reading."""
+    whole = np.isfinite(found.corrected).all(axis=0)
+    if np.count_nonzero(whole) < LEAST:
+        notes.append(f"The alternating scheme was left out: fewer than {LEAST} targets have all readings.")
+        return {}
+    begin = found.network.station if data.station is None else data.station
+    other = alternate(found.corrected[:, whole], data.nominal[whole], begin)
+    place = np.full(data.nominal.shape, np.nan)
+    place[whole] = other.target
+    notes.append(
+        f"The alternating scheme {'stopped' if other.converged else 'was given up'} after {other.iterations} turns, "
+        f"where the joint solution took {found.network.iterations}; a target may still go about "
+        f"{other.left * 1e6:.2g} um."
+    )
+    return {
+        "alternating_place": xr.DataArray(place, dims=("target", "direction"), attrs={"units": "m"}),
+        "alternating_iterations": xr.DataArray(other.iterations),
+        "alternating_left": xr.DataArray(other.left, attrs={"units": "m"}),
+    }
 
 
 def _steps(found: Solution, settings: Settings) -> list[str]:

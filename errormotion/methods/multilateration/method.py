@@ -39,17 +39,16 @@ class Multilateration:
 
     def acquire(
         self,
-        bench: Bench,  # noqa: ARG002 - part of the protocol
-        settings: MultilaterationSettings,  # noqa: ARG002
+        bench: Bench,
+        settings: MultilaterationSettings,
         *,
-        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002
-        done: xr.Dataset | None = None,  # noqa: ARG002
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield one raw dataset a set-up."""
-        raise MethodError(
-            "multilateration: expected an instrument of kind laser_tracker and, to move the machine, one of kind "
-            "controller; measuring with them is not there yet. Import a table of displacements, and identify it."
-        )
+        """Measure; yield one raw dataset a set-up. See ``acquisition``."""
+        from errormotion.methods.multilateration import acquisition
+
+        return acquisition.measure_stations(bench, settings, inputs, done)
 
     def append_dim(self, settings: MultilaterationSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``station``."""
@@ -57,7 +56,7 @@ class Multilateration:
 
     def progress(self, settings: MultilaterationSettings) -> float:
         """Return the number of set-ups."""
-        return float(len(settings.layout.stations))
+        return float(len(settings.measuring.sequence or settings.layout.stations))
 
     def identify(self, raw: xr.Dataset, settings: MultilaterationSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``tool`` over ``target``.
@@ -75,6 +74,7 @@ class Multilateration:
         MethodError
             The data do not determine the answer, or contradict one another.
         """
+        from errormotion.methods.multilateration.acquisition import latest
         from errormotion.methods.multilateration.identification import identify_targets
 
         settings = settings or MultilaterationSettings()
@@ -82,7 +82,7 @@ class Multilateration:
         validate(checked)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"multilateration reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        return identify_targets(checked, settings, self.info.id, self.info.version)
+        return identify_targets(latest(checked), settings, self.info.id, self.info.version)
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect of the layout."""

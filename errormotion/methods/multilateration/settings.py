@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from errormotion.datasets.units import Length, Quantity, Temperature
+from errormotion.methods.multilateration.acquisition import Measuring
 from errormotion.methods.multilateration.refraction import CO2, HELIUM_NEON
+from errormotion.methods.multilateration.sight import Planning
 from errormotion.plugins import PluginSettings
 
 Pressure = Annotated[float, Quantity("a pressure", "Pa", "1013.25 hPa")]
@@ -71,12 +73,15 @@ class Settings(PluginSettings):
 
     layout: Layout = Field(default_factory=Layout, description="the set-up that is measured, or planned")
 
+    planning: Planning = Field(default_factory=Planning, description="where the tracker may stand, and what it sees")
+    measuring: Measuring = Field(default_factory=Measuring, description="how the targets are measured")
+
     # The network
     start: Literal["nominal", "distances"] = Field(
         default="nominal", description="where stations are looked for first: their rough places, or anywhere"
     )
-    scheme: Literal["joint", "alternating"] = Field(
-        default="joint", description="stations and targets together, or in turn as published, to compare"
+    alternating: bool = Field(
+        default=False, description="also go the published way, stations and targets by turns, and set it beside"
     )
     robust: bool = Field(default=True, description="leave out readings that contradict the others, and name them")
     noise: Literal["auto", "stated"] = Field(
