@@ -20,7 +20,7 @@ from errormotion.errors import MethodError
 
 Array = NDArray[np.float64]
 
-SOME = 250
+SOME = 150
 """Readings of a station that are looked at: enough to tell where it is."""
 FLAT = 1e-3
 """Targets thinner than this share of their extent lie in a plane, or on a line."""
@@ -109,7 +109,7 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> l
         w = 1.0 / np.sqrt(1.0 + (off / (3 * typical + 1e-300)) ** 2)
     U, L, K = B @ x[:-2], x[-2], x[-1]
     if normal is None:
-        return [*guesses, np.append(U, L - middle)]
+        return [np.append(U, L - middle), *guesses]
     height = np.sqrt(max(L**2 - K - U @ U, 0.0))
     if rough is None and height > FLAT * np.linalg.norm(u, axis=1).max():
         raise MethodError(
@@ -117,8 +117,8 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> l
             "do not tell on which side of it a station stands; state roughly where the stations are, or measure "
             "targets off that plane"
         )
-    sides = (1.0,) if rough is None else (np.sign(normal @ rough) or 1.0,)
-    return [*guesses, *(np.append(U + side * height * normal, L - middle) for side in sides)]
+    side = -1.0 if rough is not None and normal @ rough < 0 else 1.0
+    return [np.append(U + side * height * normal, L - middle), *guesses]
 
 
 def _from_few(d: Array, u: Array) -> list[Array]:
@@ -140,7 +140,11 @@ def _reversed(d: Array, u: Array, found: Array, scale: float) -> bool:
 
 def _best(guesses: list[Array], d: Array, u: Array) -> tuple[Array, float]:
     """Return the best (U, L) from some guesses, and the robust scale of its residuals, m."""
-    found = [_sharpened(guess, d, u) for guess in guesses]
+    enough, found = 0.1 * FITS * float(np.linalg.norm(np.ptp(u, axis=0))), []
+    for guess in guesses:
+        found.append(_sharpened(guess, d, u))
+        if found[-1][1] < enough:
+            break
     return min(found, key=lambda each: each[1])
 
 
@@ -166,7 +170,8 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
                 break
             continue
         mu = 0.1 * mu if mu > 1e-3 else 0.0
-        settled = mu == 0.0 and np.linalg.norm(step) < 1e-3 * scale + 1e-9
+        # A start need not be sharper than this.
+        settled = mu == 0.0 and size > 0.98 * scale
         x, r, J, scale = x + step, tried, J_tried, size
         if settled:
             break
