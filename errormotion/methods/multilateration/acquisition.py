@@ -227,9 +227,9 @@ class Stand:
         self.place(number)
         start = datetime.now(UTC).isoformat(timespec="seconds")
         setup = SetUp(self, number)
-        found: dict[int, dict[int, tuple[float, Any]]] = {}
+        found: dict[int, dict[int, tuple[float, Any]]] = {}  # by dead path, then by target
         reasons: dict[int, str] = {}
-        queue, renewals, current = deque(self.order), 0, None
+        queue, last = deque(self.order), 0
         while queue:
             i = queue.popleft()
             self.move(i)
@@ -238,12 +238,10 @@ class Stand:
                 reasons[i] = reading.reason or NO_VALUE
                 continue
             count = int(getattr(reading, "dead_path", 0))
-            before = set(found.get(current, ())) if current is not None else set()
+            if found and count not in found and len(found) <= self.measuring.renewals:
+                queue.extend(k for k in self.order if k in found[last])
             found.setdefault(count, {})[i] = (self.now(), reading)
-            if current is not None and count != current and renewals < self.measuring.renewals:
-                renewals += 1
-                queue.extend(k for k in self.order if k in before and k != i)
-            current = count
+            last = count
         kept = max(found.values(), key=len, default={})
         invalid = Counter(reasons.get(i, LOST) for i in self.order if i not in kept)
         return self._dataset(number, kept, invalid, start)
@@ -376,6 +374,6 @@ class SetUp:
         ):
             names = self.stand.names
             raise MethodError(
-                f"Set-up {names[self.number]}: the tracker stands near ({here[0]:.2f}, {here[1]:.2f}, {here[2]:.2f}) m, "
-                f"which is the place of {names[nearest]}. Put it to its place and resume, or correct layout.stations."
+                f"Set-up {names[self.number]}: the tracker stands near ({here[0]:.2f}, {here[1]:.2f}, {here[2]:.2f}) "
+                f"m, the place of {names[nearest]}. Put it to its place and resume, or correct layout.stations."
             )

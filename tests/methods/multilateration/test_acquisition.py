@@ -1,0 +1,324 @@
+"""Measuring from several stations, with a machine and a tracker that do what real ones do."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration import layout
+from errormotion.methods.multilateration.acquisition import Measuring, latest, measure_stations
+from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.solver import solve
+
+STATIONS = ((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5))
+LAYOUT = {"low": (-0.1, -0.1, 0.0), "high": (0.1, 0.1, 0.2), "count": (3, 3, 2), "stations": STATIONS}
+REFLECTOR = (0.02, -0.01, -0.08)
+QUICK = Measuring(settle=0.25, returns=2)
+NOISE, BULGE = 0.2e-6, 2e-3  # 1/m: the machine is wrong by up to some 0.1 mm
+
+
+def settings(**changes):
+    return Settings(layout=LAYOUT | {"reflector": REFLECTOR} | changes)
+
+
+def true_place(position):
+    """Return where the reflector is: the commanded place, and errors that no rigid motion takes away."""
+    x, y, z = position
+    return np.array(position) + REFLECTOR + BULGE * np.array([x * y, y * z, x * x])
+
+
+class Machine:
+    """Goes where it is told, with a clock of its own."""
+
+    def __init__(self):
+        self.place, self.time, self.path = np.zeros(3), 0.0, []
+
+    def move_to(self, position, feed=None):
+        self.place = np.array(position, float)
+        self.path.append(tuple(position))
+        self.time += 1.0
+
+    def elapse(self, seconds):
+        self.time += seconds
+
+    def state(self):
+        return {"position": list(self.place), "time": self.time, "running": False}
+
+
+class Tracker:
+    """An interferometer that follows its reflector, upright at a station and turned by any angle.
+
+    ``broken`` lists the measurements, counted from 0, before which the beam breaks; ``shadow`` the targets (as
+    commanded, by set-up) that it never sees.
+    """
+
+    info = SimpleNamespace(id="tracker")
+    settings = SimpleNamespace(noise=NOISE)
+    distance_is_displacement = True
+
+    def __init__(self, bench, broken=(), shadow=(), air=True):
+        self.bench, self.broken, self.shadow, self.air = bench, set(broken), set(shadow), air
+        self.rng = np.random.default_rng(7)
+        self.count, self.number, self.locked, self.last, self.asked = 0, 0, True, None, 0.003
+
+    def place_at(self, station):
+        self.station, self.turn = np.array(station), self.rng.uniform(-3, 3)
+        self.rise()
+
+    def rise(self):
+        self.number, self.locked, self.dead = self.number + 1, True, self.rng.uniform(-0.01, 0.01)
+
+    def measure(self, target=None):
+        if self.count in self.broken:
+            self.locked = False
+        self.count += 1
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        way = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ (true_place(self.bench.machine_.place) - self.station)
+        if (self.bench.asked_for, tuple(np.round(self.bench.machine_.place, 6))) in self.shadow:
+            self.locked = False
+            return self.answer(None, "beam broken")
+        if not self.locked:
+            if target is None or np.linalg.norm(np.array(target) - way) > 0.05:
+                return self.answer(None, "beam broken")
+            self.rise()
+        return self.answer(way, "")
+
+    def answer(self, way, reason):
+        length = np.nan if way is None else np.linalg.norm(way)
+        distance = length + self.dead + NOISE * self.rng.normal()
+        place = (np.nan,) * 3 if way is None else tuple(way * distance / length)
+        air = SimpleNamespace(temperature=21.0, pressure=100800.0, humidity=43.0 if self.air else np.nan)
+        return SimpleNamespace(
+            distance=distance, position=place, environment=air, refraction_index=1.00027 if self.air else np.nan,
+            valid=way is not None, reason=reason, dead_path=self.number,
+        )  # fmt: skip
+
+
+class Bench:
+    machine = "a machine"
+
+    def __init__(self, moved=True, **tracker):
+        self.machine_, self.moved = Machine(), moved
+        self.tracker = Tracker(self, **tracker)
+        self.messages, self.asked_for = [], 0
+
+    def has_kind(self, kind):
+        return kind in ("laser_tracker", "controller")
+
+    def of_kind(self, kind):
+        return self.tracker if kind == "laser_tracker" else self.machine_
+
+    def ask(self, message):
+        self.messages.append(message)
+        self.asked_for = int(message.split("Station S")[1][0])
+        if self.moved or not hasattr(self.tracker, "station"):
+            self.tracker.place_at(STATIONS[self.asked_for - 1])
+
+
+def joined(chunks):
+    raw = xr.concat(chunks, dim="station", data_vars="minimal", coords="minimal", compat="override", join="exact")
+    return raw.drop_attrs(deep=False).assign_attrs({k: v for k, v in chunks[0].attrs.items() if k != "invalid"})
+
+
+def measured(bench, measuring=QUICK, done=None, **changes):
+    return list(measure_stations(bench, settings(**changes), {}, done, measuring))
+
+
+def position_of(k):
+    return tuple(np.round(layout.grid(settings().layout)[0][k], 6))
+
+
+def test_each_station_gives_a_dataset_and_together_they_tell_the_errors():
+    bench = Bench()
+    chunks = measured(bench)
+    assert [list(chunk["station"].values) for chunk in chunks] == [["S1"], ["S2"], ["S3"], ["S4"]]
+    raw = joined(chunks)
+    datasets.validate(raw)
+    assert raw["displacement"].shape == (4, 18 + 2)
+    network = solve(
+        raw["displacement"].values, raw["target_nominal"].values, raw["station_nominal"].values, noise=NOISE
+    )
+    true = np.array([true_place(q) for q in (raw["target_nominal"] - raw["reflector"]).values])
+    nominal = raw["target_nominal"].values
+    lever = nominal - nominal.mean(axis=0)
+    G = np.concatenate([np.broadcast_to(np.eye(3), (20, 3, 3)), -np.cross(lever[:, None], np.eye(3)).swapaxes(1, 2)], 2)
+    G = G.reshape(-1, 6)
+    error = (true - nominal).ravel()
+    error -= G @ np.linalg.lstsq(G, error)[0]
+    miss = (network.target - nominal).ravel() - error
+    spread = np.sqrt(np.diagonal(network.target_covariance, axis1=1, axis2=2)).ravel()
+    # 60 numbers, and the fitted rotation is small but not infinitely so: its square times 0.2 m is far below 1e-8 m.
+    assert np.all(np.abs(miss) < 4.5 * spread + 1e-8)
+    assert np.abs(error).max() > 20 * spread.max()
+
+
+def test_operator_is_asked_for_every_station_with_the_machine_at_its_first_target():
+    bench = Bench()
+    measured(bench)
+    assert len(bench.messages) == 4
+    assert "S2: put the tracker near (350, -300, 50) mm" in bench.messages[1]
+
+
+def test_a_control_that_can_place_the_tracker_does_and_nobody_is_asked():
+    bench = Bench()
+    bench.machine_.set_station = lambda place: (bench.tracker.place_at(place), setattr(bench, "asked_for", 1))
+    chunks = measured(bench)
+    assert len(chunks) == 4
+    assert not bench.messages
+
+
+def test_machine_rests_before_it_is_measured_and_goes_to_neighbours():
+    bench = Bench()
+    raw = measured(bench)[0]
+    times = np.sort(raw["reading_time"].values[0])
+    np.testing.assert_allclose(np.diff(times), 1.25)  # the fake takes 1 s to move, and 0.25 s are waited
+    path = np.array(bench.machine_.path[1:19])
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() <= 0.2 + 1e-12
+
+
+def test_targets_are_visited_again_at_the_end():
+    raw = measured(Bench())[0]
+    nominal, times = raw["target_nominal"].values, raw["reading_time"].values[0]
+    for k in (18, 19):
+        first = np.flatnonzero((nominal[:18] == nominal[k]).all(axis=1))
+        assert first.size == 1
+        assert times[k] > times[:18].max() > times[first[0]]
+
+
+def test_air_is_recorded_where_the_tracker_tells_it():
+    raw = measured(Bench())[0]
+    assert float(raw["relative_humidity"][0, 0]) == pytest.approx(0.43)
+    assert float(raw["refractive_index"][0, 0]) == pytest.approx(1.00027)
+    without = measured(Bench(air=False))[0]
+    assert "air_temperature" not in without
+    assert "refractive_index" not in without
+
+
+def test_a_weather_station_that_falls_silent_stops_the_measurement():
+    bench = Bench()
+    chunks = measure_stations(bench, settings(), {}, None, QUICK)
+    next(chunks)
+    bench.tracker.air = False
+    with pytest.raises(MethodError, match="no longer tells the state of the air"):
+        next(chunks)
+
+
+def test_after_a_broken_beam_the_count_is_one_again_for_all_targets():
+    bench = Bench(broken=[6])
+    raw = measured(bench)[0]
+    d = raw["displacement"].values[0]
+    assert np.isfinite(d).all()
+    assert raw.attrs["invalid"] == {}
+    true = np.array(
+        [np.linalg.norm(true_place(q) - STATIONS[0]) for q in (raw["target_nominal"] - raw["reflector"]).values]
+    )
+    assert np.ptp(d - true) < 10 * NOISE  # dead paths differ by millimetres
+
+
+def test_a_target_that_is_never_seen_is_nan_and_says_why():
+    bench = Bench(shadow=[(1, position_of(5))])
+    raw = measured(bench)[0]
+    d = raw["displacement"].values[0]
+    lost = np.isnan(d)
+    assert lost[5]
+    assert np.count_nonzero(lost) <= 2  # a return to it is no better
+    assert raw.attrs["invalid"] == {"beam broken": int(np.count_nonzero(lost))}
+
+
+def test_a_beam_that_breaks_all_the_time_leaves_the_longest_count():
+    bench = Bench(broken=[5, 9, 20, 40])
+    raw = measured(bench, Measuring(settle=0.0, returns=0, renewals=0, repeats=0))[0]
+    d = raw["displacement"].values[0]
+    kept = np.isfinite(d)
+    assert 0 < np.count_nonzero(kept) < 18
+    assert raw.attrs["invalid"] == {"count lost": int(np.count_nonzero(~kept))}
+    true = np.array(
+        [np.linalg.norm(true_place(q) - STATIONS[0]) for q in (raw["target_nominal"] - raw["reflector"]).values]
+    )
+    assert np.ptp((d - true)[kept]) < 10 * NOISE
+
+
+def test_a_poor_set_up_is_repeated_and_the_last_one_counts():
+    class Awkward(Bench):
+        def ask(self, message):
+            super().ask(message)
+            # Somebody stands in the way of the first set-up at S2.
+            in_the_way = self.asked_for == 2 and sum("Station S2" in text for text in self.messages) == 1
+            self.tracker.shadow = {(2, position_of(k)) for k in range(8)} if in_the_way else set()
+
+    chunks = measured(Awkward())
+    assert [str(chunk["station"].values[0]) for chunk in chunks] == ["S1", "S2", "S2", "S3", "S4"]
+    raw = latest(joined(chunks))
+    assert list(raw["station"].values) == ["S1", "S2", "S3", "S4"]
+    assert np.isfinite(raw["displacement"].values).all()
+    assert np.isnan(chunks[1]["displacement"].values).sum() >= 8
+
+
+def test_a_station_may_come_again_and_replaces_the_earlier():
+    chunks = measured(Bench(), Measuring(settle=0.0, returns=0, sequence=(1, 2, 3, 4, 2)))
+    raw = joined(chunks)
+    assert list(raw["station"].values) == ["S1", "S2", "S3", "S4", "S2"]
+    np.testing.assert_array_equal(latest(raw)["displacement"].values[-1], raw["displacement"].values[4])
+    with pytest.raises(MethodError, match=r"from 1 to 4; found \[5\]"):
+        measured(Bench(), Measuring(sequence=(1, 5)))
+
+
+def test_an_interrupted_run_goes_on_behind_what_it_holds():
+    chunks = measured(Bench())
+    bench = Bench()
+    rest = measured(bench, done=joined(chunks[:2]))
+    assert [str(chunk["station"].values[0]) for chunk in rest] == ["S3", "S4"]
+    assert len(bench.messages) == 2
+    assert measured(Bench(), done=joined(chunks)) == []
+    with pytest.raises(MethodError, match=r"go on with S1; expected S2"):
+        measured(Bench(), Measuring(sequence=(2, 1)), done=joined(chunks[:1]))
+
+
+def test_a_poor_set_up_at_the_end_of_what_is_held_is_repeated():
+    chunks = measured(Bench(), Measuring(settle=0.0, returns=0))
+    poor = chunks[1].copy(deep=True)
+    poor["displacement"][:, :9] = np.nan
+    rest = measured(Bench(), Measuring(settle=0.0, returns=0), done=joined([chunks[0], poor]))
+    assert [str(chunk["station"].values[0]) for chunk in rest] == ["S2", "S3", "S4"]
+
+
+def test_a_tracker_that_was_not_moved_is_found_out():
+    with pytest.raises(MethodError, match=r"Set-up S2: the tracker stands near \(-0\.3., -0\.3., .*place of S1"):
+        measured(Bench(moved=False))
+
+
+def test_a_machine_that_does_not_arrive_is_named():
+    bench = Bench()
+    bench.machine_.move_to = lambda position, feed=None: None
+    with pytest.raises(MethodError, match=r"Target 1: the control is \d+ mm off after 0\.1 s"):
+        measured(bench, Measuring(timeout=0.1))
+
+
+def test_instruments_that_cannot_do_it_are_refused_before_anything_moves():
+    bench = Bench()
+    bench.has_kind = lambda kind: kind == "laser_tracker"
+    with pytest.raises(MethodError, match="kind 'controller'"):
+        measured(bench)
+    bench = Bench()
+    bench.tracker = SimpleNamespace(read=lambda: 0.0)
+    with pytest.raises(MethodError, match="measures one target at a time"):
+        measured(bench)
+    assert bench.machine_.path == []
+
+
+def test_absolute_distances_need_no_renewal():
+    bench = Bench(broken=[6])
+    bench.tracker.distance_is_displacement = False
+    rise = bench.tracker.rise
+
+    def absolute():
+        rise()
+        bench.tracker.number, bench.tracker.dead = 0, 1e-4
+
+    bench.tracker.rise = absolute
+    raw = measured(bench)[0]
+    assert np.isfinite(raw["displacement"].values).all()
+    assert len(bench.machine_.path) == 4 * (20 + 1)  # no target came twice
