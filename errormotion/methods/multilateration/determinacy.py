@@ -67,14 +67,14 @@ def refuse_too_few(weight: Array, unknown: int) -> None:
 
 
 def refuse_loose(information: Array, basis: Array, stations: Stations, target: Array, rough: Array) -> Array:
-    """Return the eigenvalues of the stations' information; raise MethodError where a freedom is loose.
+    """Raise MethodError where a freedom is loose; else return eigenvalues of the information, its diagonal made 1.
 
     Parameters
     ----------
     information : ndarray (p, p)
         1/m^2, within the columns of ``basis``.
     basis : ndarray (4 n + k, p)
-        Orthonormal.
+        In the datum of the targets: a station that is loose alone then moves alone.
     stations : Stations
         Where they were found.
     target : ndarray (m, 3)
@@ -82,15 +82,17 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     rough : ndarray (n, 3)
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
-    values, vectors = np.linalg.eigh(information)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     centre = target.mean(axis=0)
     distance = float(np.sqrt(np.mean(np.sum((stations.place - centre) ** 2, axis=1))))
-    sigma = 1.0 / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    motions = basis @ (scale[:, None] * vectors) / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    sigma = np.linalg.norm(motions[: 4 * len(stations.place)], axis=0)
     loose = (values < DIGITS * values[-1]) | (sigma > LOOSE * distance)
     if not loose.any():
         return np.asarray(values, dtype=float)
     k = int(np.count_nonzero(loose))
-    freedoms = "; ".join(describe(basis @ vectors[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
+    freedoms = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
     raise MethodError(
         f"expected places of stations and targets whose distances fix them all, found {k} "
@@ -162,6 +164,16 @@ def _reason(place: Array, target: Array) -> str:
     if not found:
         found.append("spread stations and targets wider and in all three directions, or measure more targets")
     return "; ".join(found)
+
+
+def refuse_flat(determined: int, rough: Array, target: Array) -> None:
+    """Raise MethodError where fewer than three targets have a place of their own: nothing carries the datum."""
+    if determined < 3:
+        raise MethodError(
+            f"expected stations that see the targets from all sides, found {determined} of {len(target)} targets whose "
+            f"distances determine a place: all others lie in one plane with the stations that see them. What is "
+            f"special: {_reason(rough, target)}"
+        )
 
 
 def weak_layout(covariance: Array, weight: Array, place: Array, target: Array) -> list[str]:

@@ -80,7 +80,8 @@ class Network:
     converged : bool
         Whether the last step was below the tolerance.
     condition : float
-        Of the stations' information, largest over smallest eigenvalue of what distances can determine.
+        Of the stations' information, its diagonal scaled to 1: largest over smallest eigenvalue of what distances can
+        determine.
     notes : tuple of str
         What a person should know.
     """

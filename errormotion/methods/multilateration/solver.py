@@ -308,15 +308,18 @@ def conclude(problem: Problem, state: State, rough: Array) -> Network:
     centre = target[used].mean(axis=0)
     Z = problem.basis(stations, centre)
     sums = problem.reduce(stations, target)
+    GG, GDG, GF = datum_sums(problem.weight, stations.place, problem.extra, target, centre)
+    determinacy.refuse_flat(round(GG[0, 0]), rough, target[used])
+    H: Array = np.asarray(np.linalg.inv(GG), dtype=np.float64)
+    T = stations.motions(centre)
     information = Z.T @ sums.H @ Z
-    values = determinacy.refuse_loose(information, Z, stations, target[used], rough)
+    values = determinacy.refuse_loose(information, Z - T @ (H @ GF @ Z), stations, target[used], rough)
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
-    datum = _datum(problem, stations, target, centre, W)
+    datum = Datum(centre, W, H @ GF @ W, H, H @ GDG @ H)
     covariance, residual, redundancy = examine(
         problem.reading, problem.weight, stations.place, stations.dead_path, problem.extra, stations.value, target,
         datum.centre, W, datum.shift, datum.H, datum.K,
     )  # fmt: skip
-    T = stations.motions(centre)
     F = W - T @ datum.shift
     joint = F @ F.T + T @ datum.K @ T.T
     known = int(np.count_nonzero(problem.free & (problem.precision > 0)))
@@ -336,9 +339,3 @@ def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.b
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     moved = (target - a) @ R.T + b
     return replace(stations, place=(stations.place - a) @ R.T + b), np.ascontiguousarray(moved)
-
-
-def _datum(problem: Problem, stations: Stations, target: Array, centre: Array, W: Array) -> Datum:
-    GG, GDG, GF = datum_sums(problem.weight, stations.place, problem.extra, target, centre)
-    H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
-    return Datum(centre, W, H @ GF @ W, H, H @ GDG @ H)

@@ -195,7 +195,7 @@ def _what_is_wrong(j: int, d: Array, u: Array, extent: float, scale: float) -> s
     for k, name in ((1e3, "millimetres given as metres"), (1e6, "micrometres given as metres"),
                     (1e-3, "targets in millimetres given as metres"), (2.0, "the double path counted as a single one"),
                     (0.5, "half of the path counted")):  # fmt: skip
-        if abs(factor / k - 1) < 0.2:
+        if abs(factor / k - 1) < 0.2 and _best(_guesses(d / k, u, None, None), d / k, u)[1] < FITS * extent:
             return f"{text}; they are about {k:g} times what they should be: it looks like {name}"
     if reversed_sign or scale < FITS * extent:
         return f"{text}; they fit with their sign reversed: a displacement grows as the target moves away"

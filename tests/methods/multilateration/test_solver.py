@@ -1,0 +1,310 @@
+"""Targets and stations from displacements: exact on exact ones, best on noisy ones, honest about their worth."""
+
+import numba
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.stats import chi2, norm
+
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.bound import bound, relative_bound
+from errormotion.methods.multilateration.model import Stations, jacobian, motions, readings
+from errormotion.methods.multilateration.solver import solve
+
+# Around a cube of 100 mm, at distances like its size: the linear regime at 1 um.
+NEAR = np.array(
+    [
+        [-0.15, -0.15, -0.1],
+        [0.16, -0.13, 0.02],
+        [0.0, 0.17, -0.05],
+        [0.02, 0.01, 0.2],
+        [0.18, 0.1, 0.1],
+        [-0.1, 0.1, 0.2],
+    ]
+)
+NOISE = 1e-6
+
+
+def nominal_targets(m, seed=5):
+    return np.random.default_rng(seed).uniform(-0.05, 0.05, (m, 3))
+
+
+def measured(target, station, noise=0.0, seed=0, dead_path=0.3):
+    L = dead_path + 0.01 * np.arange(len(station))
+    d = readings(target, Stations(station, L, np.zeros(0)))
+    return d + np.random.default_rng([7, seed]).normal(0.0, 1.0, d.shape) * noise
+
+
+def dense_covariance(target, station, weight):
+    """Covariance of (targets, stations) under inner constraints on the targets, from the full bordered system."""
+    m, n = len(target), len(station)
+    known = weight > 0
+    stations = Stations(station, np.zeros(n), np.zeros(0))
+    J = jacobian(target, stations, known).toarray() * weight.T[known.T][:, None]
+    centre = target.mean(axis=0)
+    size = np.sqrt(np.mean((target - centre) ** 2))
+    G = np.zeros((3 * m + 4 * n, 6))
+    G[: 3 * m] = motions(target, centre).reshape(3 * m, 6) / [1, 1, 1, size, size, size]
+    # Scaled to one, so that the bordered matrix loses no digits.
+    s = np.linalg.norm(J)
+    N = np.block([[J.T @ J / s**2, G], [G.T, np.zeros((6, 6))]])
+    return np.linalg.inv(N)[: 3 * m + 4 * n, : 3 * m + 4 * n] / s**2
+
+
+@pytest.mark.parametrize("n", [4, 5, 6])
+def test_exact_distances_give_exact_places(n):
+    u = nominal_targets(25)
+    shifted = u + np.random.default_rng(1).normal(0, 20e-6, u.shape)
+    network = solve(measured(shifted, NEAR[:n]), u, NEAR[:n] + 5e-3, noise=NOISE)
+    # The network is only known but for a motion of the whole: distances between targets are what must agree.
+    between = np.linalg.norm(network.target[:, None] - network.target, axis=-1)
+    assert np.abs(between - np.linalg.norm(shifted[:, None] - shifted, axis=-1)).max() < 1e-12
+    assert network.converged
+
+
+@pytest.mark.parametrize("n", [4, 5])
+def test_agrees_with_a_dense_least_squares_solver(n):
+    u, U = nominal_targets(15), NEAR[:n]
+    d = measured(u, U, NOISE)
+    network = solve(d, u, U, noise=NOISE, robust=False)
+    stations = Stations(U, np.zeros(n), np.zeros(0))
+    known = np.ones(d.shape, dtype=bool)
+
+    def unpack(x):
+        s = x[45:].reshape(n, 4)
+        return x[:45].reshape(15, 3), Stations(s[:, :3], s[:, 3], np.zeros(0))
+
+    def off(x):
+        return (readings(*unpack(x)) - d).T.ravel() / NOISE
+
+    start = np.concatenate([network.target.ravel() + 1e-6, np.column_stack([U, network.dead_path]).ravel()])
+    found = least_squares(
+        off,
+        start,
+        lambda x: jacobian(*unpack(x), known).toarray() / NOISE,
+        x_scale=0.1,
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
+    target, _ = unpack(found.x)
+    between = np.linalg.norm(network.target[:, None] - network.target, axis=-1)
+    assert np.abs(between - np.linalg.norm(target[:, None] - target, axis=-1)).max() < 1e-11
+    assert network.sigma0 == pytest.approx(np.sqrt(2 * found.cost / network.freedom), rel=1e-9)
+    assert network.freedom == 15 * (n - 3) - (4 * n - 6)
+    assert stations.place.shape == network.station.shape
+
+
+def test_a_free_network_lies_on_the_nominal_targets():
+    u = nominal_targets(40)
+    true = u + np.random.default_rng(1).normal(0, 20e-6, u.shape)
+    # Where the whole stands and how it is turned cannot be seen in distances.
+    c, s = np.cos(0.3), np.sin(0.3)
+    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    d = measured(true @ R.T + 0.7, NEAR[:4] @ R.T + 0.7, NOISE)
+    network = solve(d, u, noise=NOISE)
+    error = network.target - u
+    assert np.abs(error.mean(axis=0)).max() < 1e-14
+    # The best rotation is the one that no infinitesimal one improves.
+    assert np.abs(np.cross(u - u.mean(axis=0), error).mean(axis=0)).max() < 1e-14
+    assert np.sqrt(np.mean((error - (true - u)) ** 2)) < 10e-6
+
+
+@pytest.mark.parametrize(("n", "missing"), [(4, 0), (4, 6), (6, 20)])
+def test_covariances_are_those_of_the_full_system(n, missing):
+    u = nominal_targets(20)
+    rng = np.random.default_rng(3)
+    noise = rng.uniform(0.5e-6, 2e-6, (n, 20))
+    seen = np.ones((n, 20), dtype=bool)
+    for i in rng.choice(20, missing, replace=False):
+        seen[rng.integers(n), i] = False
+    network = bound(u, NEAR[:n], noise=noise, seen=seen)
+    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0))
+    scale = np.abs(C[:60, :60]).max()
+    blocks = C[:60, :60].reshape(20, 3, 20, 3)[np.arange(20), :, np.arange(20)]
+    # Eight digits: the condition of the bordered system is its square.
+    assert np.abs(network.target_covariance - blocks).max() < 1e-8 * scale
+    assert np.abs(network.covariance() - C[:60, :60]).max() < 1e-8 * scale
+    assert np.abs(network.joint_covariance - C[60:, 60:]).max() < 1e-8 * np.abs(C[60:, 60:]).max()
+
+
+def test_redundancies_are_those_of_the_hat_matrix():
+    u = nominal_targets(14)
+    network = bound(u, NEAR[:5], noise=NOISE)
+    J = jacobian(u, network.stations, np.ones((5, 14), dtype=bool)).toarray() / NOISE
+    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE)) @ J.T
+    assert np.abs(network.redundancy.T.ravel() - (1 - np.diag(hat))).max() < 1e-6
+    assert network.redundancy.sum() == pytest.approx(network.freedom, rel=1e-8)
+
+
+def test_influence_and_own_parts_make_the_covariance_of_many_targets():
+    u = nominal_targets(2000)
+    network = bound(u, NEAR[:4], noise=NOISE)
+    F = network.influence()
+    some = np.array([3, 700, 1500])
+    joint = network.covariance(some).reshape(3, 3, 3, 3)
+    between = np.einsum("pa,pb->ab", F[:, 3], F[:, 700])
+    # But for the datum's small terms, 6 / (3 m) of a target's own covariance.
+    assert np.abs(joint[0, :, 1] - between).max() < 6 / (3 * 2000) * 5 * np.abs(joint[0, :, 0]).max()
+
+
+def test_states_what_it_is_worth():
+    u, seeds = nominal_targets(40), 60
+    truth = bound(u, NEAR[:4], noise=NOISE)
+    targets, stations, squares = [], [], []
+    for seed in range(seeds):
+        network = solve(measured(u, NEAR[:4], NOISE, seed), u, noise=NOISE)
+        targets.append(network.target - u)
+        stations.append(network.station - NEAR[:4])
+        squares.append(network.sigma0**2 * network.freedom)
+    targets, stations = np.array(targets), np.array(stations)
+    inside = np.abs(targets) < norm.isf(0.025) * np.sqrt(np.diagonal(truth.target_covariance, axis1=1, axis2=2))
+    # 7200 values in some 60 x 114 independent ones: the share scatters by 0.3 %.
+    assert abs(inside.mean() - 0.95) < 4 * np.sqrt(0.95 * 0.05 / (seeds * 114))
+    values, vectors = np.linalg.eigh(truth.covariance())
+    free = values > 1e-6 * values[-1]
+    assert np.count_nonzero(free) == 120 - 6
+    # All errors at once, with all their correlations: chi squared.
+    white = targets.reshape(seeds, -1) @ vectors[:, free] / np.sqrt(values[free])
+    assert chi2.sf(np.sum(white**2), white.size) > 1e-4
+    assert chi2.cdf(np.sum(white**2), white.size) > 1e-4
+    # Residuals: 40 equations, 10 unknowns of the stations.
+    assert 1e-4 < chi2.cdf(np.sum(squares), 30 * seeds) < 1 - 1e-4
+    places = stations / np.sqrt(np.diagonal(truth.station_covariance, axis1=1, axis2=2))
+    # 12 coordinates that share 10 freedoms, the weakest of them much: as if 60 x 4 independent ones.
+    assert abs(np.mean(np.abs(places) < norm.isf(0.025)) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / (seeds * 4))
+
+
+def test_the_relative_formulation_costs_what_it_says():
+    u, seeds = nominal_targets(40), 60
+    covariance, _, stated = relative_bound(u, NEAR[:4], noise=NOISE)
+    free = bound(u, NEAR[:4], noise=NOISE)
+    variance = np.trace(covariance, axis1=1, axis2=2)
+    # Never better than the bound, and never as good as it says itself.
+    assert (variance > np.trace(free.target_covariance, axis1=1, axis2=2) * (1 - 1e-9)).all()
+    assert (variance > np.trace(stated.target_covariance, axis1=1, axis2=2) * (1 - 1e-9)).all()
+    noise = np.full((4, 40), NOISE)
+    noise[:, 0] *= 1e-3
+    found = []
+    for seed in range(seeds):
+        network = solve(measured(u, NEAR[:4], NOISE, seed), u, noise=noise, robust=False)
+        found.append(np.sum((network.target - u) ** 2))
+    # The sum of 120 correlated squares scatters by some 20 % from draw to draw.
+    assert np.mean(found) == pytest.approx(variance.sum(), rel=4 * 0.25 / np.sqrt(seeds))
+
+
+def test_has_the_same_bits_on_any_number_of_threads():
+    u = nominal_targets(5000)
+    d = measured(u, NEAR[:4], NOISE)
+    d[1, 77] = np.nan
+    threads, found = numba.get_num_threads(), []
+    try:
+        for count in {1, threads}:
+            numba.set_num_threads(count)
+            found.append(solve(d, u, NEAR[:4], noise=NOISE))
+    finally:
+        numba.set_num_threads(threads)
+    for name in ("target", "station", "target_covariance", "joint_covariance", "residual"):
+        assert np.array_equal(getattr(found[0], name), getattr(found[-1], name), equal_nan=True), name
+
+
+def test_four_stations_have_no_way_of_their_own():
+    # A further parameter that is held at 0 makes the general elimination do the work of the four's.
+    u = nominal_targets(200)
+    d = measured(u, NEAR[:4], NOISE)
+    d[2, [5, 9]] = np.nan
+    own = solve(d, u, NEAR[:4], noise=NOISE)
+    general = solve(d, u, NEAR[:4], noise=NOISE, extra=np.ones((1, 4, 200)), extra_prior=[1e-15])
+    assert np.abs(own.target - general.target).max() < 1e-12
+    assert np.abs(own.target_covariance / general.target_covariance - 1).max() < 1e-5
+
+
+def test_missing_distances_cost_what_the_bound_says():
+    u = nominal_targets(30)
+    d = measured(u, NEAR[:4], NOISE)
+    d[:2, 4], d[3, 11], d[0, 20] = np.nan, np.nan, np.nan
+    network = solve(d, u, noise=NOISE)
+    assert np.isnan(network.target[4]).all()
+    assert np.isnan(network.target_covariance[4]).all()
+    assert np.isfinite(np.delete(network.target, 4, axis=0)).all()
+    # Three distances give a place, but say nothing about the stations.
+    assert network.freedom == 30 - 3 - 10
+    assert network.uncertainty[11] > np.nanmedian(network.uncertainty)
+    assert any("no place (1 of them): 5" in note for note in network.notes)
+
+
+def test_a_worse_station_counts_less():
+    u = nominal_targets(60)
+    sigma = np.array([1e-6, 1e-6, 1e-6, 1e-6, 20e-6])
+    d = measured(u, NEAR[:5], sigma[:, None])
+    network = solve(d, u, noise=sigma)
+    assert network.sigma0 == pytest.approx(1.0, abs=4 / np.sqrt(2 * network.freedom))
+    four = bound(u, NEAR[:4], noise=NOISE).uncertainty
+    assert (network.uncertainty < four * (1 + 1e-9)).all()
+    assert (network.uncertainty > bound(u, NEAR[:5], noise=NOISE).uncertainty).all()
+
+
+def test_known_dead_paths_make_better_targets():
+    u = nominal_targets(40)
+    d = measured(u, NEAR[:4], NOISE)
+    true = 0.3 + 0.01 * np.arange(4)
+    free = solve(d, u, noise=NOISE)
+    roughly = solve(d, u, noise=NOISE, dead_path=(true, np.full(4, 2e-6)))
+    fixed = solve(d, u, noise=NOISE, dead_path=(true, np.zeros(4)))
+    forgotten = solve(d, u, noise=NOISE, dead_path=(true, np.full(4, np.inf)))
+    assert np.array_equal(fixed.dead_path, true)
+    assert fixed.uncertainty.mean() < roughly.uncertainty.mean() < free.uncertainty.mean()
+    assert np.abs(forgotten.target - free.target).max() < 1e-12
+    assert fixed.freedom == free.freedom + 4 == roughly.freedom
+
+
+def test_a_further_parameter_is_found_with_its_uncertainty():
+    u = nominal_targets(80)
+    # One station's displacements are off in proportion to the time of the reading.
+    time = np.zeros((1, 4, 80))
+    time[0, 1] = np.linspace(0, 1, 80)
+    found = []
+    for seed in range(40):
+        d = measured(u, NEAR[:4], NOISE, seed) + 7e-6 * time[0]
+        network = solve(d, u, noise=NOISE, extra=time)
+        found.append((network.stations.value[0] - 7e-6) / np.sqrt(network.joint_covariance[-1, -1]))
+    assert 1e-4 < chi2.cdf(np.sum(np.square(found)), 40) < 1 - 1e-4
+
+
+def test_response_foretells_what_a_change_of_readings_does():
+    u = nominal_targets(40)
+    d = measured(u, NEAR[:4], NOISE)
+    d[1, 3] = np.nan
+    before = solve(d, u, noise=NOISE, robust=False)
+    change = 2e-6 * np.cos(np.arange(160.0)).reshape(4, 40)
+    after = solve(d + change, u, noise=NOISE, robust=False)
+    targets, parameters = before.response(change)
+    # Second order: some 50 um of the stations over their distance of 0.2 m, 3e-4 of the effect.
+    assert np.abs(after.target - before.target - targets).max() < 1e-3 * np.abs(targets).max()
+    moved = (after.station - before.station).ravel()
+    assert np.abs(moved - parameters.reshape(4, 4)[:, :3].ravel()).max() < 2e-3 * np.abs(moved).max()
+
+
+def test_far_off_rough_places_do_no_harm():
+    u = nominal_targets(30)
+    d = measured(u, NEAR[:4], NOISE)
+    near = solve(d, u, NEAR[:4], noise=NOISE)
+    far = solve(d, u, NEAR[:4] + np.random.default_rng(2).normal(0, 0.05, (4, 3)), noise=NOISE)
+    assert np.abs(near.target - far.target).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"target": np.zeros((9, 3))}, r"expected displacements \(station, target\)"),
+        ({"noise": 0.0}, "expected a positive standard deviation"),
+        ({"noise": np.ones(3)}, "expected noise as one value"),
+        ({"station": np.zeros((3, 3))}, "expected rough places"),
+        ({"extra": np.zeros((1, 4, 3))}, "expected further parameters"),
+    ],
+)
+def test_refuses_shapes_that_do_not_fit(change, message):
+    u = nominal_targets(12)
+    given = {"target": u, "station": NEAR[:4], "noise": NOISE} | change
+    with pytest.raises(MethodError, match=message):
+        solve(measured(u, NEAR[:4]), given.pop("target"), given.pop("station"), **given)
