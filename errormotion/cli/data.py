@@ -65,6 +65,11 @@ def _method_of(raw: Path) -> str:
     match = re.fullmatch(r"errormotion\.raw\.(\w+)/\d+", schema)
     if match is None:
         raise DatasetError(f"{path}: expected a raw dataset, whose schema tells the method; found schema {schema}")
+    if match[1] == "inclination":
+        raise DatasetError(
+            f"{path}: holds readings for a calibration of a sensor's inclination error; turn them into one with "
+            "'errormotion calibrate'"
+        )
     return match[1]
 
 

@@ -70,7 +70,10 @@ def read_csv(path: str | Path) -> xr.Dataset:
     complaints = Complaints(path)
     if "schema" not in header:
         known = ", ".join(sorted({raw.id for raw in RAW_SCHEMAS}))
-        raise DatasetError(f"{path}: expected a line '# schema = ...' that names one of {known}; found none")
+        raise DatasetError(
+            f"{path}: expected a line '# schema = ...' that names one of {known}; found none. "
+            "Logs of other software come in by 'errormotion import'."
+        )
     line, schema = header["schema"]
     names = _Names.of(schema)
     if names is None:

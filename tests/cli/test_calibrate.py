@@ -87,3 +87,9 @@ def test_readings_that_cannot_be_meant_leave_no_file(run, readings, tmp_path):
     found = run("calibrate", "data.nc", "-o", "a.nc", code=1)
     assert "Change the sign of the reference" in found.stderr
     assert not (tmp_path / "a.nc").exists()
+
+
+def test_identify_says_where_such_readings_belong(run, data):
+    found = run("identify", data, "--out", "errors.nc", code=1)
+    assert "errormotion calibrate" in found.stderr
+    assert "Traceback" not in found.stderr
