@@ -15,7 +15,16 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import beam, beam_direction, crossbeam, crossbeam_pose, generic, provenance, spindle
+from errormotion.report import (
+    beam,
+    beam_direction,
+    crossbeam,
+    crossbeam_pose,
+    generic,
+    multilateration,
+    provenance,
+    spindle,
+)
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH
@@ -121,6 +130,8 @@ def _builder(errors: xr.Dataset) -> Builder:
         return crossbeam_pose.part
     if beam_direction.is_direction(errors):
         return beam_direction.part
+    if multilateration.is_multilateration(errors):
+        return multilateration.part
     return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 
