@@ -2,6 +2,8 @@
 
 Property tests have no time limit an example, since machines differ. In CI their examples are the same each time;
 elsewhere they are drawn anew, and so find more.
+
+Every worker keeps its linear algebra to one thread: as many workers as processors are at work.
 """
 
 import os
@@ -9,6 +11,9 @@ from collections.abc import Generator
 
 import hypothesis
 import pytest
+
+for _library in ("OPENBLAS", "OMP", "MKL"):  # before anything imports numpy
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 IN_CI = os.environ.get("CI", "").lower() not in ("", "0", "false")
 

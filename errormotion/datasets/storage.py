@@ -172,7 +172,8 @@ def _engine_of(path: Path) -> str:
     if _HDF5_SIGNATURE.startswith(head):
         raise DatasetError(f"{path}: is truncated; make it anew or fetch it again")
     raise DatasetError(
-        f"{path}: is no dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log use 'errormotion import'"
+        f"{path}: is no dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log use "
+        "'errormotion import'"
     )
 
 
