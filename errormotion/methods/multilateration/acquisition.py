@@ -83,7 +83,7 @@ def measure_stations(
     done : Dataset, optional
         What an interrupted run holds: its set-ups are not measured again.
     measuring : Measuring, optional
-        Default: that of the settings where they have one.
+        Default: that of the settings.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def measure_stations(
         No instrument that can do it, a station that there is not, a tracker that stands at the place of another
         station, an axis that does not arrive.
     """
-    stand = Stand(bench, settings, measuring or getattr(settings, "measuring", None) or Measuring())
+    stand = Stand(bench, settings, measuring or settings.measuring)
     held = deque(_held(done))
     if done is not None:
         stand.air_told = _AIR[0] in done

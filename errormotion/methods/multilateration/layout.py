@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.bound import bound
 
 if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Layout
@@ -110,6 +109,8 @@ def optimise(
     """
     import nlopt
 
+    from errormotion.methods.multilateration.bound import bound
+
     u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
     if len(corners) < LEAST:
         raise MethodError(f"expected boxes for at least {LEAST} stations; found {len(corners)}; add some")
@@ -128,9 +129,11 @@ def optimise(
         if lacking := _lacking(seen):
             return _PENALTY * (1.0 + lacking)
         try:
-            sigma = uncertainty(bound(u, U, noise=noise, seen=seen).target_covariance)
-        except MethodError:  # a freedom is loose there
+            with np.errstate(all="ignore"):  # in what is said about a loose freedom, which nobody reads here
+                network = bound(u, U, noise=noise, seen=seen)
+        except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
             return _PENALTY
+        sigma = uncertainty(network.target_covariance)
         if minimise == "mean":
             return float(np.log(sigma.mean()))
         largest = sigma.max()
@@ -141,6 +144,7 @@ def optimise(
     rng = np.random.default_rng(seed)
 
     def search(algorithm: int, x: Array, evaluations: int, power: float | None = None) -> Array:
+        x = np.clip(x, low[free], high[free])
         lowest, best = cost(x, power), x
 
         def follow(y: Array, gradient: Array) -> float:  # noqa: ARG001 - the signature of nlopt

@@ -14,13 +14,14 @@ from errormotion.methods.multilateration import layout
 from errormotion.methods.multilateration.bound import bound
 from errormotion.methods.multilateration.model import motions
 from errormotion.methods.multilateration.refraction import index_uncertainty, sensitivities
-from errormotion.methods.multilateration.sight import Planning, Sight
+from errormotion.methods.multilateration.sight import Sight
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.multilateration.network import Network
     from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.sight import Planning
     from errormotion.plugins import MethodInfo
 
     Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
         Of the method.
     settings : Settings
     planning : Planning, optional
-        Boxes, obstacles, reflector, and what is minimised; default: those of the settings where they have some.
+        Boxes, obstacles, reflector, and what is minimised; default: those of the settings.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
         The layout leaves a freedom loose, or there is no better one within the boxes.
     """
     p = settings.layout
-    planning = planning or getattr(settings, "planning", None) or Planning()
+    planning = planning or settings.planning
     position, target = layout.grid(p)
     sight = Sight.of(planning)
     own = np.array(p.stations, np.float64)
@@ -216,7 +217,8 @@ def _notes(
             f"As set, {missing} of {sees.size} lines of sight are blocked or beyond the reflector's acceptance."
         )
     if unseen := int(np.count_nonzero(np.isnan(sigma[0]))):
-        notes.append(f"As set, {unseen} targets are seen by fewer than three stations and will not be determined.")
+        what = "target is" if unseen == 1 else "targets are"
+        notes.append(f"As set, {unseen} {what} seen by fewer than three stations and will not be determined.")
     if gain != 1:
         where = "; ".join("{:.0f}, {:.0f}, {:.0f}".format(*(U * 1e3)) for U in place)
         notes.append(

@@ -1,0 +1,171 @@
+"""Where to put the tracker: against brute force, within boxes and lines of sight, and as published."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration import layout
+from errormotion.methods.multilateration.bound import bound
+from errormotion.methods.multilateration.settings import Layout
+from errormotion.methods.multilateration.sight import Box, Planning, Sight, blocked
+
+CUBE = np.stack(np.meshgrid(*[np.linspace(-0.05, 0.05, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+OPEN = Sight.of(Planning(acceptance=np.pi))
+FIXED = np.array([(0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5)])
+
+
+def one_free(low, high):
+    """Return boxes in which only the first of four stations is free."""
+    return np.array([(low, high), *((U, U) for U in FIXED)])
+
+
+def largest(stations, sight=OPEN, target=CUBE):
+    try:
+        network = bound(target, stations, noise=1e-6, seen=sight.sees(stations, target))
+    except MethodError:
+        return np.inf
+    return float(layout.uncertainty(network.target_covariance).max())
+
+
+def brute(low, high, sight=OPEN, points=7):
+    places = itertools.product(*(np.linspace(a, b, points) for a, b in zip(low, high, strict=True)))
+    return min(largest(np.vstack([place, FIXED]), sight) for place in places)
+
+
+@pytest.mark.parametrize("low", [(-0.4, -0.4, -0.2), (-0.4, -0.4, 0.1)])
+def test_no_place_on_a_grid_is_better(low):
+    high = (-0.2, 0.4, 0.6)
+    found = layout.optimise(CUBE, one_free(low, high), OPEN, noise=1e-6)
+    np.testing.assert_array_equal(found[1:], FIXED)
+    np.testing.assert_array_equal(found, layout.optimise(CUBE, one_free(low, high), OPEN, noise=1e-6))
+    assert np.all(found[0] >= low)
+    assert np.all(found[0] <= high)
+    assert largest(found) <= brute(low, high) * (1 + 1e-6)
+
+
+def test_behind_an_obstacle_no_place_on_a_grid_is_better_either():
+    low, high = (-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6)
+    wall = Box(low=(-0.15, -0.5, 0.0), high=(-0.1, 0.0, 0.5))
+    sight = Sight.of(Planning(obstacles=(wall,), acceptance=np.pi))
+    assert sight.sees(FIXED, CUBE).all()
+    assert not sight.sees(np.array([(-0.35, -0.3, 0.2)]), CUBE).all()
+    found = layout.optimise(CUBE, one_free(low, high), sight, noise=1e-6)
+    assert largest(found, sight) <= brute(low, high, sight) * (1 + 1e-6)
+    assert largest(found, sight) >= largest(layout.optimise(CUBE, one_free(low, high), OPEN, noise=1e-6)) * (1 - 1e-6)
+
+
+def test_all_four_may_be_free_and_the_answer_is_better_than_the_start():
+    corners = np.tile([(-0.4, -0.4, -0.1), (0.4, 0.4, 0.5)], (4, 1, 1))
+    start = np.array([(-0.35, -0.3, 0.0), *FIXED])
+    found = layout.optimise(CUBE, corners, OPEN, noise=1e-6, start=start)
+    assert largest(found) < largest(start)
+
+
+def test_the_mean_may_be_minimised_instead():
+    corners = one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6))
+
+    def mean(stations):
+        return layout.uncertainty(bound(CUBE, stations, noise=1e-6).target_covariance).mean()
+
+    by_mean = layout.optimise(CUBE, corners, OPEN, noise=1e-6, minimise="mean")
+    by_largest = layout.optimise(CUBE, corners, OPEN, noise=1e-6)
+    assert mean(by_mean) <= mean(by_largest) * (1 + 1e-6)
+    assert largest(by_largest) <= largest(by_mean) * (1 + 1e-6)
+
+
+def test_noise_scales_the_answer_and_does_not_move_it():
+    corners = one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6))
+    a, b = (layout.optimise(CUBE, corners, OPEN, noise=noise) for noise in (1e-6, 1e-5))
+    assert largest(a) == pytest.approx(largest(b), rel=1e-3)
+
+
+def test_spread_across_x_and_y_is_good_and_z_alone_is_of_no_use():
+    # As published: a cube of 100 mm with 1 um noise; three stations close together, moved in Z, spread wide in X and Y.
+    # Stations and dead paths are free here, so the fourth place (overhead) is needed in every case.
+    overhead = (0.0, 0.05, 0.5)
+    close = np.array([(-0.3, -0.1, 0.0), (-0.3, 0.0, 0.1), (-0.3, 0.1, 0.0), overhead])
+    in_z = close + np.array([(0, 0, -0.2), (0, 0, 0.25), (0, 0, -0.2), (0, 0, 0)])
+    wide = np.array([(-0.3, 0.0, 0.0), (0.2, -0.3, 0.0), (0.2, 0.3, 0.1), overhead])
+    sigma = [largest(stations) for stations in (close, in_z, wide)]
+    # In the paper 14.5 um become 2.7 um with two of three stations spread, and 13.0 um with a change in Z alone.
+    assert sigma[2] < sigma[0] / 4
+    assert sigma[1] > 2 * sigma[2]
+
+
+def test_boxes_without_any_view_are_refused_with_what_to_do():
+    box = Box(low=(-0.15, -0.15, -0.15), high=(0.15, 0.15, 0.15))
+    sight = Sight.of(Planning(obstacles=(box,), acceptance=np.pi))
+    with pytest.raises(MethodError, match=r"found none in the search.*Enlarge the boxes"):
+        layout.optimise(CUBE, one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6)), sight, noise=1e-6)
+    with pytest.raises(MethodError, match="at least 4 stations; found 3"):
+        layout.optimise(CUBE, one_free((-0.4, -0.4, -0.2), (-0.2, 0.4, 0.6))[:3], OPEN, noise=1e-6)
+
+
+def test_a_grid_is_visited_by_neighbours_once_each():
+    made = Layout(count=(3, 4, 5), low=(0, 0, 0), high=(0.2, 0.3, 0.4), reflector=(0.0, 0.0, -0.1))
+    position, target = layout.grid(made)
+    order = layout.serpentine(made.count)
+    assert sorted(order) == list(range(60))
+    assert np.linalg.norm(np.diff(position[order], axis=0), axis=1).max() == pytest.approx(0.1)
+    np.testing.assert_allclose(target - position, np.tile((0, 0, -0.1), (60, 1)))
+    one = layout.grid(made.model_copy(update={"count": (1, 1, 2)}))[0]
+    np.testing.assert_allclose(one, [(0.1, 0.15, 0.0), (0.1, 0.15, 0.4)])
+
+
+# ---------------------------------------------------------------------- lines of sight
+
+
+@pytest.mark.parametrize(
+    ("station", "seen"),
+    [
+        ((-1.0, 0.0, 0.0), False),  # straight through
+        ((-1.0, 0.2, 0.0), False),  # in at a side, out at the front
+        ((-1.0, 3.0, 0.0), True),  # past it
+        ((1.0, 0.0, 0.0), True),  # on the other side
+        ((-0.3, 0.0, 0.0), True),  # in front of it
+        ((-0.5, 0.05, 0.0), False),  # inside
+        ((-1.0, 0.0, 0.1), True),  # along its surface
+    ],
+)
+def test_a_box_blocks_what_passes_its_inside(station, seen):
+    low, high = np.array([-0.6, -0.1, -0.1]), np.array([-0.4, 0.1, 0.1])
+    target = np.array([[0.0, 0.0, 0.0 if station[2] == 0 else 0.1]])
+    assert blocked(target, np.array(station)[None, None] - target, low, high)[0, 0] == (not seen)
+
+
+def test_blocked_lines_are_those_with_points_inside():
+    rng = np.random.default_rng(3)
+    low, high = np.array([-0.1, -0.2, -0.1]), np.array([0.2, 0.1, 0.3])
+    target, station = rng.uniform(-1, 1, (40, 3)), rng.uniform(-1, 1, (30, 3))
+    way = station[:, None] - target
+    along = target + np.linspace(0, 1, 2001)[:, None, None, None] * way
+    inside = ((along > low) & (along < high)).all(axis=-1).any(axis=0)
+    found = blocked(target, way, low, high)
+    # A line that cuts a corner by less than a step of the points is the only one on which they may differ.
+    assert not (inside & ~found).any()
+    assert np.count_nonzero(found & ~inside) <= 2
+
+
+def test_a_reflector_that_looks_one_way_is_seen_within_its_acceptance_only():
+    planning = Planning(reflector_axis=(0.0, 0.0, -2.0), acceptance=np.radians(60), nearest=0.0)
+    below = np.array([(np.tan(np.radians(a)), 0.0, -1.0) for a in (0, 59, 61)])
+    assert Sight.of(planning).sees(below, np.zeros((1, 3))).ravel().tolist() == [True, True, False]
+
+
+def test_a_reflector_that_is_turned_to_the_station_has_to_serve_all_targets_so():
+    target = np.array([(-0.5, 0.0, 0.0), (0.0, 0.0, 0.0), (0.5, 0.0, 0.0)])
+    sight = Sight.of(Planning(acceptance=np.radians(40)))
+    assert sight.sees(np.array([(0.0, 1.0, 0.0)]), target).all()  # 27 deg to either side
+    assert sight.sees(np.array([(0.0, 0.5, 0.0)]), target).tolist() == [[False, True, False]]  # 45 deg
+
+
+def test_a_tracker_is_not_nearer_than_it_can_measure():
+    sight = Sight.of(Planning(acceptance=np.pi, nearest=0.3))
+    assert sight.sees(np.array([(0.2, 0, 0), (0.31, 0, 0)]), np.zeros((1, 3))).ravel().tolist() == [False, True]
+
+
+def test_a_box_with_its_corners_swapped_is_refused():
+    with pytest.raises(ValueError, match="expected low <= high"):
+        Box(low=(0.1, 0, 0), high=(0, 0, 0))

@@ -1,0 +1,132 @@
+"""What to expect of a set-up before anything is measured: against what is measured then, and against the best one."""
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration import Multilateration, layout
+from errormotion.methods.multilateration.planning import boxes_of, plan, reading_noise
+from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.sight import Box, Planning
+from errormotion.methods.multilateration.solver import solve
+
+CLOSE = ((-0.3, -0.1, 0.0), (-0.3, 0.0, 0.1), (-0.3, 0.1, 0.0), (0.0, 0.05, 0.6))
+LAYOUT = {
+    "low": (-0.1, -0.1, 0.0), "high": (0.1, 0.1, 0.2), "count": (3, 3, 3), "stations": CLOSE,
+    "displacement_noise": 1e-6,
+}  # fmt: skip
+ROOM = Planning(boxes=(Box(low=(-0.35, -0.35, -0.1), high=(0.35, 0.35, 0.6)),), acceptance=np.pi)
+STILL = {
+    "temperature_uncertainty": 0.0, "pressure_uncertainty": 0.0, "humidity_uncertainty": 0.0,
+    "wavelength_uncertainty": 0.0,
+}  # fmt: skip
+
+
+def planned(planning=ROOM, **changes):
+    return plan(Multilateration.info, Settings(**({"layout": LAYOUT} | changes)), planning)
+
+
+@pytest.fixture(scope="module")
+def ds():
+    return planned()
+
+
+def test_a_plan_is_an_error_dataset_of_zeros_that_follows_the_schema(ds):
+    datasets.validate(ds)
+    for name in ("EX", "EY", "EZ"):
+        assert not ds[name].values.any()
+    assert np.isnan(ds["EA"].values).all()
+    assert ds.sizes["target"] == 27
+
+
+def test_expected_uncertainty_is_the_scatter_of_what_is_measured():
+    settings = Settings(layout=LAYOUT, air=STILL)
+    ds = plan(
+        Multilateration.info, settings, Planning(boxes=tuple(Box(low=U, high=U) for U in CLOSE), acceptance=np.pi)
+    )
+    target, U = layout.grid(settings.layout)[1], np.array(CLOSE)
+    rng = np.random.default_rng(2)
+    d = np.linalg.norm(target - U[:, None], axis=-1)
+    runs = [solve(d + 1e-6 * rng.normal(size=d.shape), target, U, noise=1e-6, robust=False).target for _ in range(300)]
+    scatter = np.sqrt(((np.array(runs) - target) ** 2).sum(axis=-1).mean(axis=0))
+    # 300 runs: some 5 % of a standard deviation, and 27 targets that share their stations. Beyond the linear
+    # prediction comes what a close layout bends.
+    assert np.abs(scatter / ds["target_uncertainty"].values - 1).max() < 0.2
+    variance = np.trace(ds["covariance"].values[:, :3, :3], axis1=1, axis2=2)
+    # What the air's own equations leave, 1e-8 of 0.2 m, is nothing here.
+    np.testing.assert_allclose(np.sqrt(variance), ds["target_uncertainty"].values, rtol=1e-4)
+
+
+def test_the_gain_over_the_layout_as_set_is_stated(ds):
+    own, best = ds["largest_uncertainty"].values
+    assert float(ds["gain"]) == pytest.approx(own / best)
+    assert float(ds["gain"]) > 3  # three stations close together are bad
+    assert ds["target_uncertainty"].values.max() == pytest.approx(own)
+    assert ds["best_uncertainty"].values.max() == pytest.approx(best)
+    low, high = boxes_of(ROOM, np.array(CLOSE))[0]
+    assert np.all(ds["best_place"].values >= low)
+    assert np.all(ds["best_place"].values <= high)
+    text = "\n".join(ds.attrs["notes"])
+    assert "at the worst" in text
+    assert "times smaller. Stations at (mm)" in text
+
+
+def test_uncertainty_of_the_air_is_one_scale_for_all_targets(ds):
+    still = planned(Planning(acceptance=np.pi), air=STILL)
+    assert "air temperature" not in still["source"].values
+    scale = ds["influence"].sel(source="air temperature").values[:, :3]
+    target = layout.grid(Settings(layout=LAYOUT).layout)[1]
+    # 0.2 K of air: 0.95 um/m a kelvin.
+    np.testing.assert_allclose(scale, 0.19e-6 * (target - target.mean(axis=0)), rtol=0.02, atol=1e-12)
+
+
+def test_expansion_that_is_not_known_is_in_the_plan():
+    narrow = Planning(boxes=tuple(Box(low=U, high=U) for U in CLOSE), acceptance=np.pi)
+    expansion = {"coefficient": 11.5e-6, "temperature_uncertainty": 0.5, "temperature": 22.0}
+    ds = planned(narrow, expansion=expansion)
+    groups = dict(zip(ds["source"].values, ds["source_group"].values, strict=True))
+    assert groups["temperature of X scale"] == "expansion"
+    along = ds["influence"].sel(source="temperature of X scale").values
+    x = ds["x"].values
+    # 0.5 K of 11.5 um/m/K make the grid as commanded longer along X, and nothing else.
+    np.testing.assert_allclose(along[:, 0], -5.75e-6 * (x - x.mean()), atol=1e-15)
+    np.testing.assert_allclose(along[:, 1:3], 0, atol=1e-15)
+
+
+def test_repeatability_counts_where_the_tracker_is_set_up_in_turn():
+    settings = Settings(layout=LAYOUT, repeatability=2e-6)
+    assert reading_noise(settings) == pytest.approx(np.sqrt(5) * 1e-6)
+    assert reading_noise(settings.model_copy(update={"together": True})) == pytest.approx(1e-6)
+
+
+def test_the_best_layout_is_the_own_one_where_there_is_no_room():
+    narrow = Planning(boxes=tuple(Box(low=U, high=U) for U in CLOSE), acceptance=np.pi)
+    ds = planned(narrow)
+    assert float(ds["gain"]) == 1.0
+    np.testing.assert_array_equal(ds["best_place"].values, CLOSE)
+    assert "No better layout was found within the boxes." in ds.attrs["notes"]
+
+
+def test_blocked_lines_of_sight_are_counted_and_targets_without_three_named():
+    # A pillar close to one target hides it from the three stations that stand together.
+    pillar = Box(low=(-0.13, -0.02, 0.08), high=(-0.12, 0.02, 0.12))
+    ds = planned(Planning(boxes=ROOM.boxes, obstacles=(pillar,), acceptance=np.pi))
+    text = "\n".join(ds.attrs["notes"])
+    assert f"{int((ds['sees'] == 0).sum())} of 108 lines of sight" in text
+    unseen = ds["sees"].sum("station").values < 3
+    assert np.flatnonzero(unseen).tolist() == [4]
+    assert (ds["best_sees"].sum("station") >= 3).all()
+    assert np.isnan(ds["EX"].values[unseen]).all()
+    assert "1 target is seen by fewer than three stations" in text
+
+
+def test_boxes_for_another_number_of_stations_are_refused():
+    with pytest.raises(MethodError, match="one box for all stations or one for each of 4; found 2"):
+        boxes_of(Planning(boxes=ROOM.boxes * 2), np.array(CLOSE))
+
+
+def test_the_method_plans():
+    flat = Settings(layout=LAYOUT | {"count": (2, 2, 2), "stations": [(0.3 * k, 0.2, 0.5) for k in range(-2, 2)]})
+    with pytest.raises(MethodError):  # on one line: nothing to be determined
+        Multilateration().plan(flat)
