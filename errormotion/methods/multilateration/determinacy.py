@@ -205,7 +205,7 @@ def weak_targets(target: Array, covariance: Array, place: Array) -> list[str]:
     known = np.isfinite(trace)
     if not known.any():
         return []
-    weak = np.flatnonzero(known & (trace > 100**2 * np.median(trace[known])))
+    weak = np.flatnonzero(known & (trace > WEAK**2 * np.median(trace[known])))
     notes = []
     for i in weak[:_TOLD]:
         values, vectors = np.linalg.eigh(covariance[i])

@@ -5,22 +5,51 @@ The equations are those of `network`. Chunks of targets and their order are thos
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 
-from errormotion.methods.multilateration.kernels import CHUNK, MANY, Array, chunks, compiled, reach_of, reflect
+from errormotion.methods.multilateration.kernels import CHUNK, MANY, Array, chunks, compiled, reach_of
+
+# Directions to the stations closer to a plane than this leave a target without a place.
+_FLAT = 1e-6
 
 
 @compiled()
-def _block(E: Array, D: Array) -> bool:  # pragma: no cover - compiled
-    """Fill D (3, 3), the inverse of R^T R, from the reflected E; False where that has no inverse."""
-    largest = max(abs(E[0, 0]), abs(E[1, 1]), abs(E[2, 2]))
-    if not min(abs(E[0, 0]), abs(E[1, 1]), abs(E[2, 2])) > 1e-7 * largest:
+def _sight(
+    w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
+) -> bool:  # pragma: no cover - compiled
+    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; False where that has none."""
+    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(len(station)):
+        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+        distance[j] = math.sqrt(x * x + y * y + z * z)
+        k = 1.0 / distance[j]
+        x, y, z = k * x, k * y, k * z
+        e[j, 0], e[j, 1], e[j, 2] = x, y, z
+        k = w[j] * w[j]
+        a00 += k * x * x
+        a01 += k * x * y
+        a02 += k * x * z
+        a11 += k * y * y
+        a12 += k * y * z
+        a22 += k * z * z
+    # E^T E = R^T R, and D = R^-1 R^-T.
+    least = _FLAT * _FLAT * (a00 + a11 + a22)
+    if not a00 > least:
         return False
-    i00, i11, i22 = 1.0 / E[0, 0], 1.0 / E[1, 1], 1.0 / E[2, 2]
-    i01 = -i00 * E[0, 1] * i11
-    i12 = -i11 * E[1, 2] * i22
-    i02 = -(i00 * E[0, 2] + i01 * E[1, 2]) * i22
+    r00 = math.sqrt(a00)
+    r01, r02 = a01 / r00, a02 / r00
+    if not a11 - r01 * r01 > least:
+        return False
+    r11 = math.sqrt(a11 - r01 * r01)
+    r12 = (a12 - r01 * r02) / r11
+    if not a22 - r02 * r02 - r12 * r12 > least:
+        return False
+    i00, i11, i22 = 1.0 / r00, 1.0 / r11, 1.0 / math.sqrt(a22 - r02 * r02 - r12 * r12)
+    i01, i12 = -i00 * r01 * i11, -i11 * r12 * i22
+    i02 = -(i00 * r02 + i01 * r12) * i22
     D[0, 0] = i00 * i00 + i01 * i01 + i02 * i02
     D[0, 1] = i01 * i11 + i02 * i12
     D[0, 2] = i02 * i22
@@ -72,15 +101,15 @@ def _datum_part(
     weight: Array, station: Array, extra: Array, target: Array, centre: Array, part: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
     n = len(station)
-    reach, w, r, c = np.zeros(n), np.empty(n), np.empty(n), np.empty(3)
-    e, E, Q, D = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n)), np.empty((3, 3))
+    w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
     F, DG = np.empty((3, 4 * n + len(extra))), np.empty((3, 6))
     for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-        w[:] = weight[:, i]
-        reflect(reach, w, station, target[i], e, r, E, Q)
-        if not _block(E, D):
+        for j in range(n):
+            w[j] = weight[j, i]
+        if not _sight(w, station, target[i], e, distance, D):
             continue
-        c[:] = target[i] - centre
+        for k in range(3):
+            c[k] = target[i, k] - centre[k]
         _response(e, w, D, extra, i, F)
         _spread_motions(D, c, DG)
         _cross(F, c, sums[:, 12:])
@@ -124,12 +153,9 @@ def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centr
 
 @compiled()
 def _covariance(
-    D: Array, DG: Array, FW: Array, c: Array, H: Array, K: Array, room: Array, out: Array
+    D: Array, DG: Array, FW: Array, G: Array, H: Array, K: Array, room: Array, out: Array
 ) -> None:  # pragma: no cover - compiled
     """Fill the covariance (3, 3) of a target in the datum: D + F F^T - D G H G^T - G H G^T D + G K G^T."""
-    G = np.zeros((3, 6))
-    G[0, 0], G[1, 1], G[2, 2] = 1.0, 1.0, 1.0
-    G[0, 4], G[0, 5], G[1, 3], G[1, 5], G[2, 3], G[2, 4] = c[2], -c[1], -c[2], c[0], c[1], -c[0]
     for a in range(3):
         for k in range(6):
             # 1/2 G K - D G H: G times its transpose, and the transpose of that, make both sides of the datum.
@@ -150,25 +176,25 @@ def _covariance(
 @compiled()
 def _examine_part(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
+    redundancy: Array,
     part: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    n, p = W.shape[0], W.shape[1]
-    stations = len(station)
-    reach, w, r, c = np.zeros(stations), np.empty(stations), np.empty(stations), np.empty(3)
-    e, E, Q, D = np.empty((stations, 3)), np.empty((stations, 3)), np.empty((stations, stations)), np.empty((3, 3))
-    F, DG, FW, q = np.empty((3, n)), np.empty((3, 6)), np.empty((3, p)), np.empty((stations, p))
+    stations, p = len(station), W.shape[1]
+    reach, w, distance, c = np.empty(stations), np.empty(stations), np.empty(stations), np.empty(3)
+    e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
+    DG, G, room = np.empty((3, 6)), np.zeros((3, 6)), np.empty((3, 6))
     for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
         reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-        reflect(reach, w, station, target[i], e, r, E, Q)
+        fine = _sight(w, station, target[i], e, distance, D)
         for j in range(stations):
-            residual[j, i] = r[j] / w[j] if w[j] > 0.0 else np.nan
+            residual[j, i] = reach[j] - distance[j] if w[j] > 0.0 else np.nan
             redundancy[j, i] = np.nan
-        if not _block(E, D):
+        if not fine:
             covariance[i] = np.nan
             continue
-        c[:] = target[i] - centre
+        for k in range(3):
+            c[k] = target[i, k] - centre[k]
         _spread_motions(D, c, DG)
         # Readings by the stations' factor, then targets: both sum over the stations.
         for j in range(stations):
@@ -177,36 +203,40 @@ def _examine_part(
                 q[j, k] = -w[j] * (s + W[4 * j + 3, k])
                 for a in range(len(extra)):
                     q[j, k] += w[j] * extra[a, j, i] * W[4 * stations + a, k]
-        FW[:] = 0.0
+        for a in range(3):
+            for k in range(p):
+                FW[a, k] = 0.0
         for j in range(stations):
+            x, y, z = e[j, 0], e[j, 1], e[j, 2]
+            hat = 0.0
             for a in range(3):
-                s = -w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
+                s = -w[j] * (D[a, 0] * x + D[a, 1] * y + D[a, 2] * z)
+                hat -= w[j] * e[j, a] * s
                 for k in range(p):
                     FW[a, k] += s * q[j, k]
-        # What is left of the readings when the target has taken its part: redundancy 1 - hat matrix.
+            redundancy[j, i] = 1.0 - hat
+        # The target has taken its part of a reading, the stations take theirs of what is left.
         for j in range(stations):
-            if w[j] == 0.0:
-                continue
-            alone, taken = 0.0, 0.0
-            for a in range(3, stations):
-                alone += Q[a, j] * Q[a, j]
+            taken = 0.0
             for k in range(p):
                 s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
                 taken += s * s
-            redundancy[j, i] = alone - taken
+            redundancy[j, i] = redundancy[j, i] - taken if w[j] > 0.0 else np.nan
         # G times the datum's shift, taken off.
         for k in range(p):
             FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
             FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
             FW[2, k] -= shift[2, k] + shift[3, k] * c[1] - shift[4, k] * c[0]
-        _covariance(D, DG, FW, c, H, K, F, covariance[i])
+        G[0, 0], G[1, 1], G[2, 2] = 1.0, 1.0, 1.0
+        G[0, 4], G[0, 5], G[1, 3], G[1, 5], G[2, 3], G[2, 4] = c[2], -c[1], -c[2], c[0], c[1], -c[0]
+        _covariance(D, DG, FW, G, H, K, room, covariance[i])
 
 
 @compiled()
 def _examine_alone(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
+    redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in range((len(target) + CHUNK - 1) // CHUNK):
         _examine_part(
@@ -218,8 +248,8 @@ def _examine_alone(
 @compiled(parallel=True)
 def _examine_shared(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
-    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array, redundancy: Array,
+    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
+    redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
         _examine_part(

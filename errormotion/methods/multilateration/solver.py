@@ -185,6 +185,11 @@ def solve(
         *determinacy.weak_targets(network.target, network.target_covariance, network.station),
         *determinacy.swapped_stations(network.station, places),
     ]
+    residual = network.residual
+    for j, i in found.left_out:
+        distance = np.linalg.norm(network.target[i] - network.station[j])
+        model = distance - network.dead_path[j] + network.stations.value @ problem.extra[:, j, i]
+        residual[j, i] = problem.reading[j, i] - model
     return replace(network, left_out=found.left_out, undecided=found.undecided, notes=tuple(notes))
 
 
