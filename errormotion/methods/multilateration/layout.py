@@ -87,11 +87,11 @@ def optimise(
     boxes : array_like (n, 2, 3)
         Lower and upper corner of the box of each station, m.
     sight : Sight
-        What is seen from where. All targets have to be seen by as many stations as can.
+        What is seen from where. Every target has to be seen by three stations at least, and enough of them by four.
     noise : float
         Standard deviation of a reading, m.
     start : array_like (n, 3), optional
-        Places to begin with, m. The answer is never worse.
+        Places to begin with, m. The answer is never worse than they are, moved into their boxes.
     minimise : {"largest", "mean"}
         Which uncertainty.
     seed : int
@@ -134,6 +134,8 @@ def optimise(
         except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
             return _PENALTY
         sigma = uncertainty(network.target_covariance)
+        if not np.isfinite(sigma).all():
+            return _PENALTY
         if minimise == "mean":
             return float(np.log(sigma.mean()))
         largest = sigma.max()

@@ -56,6 +56,14 @@ class Planning(PluginSettings):
         default="largest", description="which of the targets' uncertainties: the largest one, or their mean"
     )
 
+    @model_validator(mode="after")
+    def _looks_somewhere(self) -> Self:
+        if self.reflector_axis is not None and not any(self.reflector_axis):
+            raise ValueError(
+                "reflector_axis: expected a direction; found (0, 0, 0); leave it out or say where it looks"
+            )
+        return self
+
 
 @dataclass(frozen=True)
 class Sight:

@@ -166,6 +166,8 @@ def test_a_tracker_is_not_nearer_than_it_can_measure():
     assert sight.sees(np.array([(0.2, 0, 0), (0.31, 0, 0)]), np.zeros((1, 3))).ravel().tolist() == [False, True]
 
 
-def test_a_box_with_its_corners_swapped_is_refused():
+def test_a_box_with_its_corners_swapped_and_a_reflector_that_looks_nowhere_are_refused():
     with pytest.raises(ValueError, match="expected low <= high"):
         Box(low=(0.1, 0, 0), high=(0, 0, 0))
+    with pytest.raises(ValueError, match="reflector_axis: expected a direction"):
+        Planning(reflector_axis=(0.0, 0.0, 0.0))
