@@ -81,7 +81,7 @@ def test_noise_scales_the_answer_and_does_not_move_it():
     assert largest(a) == pytest.approx(largest(b), rel=1e-3)
 
 
-def test_spread_across_x_and_y_is_good_and_z_alone_is_of_no_use():
+def test_spread_across_x_and_y_is_worth_far_more_than_a_change_in_z_alone():
     # As published: a cube of 100 mm with 1 um noise; three stations close together, moved in Z, spread wide in X and Y.
     # Stations and dead paths are free here, so the fourth place (overhead) is needed in every case.
     overhead = (0.0, 0.05, 0.5)
@@ -90,8 +90,9 @@ def test_spread_across_x_and_y_is_good_and_z_alone_is_of_no_use():
     wide = np.array([(-0.3, 0.0, 0.0), (0.2, -0.3, 0.0), (0.2, 0.3, 0.1), overhead])
     sigma = [largest(stations) for stations in (close, in_z, wide)]
     # In the paper 14.5 um become 2.7 um with two of three stations spread, and 13.0 um with a change in Z alone.
+    # With stations and dead paths free Z alone brings a factor of two, and is still far behind.
     assert sigma[2] < sigma[0] / 4
-    assert sigma[1] > 2 * sigma[2]
+    assert sigma[1] > 3 * sigma[2]
 
 
 def test_boxes_without_any_view_are_refused_with_what_to_do():
