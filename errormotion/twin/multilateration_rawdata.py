@@ -59,7 +59,7 @@ class TrackerMeasurements:
         """Return four places of the tracker around the targets, not in one plane, m, (4, 3)."""
         middle = np.array([sum(self.travel[axis]) / 2 for axis in "XYZ"])
         half = np.array([np.ptp(self.travel[axis]) / 2 for axis in "XYZ"])
-        around = np.array([(-1.1, -1.2, -1.0), (1.2, -1.1, -0.9), (1.1, 1.2, -1.0), (-1.2, 1.0, 1.3)])
+        around = np.array([(-1.1, -1.2, -1.6), (1.2, -1.1, -1.2), (1.1, 1.2, -1.5), (-1.2, 1.0, 1.3)])
         return np.asarray(middle + around * half)
 
     def reflector_places(self, position: ArrayLike, reflector: ArrayLike = REFLECTOR) -> Array:

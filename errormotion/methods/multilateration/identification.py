@@ -24,9 +24,10 @@ from errormotion.methods.multilateration.expansion import (
 from errormotion.methods.multilateration.model import directions
 from errormotion.methods.multilateration.moving import find_move
 from errormotion.methods.multilateration.parameters import fit_machine
-from errormotion.methods.multilateration.reading import Readings, read
+from errormotion.methods.multilateration.reading import Readings, read, short
 from errormotion.methods.multilateration.solver import solve
 from errormotion.methods.multilateration.volume import parametric_extras
+from errormotion.methods.multilateration.weakness import weak_targets
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -121,6 +122,7 @@ def _solved(raw: xr.Dataset, data: Readings, settings: Settings, notes: list[str
     times, scale = air_scale(raw, settings.air, notes)
     d = data.displacement * times
     noise = np.full(d.shape, data.noise if settings.together else np.hypot(data.noise, settings.repeatability))
+    _leave_out_weak(d, data, noise, settings, notes)
     first = _network(d, data, noise, settings)
     e = directions(np.where(np.isnan(first.target), data.nominal, first.target), first.stations)
     drift = _drift(d, e, data, noise, settings, notes)
@@ -137,6 +139,18 @@ def _solved(raw: xr.Dataset, data: Readings, settings: Settings, notes: list[str
     if not network.converged:
         notes.append(f"The network has not settled after {network.iterations} passes; its figures are rough.")
     return Solution(network, factor, corrected, drift, sources, scale)
+
+
+def _leave_out_weak(d: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]) -> None:
+    """Take the readings of targets that they hardly fix out of ``d``."""
+    weak = weak_targets(d, data.nominal, data.station if settings.start == "nominal" else None, noise)
+    if weak.any():
+        d[:, weak] = np.nan
+        names = short([name for name, lost in zip(data.targets, weak, strict=True) if lost])
+        notes.append(
+            f"{int(weak.sum())} of {len(weak)} targets are hardly fixed by their readings, since what they are seen "
+            f"from lies nearly in one plane with them; they are not known: {names}."
+        )
 
 
 def _network(d: Array, data: Readings, noise: Array, settings: Settings) -> Network:

@@ -24,6 +24,9 @@ _CUTS = 9
 _FEWEST = 5  # readings of a part
 _EXPLAINS = 0.5
 """Share of the excess that a cut has to take away."""
+_GAIN = 50.0
+"""How much smaller a cut has to make the sum of squares, over what it leaves per freedom: its four further unknowns do
+that by chance once in 3e9 cuts."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def find_move(displacement: Array, nominal: Array, station: Array | None, noise:
                 break
             step = (high - low) // (_CUTS - 1) + 1
             low, high = max(low, int(cuts[i]) - step), min(high, int(cuts[i]) + step)
-    if best is None or not best[0] < (1 - _EXPLAINS) * whole:
+    if best is None or not whole - best[0] > max(_EXPLAINS * whole, _GAIN * max(best[3], 1.0) ** 2):
         return None
     later = np.where(np.isfinite(displacement[best[1]]) & (time[best[1]] >= best[2]), time[best[1]], np.inf)
     return Move(best[1], int(np.argmin(later)), best[4], before, best[3])

@@ -78,10 +78,8 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
         raise MethodError(f"No reading of station {', '.join(silent)}: leave it out, or measure from there.")
     few = np.count_nonzero(np.isfinite(d), axis=0) < 3
     if few.any():
-        first = ", ".join(name for name, lost in zip(names["target"], few, strict=True) if lost and name)
-        notes.append(
-            f"{int(few.sum())} of {m} targets have fewer than three readings and are not known: {_short(first)}."
-        )
+        first = short([name for name, lost in zip(names["target"], few, strict=True) if lost])
+        notes.append(f"{int(few.sum())} of {m} targets have fewer than three readings and are not known: {first}.")
     station = None
     if "station_nominal" in raw:
         station = _array(raw, "station_nominal", "station", "direction")
@@ -109,6 +107,6 @@ def _names(raw: xr.Dataset, dim: str, letter: str) -> list[str]:
     return [f"{letter}{i + 1}" for i in range(raw.sizes[dim])]
 
 
-def _short(names: str) -> str:
-    found = names.split(", ")
-    return ", ".join(found) if len(found) <= 8 else f"{', '.join(found[:8])} and {len(found) - 8} more"
+def short(names: list[str]) -> str:
+    """Return names as a text, the first eight of them."""
+    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:8])} and {len(names) - 8} more"

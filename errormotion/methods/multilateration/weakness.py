@@ -1,0 +1,50 @@
+"""Targets whose readings hardly fix them: left out, since each would spoil the datum that all of them share.
+
+A target with three readings and its three stations nearly in one plane can move out of that plane by a millimetre
+before its distances change by a micrometre. Such a target says nothing about the stations.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.methods.multilateration.model import Stations, directions
+from errormotion.methods.multilateration.start import initial_stations
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+WEAK = 10.0
+"""So many times as uncertain as the middle one, the stations known. Of m targets one of sqrt(m) times is harmless to
+the datum, so that the limit is half of this where it is larger."""
+
+
+def weak_targets(displacement: Array, nominal: Array, station: Array | None, noise: Array) -> NDArray[np.bool_]:
+    """Return which targets (m,) to leave out: those with three readings or more that hardly fix them.
+
+    Parameters
+    ----------
+    displacement, noise : ndarray (n, m)
+        m; NaN where there is no reading.
+    nominal : ndarray (m, 3)
+        m.
+    station : ndarray (n, 3) or None
+        Rough places, m; without them they are reckoned from the nominal targets.
+    """
+    known = np.isfinite(displacement)
+    weight = np.where(known, 1 / noise, 0.0)
+    fixed = np.count_nonzero(known, axis=0) >= 3
+    if not fixed.any():
+        return np.zeros(len(nominal), dtype=bool)
+    place = initial_stations(np.nan_to_num(displacement), weight, nominal, station).place
+    e = directions(nominal, Stations(place, np.zeros(len(place)), np.zeros(0)))
+    information = np.einsum("jt,jta,jtb->tab", weight**2, e, e)
+    values = np.linalg.eigvalsh(information)
+    with np.errstate(divide="ignore"):
+        u = np.sqrt((1 / np.maximum(values, 0.0)).sum(axis=1))
+    limit = max(WEAK, 0.5 * np.sqrt(len(nominal))) * float(np.median(u[fixed]))
+    return np.asarray(fixed & ~(u <= limit), dtype=bool)
