@@ -100,7 +100,7 @@ def test_reading_that_was_left_out_is_named_with_how_wrong_it_is(html):
 
 
 def test_reading_that_was_left_out_is_named_without_raw_data_too(tmp_path):
-    assert "the others contradict them: S2 to T021." in words(page(measured()[0], tmp_path))
+    assert "the others contradict them: S2 to T021" in words(page(measured()[0], tmp_path))
 
 
 def test_result_stays_as_it_is():
