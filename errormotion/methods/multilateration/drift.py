@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 SAME_PLACE = 1e-9
 """Commanded places closer than this are one, m."""
 FALSE_ALARM = 1e-3
+DRIFTS = 0.01
+"""Chance at which a set-up that does not drift is said to."""
+_ALIKE = 1e4
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def estimate_drift(
     """Return the drift that the returns show.
 
     Each set-up gets no rate, one of its dead path, or one of its dead path and three of the machine: what explains
-    its returns best by the Bayesian information criterion.
+    its returns where chance would do so once in a hundred set-ups.
 
     Parameters
     ----------
@@ -143,16 +146,15 @@ def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array
 
 
 def _order(d: Array, A: Array) -> int:
-    """Return how many of the columns of A explain d best: none, 1, or 4."""
-    best, found = float(d @ d), 0
+    """Return how many of the columns of A explain d: none, 1, or all four."""
+    square, found = float(d @ d), 0
     for order in (1, A.shape[1]):
         part = A[:, :order]
-        if len(d) <= order or np.linalg.cond(part) > 1e4:
+        if len(d) <= order or np.linalg.cond(part) > _ALIKE:
             continue
         left = d - part @ np.linalg.lstsq(part, d)[0]
-        score = float(left @ left) + order * np.log(len(d))
-        if score < best:
-            best, found = score, order
+        if square - float(left @ left) > stats.chi2.ppf(1 - DRIFTS, order - found):
+            square, found = float(left @ left), order
     return found
 
 
