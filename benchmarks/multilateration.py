@@ -29,7 +29,8 @@ from errormotion.errors import MethodError
 from errormotion.methods.multilateration.alternating import alternate
 from errormotion.methods.multilateration.bound import bound, relative_bound
 from errormotion.methods.multilateration.model import Stations, jacobian, readings
-from errormotion.methods.multilateration.solver import fitted, solve
+from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.turning import fitted
 
 PARTS = ("compare", "coverage", "layout")
 NOISE = 1e-6
@@ -53,7 +54,7 @@ def data(m: int):
 
 
 def on_nominal(target, station, nominal):
-    stations, moved = fitted(Stations(station, np.zeros(4), NONE), target, nominal, np.ones(len(target), dtype=bool))
+    stations, moved, _ = fitted(Stations(station, np.zeros(4), NONE), target, nominal, np.ones(len(target), dtype=bool))
     return moved, stations.place
 
 

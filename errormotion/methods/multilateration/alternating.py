@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.model import Stations
-from errormotion.methods.multilateration.solver import fitted
+from errormotion.methods.multilateration.turning import fitted
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ def alternate(
         if moved < tolerance:
             break
     r = d - (np.linalg.norm(u - U[:, None], axis=-1) - np.linalg.norm(u[0] - U, axis=1)[:, None])
-    stations, u = fitted(Stations(U, np.zeros(len(U)), np.zeros(0)), u, nominal, np.ones(len(u), dtype=bool))
+    stations, u, _ = fitted(Stations(U, np.zeros(len(U)), np.zeros(0)), u, nominal, np.ones(len(u), dtype=bool))
     return Alternated(u, stations.place, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2))))
 
 

@@ -10,7 +10,7 @@ import math
 import numba
 import numpy as np
 
-from errormotion.methods.multilateration.kernels import CHUNK, MANY, Array, chunks, compiled, reach_of
+from errormotion.methods.multilateration.kernels import CHUNK, FAST, MANY, Array, chunks, compiled, reach_of
 
 # Directions to the stations closer to a plane than this leave a target without a place.
 _FLAT = 1e-6
@@ -61,20 +61,7 @@ def _sight(
 
 
 @compiled()
-def _response(e: Array, w: Array, D: Array, extra: Array, i: int, F: Array) -> None:  # pragma: no cover - compiled
-    """Fill F (3, q): how a target moves by the parameters of the stations, D E^T (-Q)."""
-    n = len(e)
-    F[:, 4 * n :] = 0.0
-    for j in range(n):
-        for c in range(3):
-            k = w[j] * w[j] * (D[c, 0] * e[j, 0] + D[c, 1] * e[j, 1] + D[c, 2] * e[j, 2])
-            F[c, 4 * j], F[c, 4 * j + 1], F[c, 4 * j + 2], F[c, 4 * j + 3] = k * e[j, 0], k * e[j, 1], k * e[j, 2], k
-            for p in range(len(extra)):
-                F[c, 4 * n + p] -= k * extra[p, j, i]
-
-
-@compiled()
-def _cross(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compiled
+def _add_motions(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compiled
     """Add G^T F (6, q), G = [1, -(c x)], to ``out``."""
     for k in range(F.shape[1]):
         x, y, z = F[0, k], F[1, k], F[2, k]
@@ -84,6 +71,25 @@ def _cross(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compil
         out[3, k] += c[1] * z - c[2] * y
         out[4, k] += c[2] * x - c[0] * z
         out[5, k] += c[0] * y - c[1] * x
+
+
+@compiled()
+def _add_response(
+    e: Array, w: Array, D: Array, c: Array, extra: Array, i: int, v: Array, out: Array
+) -> None:  # pragma: no cover - compiled
+    """Add G^T F (6, q) to ``out``: F = D E^T (-Q) is how a target moves by the stations' parameters; v (6,) is room."""
+    n = len(e)
+    for j in range(n):
+        for a in range(3):
+            v[a] = w[j] * w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
+        v[3], v[4], v[5] = c[1] * v[2] - c[2] * v[1], c[2] * v[0] - c[0] * v[2], c[0] * v[1] - c[1] * v[0]
+        for a in range(6):
+            out[a, 4 * j] += v[a] * e[j, 0]
+            out[a, 4 * j + 1] += v[a] * e[j, 1]
+            out[a, 4 * j + 2] += v[a] * e[j, 2]
+            out[a, 4 * j + 3] += v[a]
+            for p in range(len(extra)):
+                out[a, 4 * n + p] -= v[a] * extra[p, j, i]
 
 
 @compiled()
@@ -102,7 +108,7 @@ def _datum_part(
 ) -> None:  # pragma: no cover - compiled
     n = len(station)
     w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
-    F, DG = np.empty((3, 4 * n + len(extra))), np.empty((3, 6))
+    v, DG = np.empty(6), np.empty((3, 6))
     for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
         for j in range(n):
             w[j] = weight[j, i]
@@ -110,10 +116,9 @@ def _datum_part(
             continue
         for k in range(3):
             c[k] = target[i, k] - centre[k]
-        _response(e, w, D, extra, i, F)
+        _add_response(e, w, D, c, extra, i, v, sums[:, 12:])
         _spread_motions(D, c, DG)
-        _cross(F, c, sums[:, 12:])
-        _cross(DG, c, sums[:, 6:12])
+        _add_motions(DG, c, sums[:, 6:12])
         for a in range(3):
             sums[a, a] += 1.0
         square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
@@ -151,7 +156,7 @@ def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centr
     return total[:, :6], total[:, 6:12], total[:, 12:]
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def _covariance(
     D: Array, DG: Array, FW: Array, G: Array, H: Array, K: Array, room: Array, out: Array
 ) -> None:  # pragma: no cover - compiled
@@ -173,7 +178,7 @@ def _covariance(
             out[a, b] = s
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def _examine_part(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
     target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,

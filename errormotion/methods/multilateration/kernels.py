@@ -25,7 +25,7 @@ CHUNK = 1024
 """Targets that one thread adds up."""
 LANES = 128
 """Equations whose products are added up together."""
-MANY = 3000
+MANY = 20_000
 """More targets than these are shared out to several threads."""
 # Sums of products may be taken in any order (so that they vectorise).
 FAST = {"reassoc", "contract", "nsz"}

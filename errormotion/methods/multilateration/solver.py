@@ -20,6 +20,7 @@ from errormotion.methods.multilateration.kernels import reduce_targets
 from errormotion.methods.multilateration.model import Stations
 from errormotion.methods.multilateration.network import Datum, Network
 from errormotion.methods.multilateration.start import initial_stations
+from errormotion.methods.multilateration.turning import fitted
 
 Array = NDArray[np.float64]
 
@@ -84,17 +85,25 @@ class Problem:
             H = H + np.diag(weight)
             h += weight * off
             square += float(weight @ off**2)
-        return Sums(H, h, square, moved)
+        return Sums(H, h, square, moved, len(stations.value))
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Information H, gradient h, sum of squares of the normalised residuals, and how far the targets went, m."""
+    """Information H, gradient h, sum of squares, how far targets went, m, and how many further parameters there are."""
 
     H: Array
     h: Array
     square: float
     moved: float
+    further: int
+
+    def turned(self, R: Array) -> Sums:
+        """Return what the targets say when the whole has been turned by R (3, 3)."""
+        B = np.eye(len(self.h))
+        for j in range(0, len(self.h) - self.further, 4):
+            B[j : j + 3, j : j + 3] = R
+        return replace(self, H=B @ self.H @ B.T, h=B @ self.h)
 
 
 @dataclass(frozen=True)
@@ -309,10 +318,10 @@ def _without_wrong(
 def conclude(problem: Problem, state: State, rough: Array) -> Network:
     """Bring a solution into the datum and return it with its covariances; ``rough`` (n, 3) are rough stations."""
     used = np.count_nonzero(problem.weight, axis=0) >= 3
-    stations, target = fitted(state.stations, state.target, problem.nominal, used)
+    stations, target, R = fitted(state.stations, state.target, problem.nominal, used)
     centre = target[used].mean(axis=0)
     Z = problem.basis(stations, centre)
-    sums = problem.reduce(stations, target)
+    sums = state.sums.turned(R)
     GG, GDG, GF = datum_sums(problem.weight, stations.place, problem.extra, target, centre)
     determinacy.refuse_flat(round(GG[0, 0]), rough, target[used])
     H: Array = np.asarray(np.linalg.inv(GG), dtype=np.float64)
@@ -335,12 +344,3 @@ def conclude(problem: Problem, state: State, rough: Array) -> Network:
         target, stations, covariance, joint, residual, redundancy, problem.weight, (), (), sigma0, freedom,
         state.passes, state.converged, float(values[-1] / values[0]), (), problem.extra, datum,
     )  # fmt: skip
-
-
-def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.bool_]) -> tuple[Stations, Array]:
-    """Move the whole so that the targets lie on the nominal ones as well as can be."""
-    a, b = target[used].mean(axis=0), nominal[used].mean(axis=0)
-    U, _, Vt = np.linalg.svd((nominal[used] - b).T @ (target[used] - a))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    moved = (target - a) @ R.T + b
-    return replace(stations, place=(stations.place - a) @ R.T + b), np.ascontiguousarray(moved)

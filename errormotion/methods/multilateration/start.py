@@ -11,12 +11,14 @@ stands; then its rough place decides.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.kernels import compiled
 
 Array = NDArray[np.float64]
 
@@ -148,22 +150,37 @@ def _best(guesses: list[Array], d: Array, u: Array) -> tuple[Array, float]:
     return min(found, key=lambda each: each[1])
 
 
-def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
+@compiled()
+def _residuals(x: Array, d: Array, u: Array, r: Array, e: Array) -> float:  # pragma: no cover - compiled
+    """Fill residuals (n,) and directions (n, 3) of readings from a station (U, L); return their robust scale, m."""
+    for i in range(len(d)):
+        a, b, c = u[i, 0] - x[0], u[i, 1] - x[1], u[i, 2] - x[2]
+        distance = math.sqrt(a * a + b * b + c * c)
+        e[i, 0], e[i, 1], e[i, 2] = a / distance, b / distance, c / distance
+        r[i] = d[i] - distance + x[3]
+    return 1.4826 * float(np.median(np.abs(r)))
+
+
+@compiled()
+def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:  # pragma: no cover - compiled
     """Fit (U, L) to the distances from nominal targets by damped Gauss-Newton with Cauchy's weights."""
-
-    def residual(x: Array) -> tuple[Array, Array]:
-        v = u - x[:3]
-        distance = np.linalg.norm(v, axis=1)
-        return d - (distance - x[3]), np.column_stack([-v / distance[:, None], -np.ones(len(d))])
-
-    r, J = residual(x)
-    scale, mu = _scale(r), 0.0
+    n = len(d)
+    r, e, r_tried, e_tried = np.empty(n), np.empty((n, 3)), np.empty(n), np.empty((n, 3))
+    A, g, J = np.empty((4, 4)), np.empty(4), np.empty(4)
+    scale, mu = _residuals(x, d, u, r, e), 0.0
     for _ in range(_STEPS):
-        w = 1.0 / (1.0 + (r / (3 * scale + 1e-15)) ** 2)
-        A, g = J.T @ (w[:, None] * J), J.T @ (w * r)
-        step = np.linalg.lstsq(A + mu * np.diag(np.diag(A)), g, rcond=1e-14)[0]
-        tried, J_tried = residual(x + step)
-        size = _scale(tried)
+        A[:], g[:] = 0.0, 0.0
+        for i in range(n):
+            w = 1.0 / (1.0 + (r[i] / (3.0 * scale + 1e-15)) ** 2)
+            J[0], J[1], J[2], J[3] = -e[i, 0], -e[i, 1], -e[i, 2], -1.0
+            for a in range(4):
+                g[a] += w * J[a] * r[i]
+                for b in range(4):
+                    A[a, b] += w * J[a] * J[b]
+        for a in range(4):
+            A[a, a] *= 1.0 + mu + 1e-14
+        tried = x + np.linalg.solve(A, g)
+        size = _residuals(tried, d, u, r_tried, e_tried)
         if not size <= scale * (1 + 1e-3):
             mu = max(10 * mu, 1e-3)
             if mu > 1e8:
@@ -172,7 +189,8 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
         mu = 0.1 * mu if mu > 1e-3 else 0.0
         # A start need not be sharper than this.
         settled = mu == 0.0 and size > 0.98 * scale
-        x, r, J, scale = x + step, tried, J_tried, size
+        x, scale = tried, size
+        r, e, r_tried, e_tried = r_tried, e_tried, r, e
         if settled:
             break
     return x, scale

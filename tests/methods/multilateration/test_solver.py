@@ -194,7 +194,7 @@ def test_the_relative_formulation_costs_what_it_says():
 
 
 def test_has_the_same_bits_on_any_number_of_threads():
-    u = nominal_targets(5000)
+    u = nominal_targets(25_000)
     d = measured(u, NEAR[:4], NOISE)
     d[1, 77] = np.nan
     threads, found = numba.get_num_threads(), []
