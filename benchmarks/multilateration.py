@@ -1,6 +1,7 @@
 """Multilateration: the solver against general ones and the published scheme, what it states, and what layouts do.
 
-``python -m benchmarks.multilateration [--only compare coverage layout] [--most 1000000] [--peers 10000]``
+``python -m benchmarks.multilateration [--only compare coverage layout] [--most 1000000] [--peers 10000]
+[--stations near wide]``
 
 ``compare`` gives every way the same readings, each in a process of its own: wall and processor time of one solution
 when everything is compiled and warm, the most memory that the process held, iterations, and how far its targets are
@@ -35,8 +36,12 @@ from errormotion.methods.multilateration.turning import fitted
 PARTS = ("compare", "coverage", "layout")
 NOISE = 1e-6
 EDGE = 0.1
-# Spread wide about the cube, at distances like its size.
+# Spread wide about the cube: at distances like its size, where everything is linear, and where trackers have room.
 STATION = np.array([[-0.15, -0.15, -0.1], [0.16, -0.13, 0.02], [0.0, 0.17, -0.05], [0.02, 0.01, 0.2]])
+LAYOUTS = {
+    "near": STATION,
+    "wide": np.array([[-0.35, -0.3, -0.15], [0.36, -0.33, 0.02], [0.0, 0.37, -0.15], [0.02, 0.01, 0.4]]),
+}
 NONE = np.zeros(0)
 
 
@@ -44,13 +49,13 @@ def nominal_targets(m: int, seed: int = 5):
     return np.random.default_rng(seed).uniform(-EDGE / 2, EDGE / 2, (m, 3))
 
 
-def data(m: int):
+def data(m: int, places=STATION):
     """Nominal targets, true ones (a machine with 10 um), readings, rough stations (2 mm off)."""
     rng = np.random.default_rng([1, m])
     nominal = nominal_targets(m)
     true = nominal + rng.normal(0, 10e-6, (m, 3))
-    d = readings(true, Stations(STATION, np.linalg.norm(true[0] - STATION, axis=1), NONE))
-    return nominal, true, d + rng.normal(0, NOISE, d.shape), STATION + rng.normal(0, 2e-3, (4, 3))
+    d = readings(true, Stations(places, np.linalg.norm(true[0] - places, axis=1), NONE))
+    return nominal, true, d + rng.normal(0, NOISE, d.shape), places + rng.normal(0, 2e-3, (4, 3))
 
 
 def on_nominal(target, station, nominal):
@@ -130,10 +135,11 @@ WAYS = {
 }
 
 
-def one(way: str, m: int, out: str) -> None:
+def one(way: str, m: int, places, out: str) -> None:
     """Solve once to warm up, on few targets, then once for the figures."""
-    WAYS[way](*(lambda u, _, d, s: (u, d, s))(*data(5000 if way == "errormotion" else 50)))
-    u, true, d, station = data(m)
+    u, _, d, station = data(30_000 if way == "errormotion" else 50)
+    WAYS[way](u, d, station)
+    u, true, d, station = data(m, places)
     work, repeats, walls, processors = WAYS[way], 5 if way == "errormotion" and m < 500_000 else 1, [], []
     for _ in range(repeats):
         wall, processor = time.perf_counter(), time.process_time()
@@ -141,7 +147,7 @@ def one(way: str, m: int, out: str) -> None:
         walls.append(time.perf_counter() - wall)
         processors.append(time.process_time() - processor)
     np.savez(out + ".npz", target=target, place=place)
-    truth, _ = on_nominal(true, STATION, u)
+    truth, _ = on_nominal(true, places, u)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     figures = {
         "wall": min(walls), "processor": min(processors), "memory": memory, "iterations": int(iterations),
@@ -150,10 +156,10 @@ def one(way: str, m: int, out: str) -> None:
     Path(out + ".json").write_text(json.dumps(figures))
 
 
-def compare(most: int, peers: int) -> None:
-    print(
-        "The same readings for all, four stations spread wide, 1 um noise; error: rms of the targets against the truth."
-    )
+def compare(layout: str, most: int, peers: int) -> None:
+    far = np.linalg.norm(LAYOUTS[layout], axis=1).mean()
+    print(f"The same readings for all, four stations {far * 1e3:.0f} mm from the cube's middle, 1 um of noise;")
+    print("error: rms of the targets against the truth; off ours: the furthest target.")
     print(f"Load while this ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")
     print(
         f"{'targets':>9} {'way':>28} {'wall':>11} {'cpu':>10} {'times ours':>11} {'peak':>9} {'its':>6} {'done':>5} "
@@ -165,7 +171,7 @@ def compare(most: int, peers: int) -> None:
             for way in WAYS if m <= peers else ["errormotion"]:
                 out = str(Path(folder) / "out")
                 done = subprocess.run(
-                    [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), out], check=False
+                    [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), layout, out], check=False
                 )
                 if done.returncode:
                     print(f"{m:>9} {way:>28} failed", flush=True)
@@ -301,18 +307,20 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--most", type=int, default=1_000_000, help="most targets for ours")
     parser.add_argument("--peers", type=int, default=10_000, help="most targets for the other ways")
-    parser.add_argument("--one", nargs=3, metavar=("WAY", "M", "OUT"), help=argparse.SUPPRESS)
+    parser.add_argument("--stations", nargs="+", choices=tuple(LAYOUTS), default=tuple(LAYOUTS), help="for compare")
+    parser.add_argument("--one", nargs=4, metavar=("WAY", "M", "LAYOUT", "OUT"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        way, m, out = arguments.one
-        one(way, int(m), out)
+        way, m, name, out = arguments.one
+        one(way, int(m), LAYOUTS[name], out)
         return
     if "layout" in arguments.only:
         layout()
     if "coverage" in arguments.only:
         coverage()
     if "compare" in arguments.only:
-        compare(arguments.most, arguments.peers)
+        for name in arguments.stations:
+            compare(name, arguments.most, arguments.peers)
 
 
 if __name__ == "__main__":
