@@ -50,7 +50,7 @@ def part(source: Source, key: str) -> Part:
         ]
     stations: list[Block] = [
         multilateration_figures.layout(net, f"{key}-layout"),
-        multilateration_quality.stations(net),
+        multilateration_quality.planned(errors, net) if planned else multilateration_quality.stations(net),
     ]
     sections = [
         *([Section("volume", "Errors of the volume", volume)] if volume else []),

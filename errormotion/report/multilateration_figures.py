@@ -87,7 +87,7 @@ def layout(net: Network, key: str) -> Block:
         else ""
     )
     dashed = " Dashed: no reading, or one that was left out." if broken else ""
-    caption = f"Places of the tracker as estimated, targets, and lines of sight.{dashed}{fewer}{_TURN}"
+    caption = f"Places of the tracker, targets, and lines of sight.{dashed}{fewer}{_TURN}"
     alt = f"{len(stands)} places of the tracker around {integer(net.drawn.size)} targets."
     return Figure(draw(Scene(parts), key), caption, alt)
 

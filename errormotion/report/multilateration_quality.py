@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import xarray as xr
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.report import canvas
@@ -37,6 +38,23 @@ def stations(net: Network) -> Block:
         ["station", "x / mm", "y / mm", "z / mm", "dead path / mm", "off / mm", "used", "residual / µm"],
         rows,
         [("", 1), ("place", 3), ("", 1), ("", 1), ("readings", 2)],
+    )
+
+
+def planned(errors: xr.Dataset, net: Network) -> Block:
+    """Return the table of a plan's stations: where they are set, and where they would be best."""
+    if "best_place" not in errors or errors["best_place"].dims != ("station", "direction"):
+        return Text("The plan names no better places.", "note")
+    best = np.asarray(errors["best_place"].values, float)
+    rows: list[list[Cell | str]] = [
+        [name, *(or_dash(fixed(1e3 * v, 0), "not known") for v in (*own, *better))]
+        for name, own, better in zip(net.stations, net.station, best, strict=True)
+    ]
+    return Table(
+        "Places of the tracker as set, as drawn above, and the best within the boxes.",
+        ["station", *2 * ("x / mm", "y / mm", "z / mm")],
+        rows,
+        [("", 1), ("as set", 3), ("best", 3)],
     )
 
 

@@ -200,8 +200,16 @@ def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
 def test_plan_states_what_to_expect_and_no_errors(tmp_path):
     planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
     html = page(planned, tmp_path)
+    assert "The plan names no better places" in html
     assert "Expected uncertainty of a multilateration" in html
     assert "Errors of the volume" not in html
+
+
+def test_plan_shows_the_best_places_beside_those_that_were_set(tmp_path):
+    places = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3))
+    best = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3) + 0.005)
+    planned = bare(target_uncertainty=(("target",), np.full(12, UM)), station_place=places, best_place=best)
+    assert "4 900 1000 1100 905 1005 1105" in words(page(planned, tmp_path))
 
 
 def test_view_turns_with_the_buttons():
