@@ -130,7 +130,8 @@ def _summary(beam: Found, errors: xr.Dataset, bar: beam_direction_bar.Bar | None
     off = beam_direction_planes.far_off(planes) if np.isfinite(planes.closure).sum() > 2 else []
     if off:
         words.append(
-            f"The planes contradict one another: {listed([f'plane {name}' for name, _ in off])} does not close."
+            f"The planes contradict one another: {listed([f'plane {name}' for name, _ in off])} "
+            f"{'do' if len(off) > 1 else 'does'} not close."
         )
     if bar is not None and math.isfinite(bar.radius):
         known = f" (known: {fixed(1e3 * bar.given, 4)} mm)" if math.isfinite(bar.given) else ""

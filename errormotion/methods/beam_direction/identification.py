@@ -10,7 +10,7 @@ import xarray as xr
 from scipy import stats
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibration import InclinationCalibration, tilt_text
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
 from errormotion.methods.beam_direction.compensation import Planes, Sensor, Settled, settle, uncompensated
@@ -62,7 +62,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         notes.append("No inclination compensation: the readings are taken as they are.")
     else:
         settled = settle(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
-    corrected = _corrected(data, settled, sensor, settings)
+    corrected = _corrected(data, settled, sensor, settings, notes)
     origin = locate(settled.direction, settled.planes.offsets, settled.planes.covariances, data.points,
                     data.point_uncertainty)  # fmt: skip
     found = propagate(settled, origin, data.point_uncertainty)
@@ -164,18 +164,28 @@ def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: 
     chi2 = closure_chi2(found)
     if chi2 <= stats.chi2.ppf(1 - FALSE_ALARM, freedom):
         return 1.0
-    z = np.abs(found.closure) / np.sqrt(np.diag(found.closure_covariance))
-    worst = int(np.argmax(z))
     times = float(np.sqrt(chi2 / freedom))
     cause = (
         "a calibration that does not hold" if settled.iterations else "the sensor's inclination error, uncompensated"
     )
     notes.append(
-        f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; worst is "
-        f"{data.names[worst].lower()}, off by {found.closure[worst]:.2g}, {z[worst]:.1f} standard uncertainties. "
-        f"Perhaps {cause}, or a plane that moved. The uncertainties are raised {times:.3g} times."
+        f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; "
+        f"{_worst(data, found)}. Perhaps {cause}, or a plane that moved. "
+        f"The uncertainties are raised {times:.3g} times."
     )
     return times
+
+
+def _worst(data: Readings, found: Propagated) -> str:
+    """Say which plane closes worst. Three planes have one contradiction, of the same size for each: none is worst."""
+    z = np.abs(found.closure) / np.sqrt(np.diag(found.closure_covariance))
+    worst = int(np.argmax(z))
+    if len(z) == 3:
+        return f"all by {z[worst]:.1f} standard uncertainties, since three planes do not tell which of them is wrong"
+    return (
+        f"worst is {data.names[worst].lower()}, off by {found.closure[worst]:.2g}, "
+        f"{z[worst]:.1f} standard uncertainties"
+    )
 
 
 def _note_roots(settled: Settled, data: Readings, notes: list[str]) -> None:
@@ -203,6 +213,8 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
             "with independent normals."
         )
         return
+    if not data.point_uncertainty > 0:
+        notes.append("No plane_point_uncertainty in the data: the known points of the planes were taken as exact.")
     if not np.isfinite(data.nominal_origin).all():
         notes.append("No nominal_origin in the data: the zero point is in beam_origin, its error is unknown.")
     if known > 3 and origin.chi2 > stats.chi2.ppf(1 - FALSE_ALARM, known - 3):
@@ -213,16 +225,23 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
         )
 
 
-def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings: Settings) -> Array:
-    """Return the compensated readings (plane, reading), m; refuse tilts and depths that were not calibrated."""
+def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings: Settings, notes: list[str]) -> Array:
+    """Return the compensated readings (plane, reading), m; tilts and depths that were not calibrated are refused or noted."""
     if sensor is None or settled.tilt is None:
         return data.raw
     values = []
     for name, reading, at in zip(data.names, data.distance, settled.tilt, strict=True):
         try:
-            values.append(sensor.calibration.compensate(reading, at, sensor.mid_range, settings.extrapolate).value)
+            value = sensor.calibration.compensate(reading, at, sensor.mid_range).value
         except MethodError as error:
-            raise MethodError(f"{name}: {error}") from error
+            if not settings.extrapolate:
+                raise MethodError(f"{name}: {error}") from error
+            value = sensor.calibration.compensate(reading, at, sensor.mid_range, extrapolate=True).value
+            notes.append(
+                f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not speak for {tilt_text(at)}, or "
+                "not for all of the readings there."
+            )
+        values.append(value)
     return np.array(values)
 
 

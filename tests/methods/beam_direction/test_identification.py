@@ -145,6 +145,9 @@ def test_without_compensation_it_is_said_and_planes_contradict_one_another(machi
     assert "No inclination compensation" in told
     assert "The planes contradict one another: chi-square" in told
     assert "The uncertainties are raised" in told
+    assert "worst is plane" in told
+    told = notes(identify(machine.raw_beam_direction(FOUR[:3], seed=0)))
+    assert "three planes do not tell which of them is wrong" in told
 
 
 def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
@@ -221,6 +224,13 @@ def test_sound_data_raise_no_alarm(machine):
         notes(identify(machine.raw_beam_direction(FOUR, seed=seed, inclination_error=False))) for seed in range(25)
     ]
     assert set(alarms) == {"No inclination compensation: the readings are taken as they are."}
+
+
+def test_known_points_without_an_uncertainty_are_said_to_be_taken_as_exact(machine):
+    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    told = "the known points of the planes were taken as exact"
+    assert told in notes(identify(raw.drop_vars("plane_point_uncertainty")))
+    assert told in notes(identify(raw.assign(plane_point_uncertainty=((), np.nan, {"units": "m"}))))
 
 
 def test_missing_and_out_of_range_readings_are_counted(machine):
@@ -318,7 +328,10 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
     file = str(tmp_path / "holed.nc")
     refused(raw, r"Plane 2: Calibration 'holed': .* leave a hole; nearest calibrated", compensation=file)
     errors = identify(raw, compensation=file, extrapolate=True)
-    assert np.trace(errors["covariance"].values[0]) > 0
+    assert "Plane 2: extrapolated. Calibration 'holed' does not speak for" in notes(errors)
+    assert "Plane 1: extrapolated" not in notes(errors)
+    deviation = twist_error(errors, machine) / np.sqrt(np.diag(errors["covariance"].values[0]))
+    assert np.abs(deviation).max() < 4
 
 
 def test_a_calibration_without_triangulation_plane(machine, calibration):
