@@ -104,7 +104,9 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
         component="tool",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
-        functional_point=data.reflector.mean(axis=0),
+        functional_point=data.reflector[0]
+        if np.ptp(data.reflector, axis=0).max() == 0
+        else data.reflector.mean(axis=0),
         reference=DATUM,
         method=method,
         method_version=version,
@@ -215,7 +217,8 @@ def _refuse_move(d: Array, data: Readings, rough: Array | None, noise: Array, er
         f"Expected every station to stay where it is; the readings say that station {name} stood elsewhere from target "
         f"{target} on, by about {move.distance * 1e3:.3g} mm: taken as two stations the readings scatter "
         f"{move.sigma0:.3g} times their noise, as one {move.sigma0_before:.3g} times. Measure this set-up again, or "
-        "give its readings from there on as a further station."
+        "give its readings from there on as a further station. A set-up that drifts looks alike: return to some "
+        "targets within it."
     ) from error
 
 

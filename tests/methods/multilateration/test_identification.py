@@ -1,0 +1,337 @@
+"""From raw data to an error dataset: the truth, the datum, scale, returns, and every wrong input with its message."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from errormotion import datasets
+from errormotion.errors import DatasetError, MethodError
+from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration.refraction import refractive_index
+from errormotion.methods.multilateration.volume import diagonals, grid, volumetric_errors
+from errormotion.twin import VirtualMachine
+
+XYZ = ("EX", "EY", "EZ")
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return VirtualMachine("cframe", seed=3)
+
+
+@pytest.fixture(scope="module")
+def raw(machine):
+    return machine.raw_multilateration(seed=1)
+
+
+@pytest.fixture(scope="module")
+def errors(raw):
+    return Multilateration().identify(raw)
+
+
+def vectors(ds):
+    return np.stack([ds[name].values for name in XYZ], axis=-1)
+
+
+def spread(ds):
+    return np.sqrt(np.einsum("tii->ti", ds["covariance"].values[:, :3, :3]))
+
+
+def notes(ds):
+    return "\n".join(ds.attrs["notes"])
+
+
+def test_targets_are_where_they_truly_are_within_their_uncertainty(machine, errors):
+    truth = machine.truth_multilateration(machine.target_grid())
+    left = vectors(errors) - vectors(truth)
+    chi2 = sum(e @ np.linalg.solve(C[:3, :3], e) for e, C in zip(left, errors["covariance"].values, strict=True))
+    # 300 values of which stations share ten directions: the mean of chi-square to 3 sigma of some 60 freedoms.
+    assert chi2 / left.size == pytest.approx(1.0, abs=0.55)
+    assert np.all(np.abs(left) < 5 * spread(errors))
+
+
+def test_the_result_is_an_error_dataset_with_all_that_a_report_needs(raw, errors):
+    datasets.validate(errors)
+    assert (errors.attrs["component"], errors.attrs["machine"]) == ("tool", "C-frame 610")
+    assert "six motions of the whole" in errors.attrs["reference"]
+    np.testing.assert_array_equal(errors.attrs["functional_point"], raw["reflector"].values[0])
+    for name in ("station_place", "station_covariance", "dead_path", "residual", "left_out", "iterations", "condition"):
+        assert name in errors
+    assert np.isnan(errors["EA"].values).all()
+    assert list(errors.em.budget()["group"].values) == ["stations", "independent"]
+    assert int(errors["iterations"]) < 10
+    assert "ECY: not told from EXY" in notes(errors)
+
+
+def test_the_datum_has_no_motion_of_the_whole(raw, errors):
+    e, place = vectors(errors), raw["target_nominal"].values
+    place = place - place.mean(axis=0)
+    assert np.abs(e.mean(axis=0)).max() < 1e-12
+    # The fit is a rotation, not its first order: errors of 1e-5 m leave their square.
+    assert np.abs(np.cross(place, e).mean(axis=0)).max() < 1e-10
+
+
+def test_stations_and_dead_paths_are_found(machine, raw, errors):
+    off = errors["station_place"].values - machine.tracker_places()
+    u = np.sqrt(np.einsum("sii->si", errors["station_covariance"].values))
+    # The datum is that of the targets: their true errors turn the stations by some 10 um.
+    assert np.abs(off).max() < 60e-6
+    assert np.all(u < 5e-6)
+    assert np.all(np.abs(raw["station_nominal"].values - machine.tracker_places()).max(axis=1) > 1e-3)
+
+
+def test_stations_need_no_rough_places(raw, errors):
+    anywhere = Multilateration().identify(raw.drop_vars("station_nominal"))
+    distances = Multilateration().identify(raw, Settings(start="distances"))
+    for other in (anywhere, distances):
+        # The last step of an iteration, not the start, decides: rounding of some 1e-12 m.
+        np.testing.assert_allclose(vectors(other), vectors(errors), atol=1e-10)
+
+
+def test_covariance_and_spread_over_seeds_agree():
+    squares, held = [], []
+    for seed in range(25):
+        virtual = VirtualMachine("cframe", seed=seed)
+        q = virtual.target_grid((4, 4, 3))
+        found = Multilateration().identify(virtual.raw_multilateration(q, seed=seed), Settings(parametric=False))
+        left = vectors(found) - vectors(virtual.truth_multilateration(q))
+        C = found["covariance"].values[:, :3, :3]
+        squares.append(left[7] @ np.linalg.solve(C[7], left[7]))
+        held.append(np.abs(left) < 1.96 * spread(found))
+    low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], 75)
+    assert low < sum(squares) < high
+    assert 0.92 < np.mean(held) < 0.98
+
+
+# ---------------------------------------------------------------- the axes and the volume
+
+
+def test_the_volume_between_the_targets_follows_from_the_axes(machine, errors):
+    q = grid(errors["axes_low"].values, errors["axes_high"].values, (4, 3, 3))
+    volume = volumetric_errors(errors, q)
+    datasets.validate(volume)
+    measured, both = machine.target_grid(), np.concatenate([machine.target_grid(), q])
+    truth = vectors(machine.truth_multilateration(both))
+    # The truth of both sets, brought into the datum of the measured one.
+    place = both + errors.attrs["functional_point"]
+    shift = _motion(place[: len(measured)], truth[: len(measured)], place)
+    left = vectors(volume) - (truth - shift)[len(measured) :]
+    assert np.mean(np.abs(left) < 2 * spread(volume)) > 0.85
+    assert spread(volume).mean() < spread(errors).mean()
+
+
+def _motion(place, error, everywhere):
+    centre = place.mean(axis=0)
+
+    def columns(at):
+        x, y, z = (at - centre).T
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        rows = [[one, zero, zero, zero, z, -y], [zero, one, zero, -z, zero, x], [zero, zero, one, y, -x, zero]]
+        return np.moveaxis(np.array(rows), 2, 0)
+
+    motion = np.linalg.lstsq(columns(place).reshape(-1, 6), error.ravel())[0]
+    return columns(everywhere) @ motion
+
+
+def test_the_volume_outside_of_what_was_measured_is_not_known(errors):
+    volume = volumetric_errors(errors, [errors["axes_high"].values + 0.01, errors["axes_low"].values])
+    assert np.isnan(vectors(volume)[0]).all()
+    assert np.isfinite(vectors(volume)[1]).all()
+    assert "outside" in notes(volume)
+
+
+def test_another_tool_needs_what_one_reflector_did_not_show(errors):
+    here, there = (volumetric_errors(errors, [[0.0, 0.0, 0.2]], tool) for tool in (None, (0.02, -0.01, -0.2)))
+    assert np.isfinite(vectors(here)).all()
+    assert np.isnan(vectors(there)[0, :2]).all()  # EAZ and EBZ swing the longer tool
+
+
+def test_diagonals_run_from_corner_to_corner():
+    lines = diagonals((0, 0, 0), (1, 2, 3), 3)
+    assert lines.shape == (4, 3, 3)
+    np.testing.assert_array_equal(lines[3], [(1, 2, 0), (0.5, 1, 1.5), (0, 0, 3)])
+    np.testing.assert_array_equal(lines[:, 1], np.tile((0.5, 1, 1.5), (4, 1)))
+
+
+def test_without_a_chain_there_are_no_axes(raw):
+    blank = {key: value for key, value in raw.attrs.items() if key != "chain"}
+    found = Multilateration().identify(raw.drop_attrs().assign_attrs(blank))
+    assert "EXX" not in found
+    assert "chain of the machine is not known" in notes(found)
+    with pytest.raises(MethodError, match="no errors of the axes"):
+        volumetric_errors(found, [[0.0, 0.0, 0.1]])
+
+
+# ---------------------------------------------------------------- scale
+
+
+def test_an_unknown_scale_is_in_the_budget(raw, errors):
+    found = Multilateration().identify(raw, Settings(scale_uncertainty="2 um/m"))
+    budget = found.em.budget()
+    assert list(budget["group"].values) == ["stations", "scale of the tracker", "independent"]
+    place = raw["target_nominal"].values
+    shape = 2e-6 * (place - place.mean(axis=0))
+    np.testing.assert_allclose(np.abs(budget.values[1][:, :3]), np.abs(shape), atol=1e-9)
+
+
+def test_lengths_in_vacuum_become_lengths_in_air(raw, errors):
+    shape = raw["displacement"].shape
+    air = {"air_temperature": (23.0, "degC"), "air_pressure": (98e3, "Pa"), "relative_humidity": (0.4, "1")}
+    n = float(refractive_index(23.0, 98e3, 0.4))
+    optical = raw.assign(
+        {name: (("station", "target"), np.full(shape, value), {"units": unit}) for name, (value, unit) in air.items()}
+    )
+    optical["displacement"] = (raw["displacement"] * n).assign_attrs(units="m")
+    optical["refractive_index"] = ("station", "target"), np.ones(shape), {"units": "1"}
+    found = Multilateration().identify(optical)
+    np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-11)
+    # 0.2 K is 0.19 um/m, 50 Pa 0.13 um/m.
+    assert "refraction" in found.em.budget()["group"].values
+    with pytest.raises(MethodError, match="air_pressure"):
+        Multilateration().identify(optical.drop_vars("air_pressure"))
+
+
+def test_scales_are_brought_to_20_degrees(raw, errors):
+    warm = {"coefficient": 11.5e-6, "temperature": 23.0, "coefficient_uncertainty": 1e-6}
+    found = Multilateration().identify(raw, Settings(expansion=warm))
+    position = raw["target_nominal"].values
+    shape = 3 * 11.5e-6 * (position - position.mean(axis=0))
+    # Second order: errors turn the beams by 1e-5.
+    np.testing.assert_allclose(vectors(found), vectors(errors) - shape, atol=2e-9)
+    assert "scales" in found.em.budget()["group"].values
+    with pytest.raises(MethodError, match="scale_temperature"):
+        Multilateration().identify(raw, Settings(expansion={"coefficient": "11.5 um/m/K"}))
+
+
+# ---------------------------------------------------------------- returns
+
+
+def test_drift_during_the_set_ups_is_taken_off(machine):
+    q = machine.target_grid((4, 4, 3))
+    q = np.concatenate([q, q[::3]])
+    rate = np.array([(2e-8, 0, 0, 0), (0, 6e-8, 0, 0), (0, 0, 0, -6e-8), (3e-8, 0, 0, 0)])
+    truth = vectors(machine.truth_multilateration(q))
+    raw = machine.raw_multilateration(q, seed=5, drift=rate)
+    found = Multilateration().identify(raw)
+    left = vectors(found) - truth
+    assert np.mean(np.abs(left) < 1.96 * spread(found)) > 0.85
+    assert np.sqrt(np.mean(left**2)) < 2e-6
+    assert "drift" in found.em.budget()["group"].values
+    with pytest.raises(MethodError, match="A set-up that drifts looks alike"):
+        Multilateration().identify(raw, Settings(drift="none"))
+
+
+def test_repeatability_of_the_machine_is_noise_where_set_ups_follow_one_another(machine):
+    raw = machine.raw_multilateration(seed=6, repeatability=2e-6)
+    stated = Multilateration().identify(raw, Settings(repeatability="2 um"))
+    raised = Multilateration().identify(raw)
+    truth = vectors(machine.truth_multilateration(machine.target_grid()))
+    for found in (stated, raised):
+        assert np.mean(np.abs(vectors(found) - truth) < 1.96 * spread(found)) > 0.88
+    assert "times as much as stated" in notes(raised)
+    assert "times as much as stated" not in notes(stated)
+
+
+def test_the_published_scheme_can_be_set_beside(raw, errors):
+    found = Multilateration().identify(raw, Settings(alternating=True))
+    assert int(found["alternating_iterations"]) > 5 * int(found["iterations"])
+    left = np.abs(found["alternating_place"].values - found["target_place"].values).max()
+    assert left < 20e-6  # it creeps towards the same answer; its noise is another
+
+
+# ---------------------------------------------------------------- wrong inputs
+
+
+def test_swapped_stations_are_named_and_the_targets_are_right(raw, errors):
+    swapped = raw.copy()
+    swapped["station_nominal"] = raw["station_nominal"].isel(station=[1, 0, 2, 3]).drop_vars("station")
+    found = Multilateration().identify(swapped)
+    assert "swapped" in notes(found)
+    np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
+
+
+def test_millimetres_for_metres_are_told(raw):
+    small = raw.assign(displacement=raw["displacement"] * 1e3)
+    with pytest.raises((MethodError, DatasetError), match=r"millimetres|in mm\?"):
+        Multilateration().identify(small)
+    field = raw.assign(displacement=(raw["displacement"] * 1e3).assign_attrs(units="mm"))
+    with pytest.raises(DatasetError, match="units 'm'; found 'mm'"):
+        Multilateration().identify(field)
+
+
+def test_one_distance_off_by_a_fringe_is_found_where_the_noise_allows(machine):
+    raw = machine.raw_multilateration(seed=2, station=_five(machine), noise=20e-9)
+    sound = Multilateration().identify(raw)
+    raw["displacement"][1, 41] += 633e-9 / 2
+    found = Multilateration().identify(raw)
+    assert int(found["left_out"].sum()) == 1
+    assert int(found["left_out"][1, 41]) == 1
+    assert np.abs(vectors(found) - vectors(sound)).max() < 100e-9
+    assert "left out" in notes(found)
+
+
+def _five(machine):
+    return np.concatenate([machine.tracker_places(), [(0.4, 0.3, 0.6)]])
+
+
+@pytest.mark.parametrize("moved", [30e-6, 1e-3])
+def test_a_station_that_moved_halfway_is_named(raw, moved):
+    half = raw.copy(deep=True)
+    target = raw["target_nominal"].values
+    station = raw["station_nominal"].values[1]
+    e = (target - station) / np.linalg.norm(target - station, axis=1)[:, None]
+    half["displacement"][1, 37:] -= e[37:] @ np.array([moved, -moved, moved])
+    with pytest.raises(MethodError, match=r"station S2 stood elsewhere from target T0(3[5-9]|4[01]) on"):
+        Multilateration().identify(half)
+
+
+def test_broken_beams_leave_targets_unknown_and_counted(raw):
+    broken = raw.copy(deep=True)
+    broken["displacement"][:, 5] = np.nan
+    broken["displacement"][:2, 6] = np.nan
+    broken["displacement"][1, 7] = np.nan
+    found = Multilateration().identify(broken)
+    known = np.isfinite(vectors(found)).all(axis=1)
+    assert not known[[5, 6]].any()
+    assert known[7]
+    assert "2 of 100 targets have fewer than three readings and are not known: T006, T007" in notes(found)
+
+
+def test_a_station_without_readings_is_named(raw):
+    silent = raw.copy(deep=True)
+    silent["displacement"][3] = np.nan
+    with pytest.raises(MethodError, match="No reading of station S4"):
+        Multilateration().identify(silent)
+
+
+def test_a_target_in_one_plane_with_its_stations_does_not_spoil_the_others(machine):
+    station = machine.tracker_places()
+    station[:3, 2] = -0.011  # the height of the lowest reflectors
+    raw = machine.raw_multilateration(seed=4, station=station)
+    raw["displacement"][3, 40] = np.nan  # T041 is among them
+    assert raw["target_nominal"].values[40, 2] == pytest.approx(-0.011)
+    found = Multilateration().identify(raw)
+    assert np.isnan(found["EX"].values[40])
+    assert np.isfinite(np.delete(found["EX"].values, 40)).all()
+    assert "hardly fixed by their readings" in notes(found)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda raw: raw.isel(station=slice(3)), "four stations"),
+        (lambda raw: raw.isel(target=slice(7)), "at least 10 targets"),
+        (lambda raw: raw.assign(displacement_noise=((), 0.0, {"units": "m"})), "displacement_noise above 0"),
+        (lambda raw: raw.assign(displacement=-raw["displacement"]), "sign"),
+        (lambda raw: raw.assign(target_nominal=raw["target_nominal"] * 1e3), "target_nominal"),
+    ],
+    ids=["three stations", "seven targets", "no noise", "sign", "targets in mm"],
+)
+def test_what_cannot_be_solved_is_said(raw, change, message):
+    with pytest.raises((MethodError, DatasetError), match=message):
+        Multilateration().identify(change(raw))
+
+
+def test_another_schema_is_refused(raw):
+    with pytest.raises((MethodError, DatasetError), match="spindle_drift"):
+        Multilateration().identify(raw.assign_attrs(schema="errormotion.raw.spindle_drift/1"))
