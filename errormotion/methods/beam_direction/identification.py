@@ -226,7 +226,7 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
 
 
 def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings: Settings, notes: list[str]) -> Array:
-    """Return the compensated readings (plane, reading), m; tilts and depths that were not calibrated are refused or noted."""
+    """Return the compensated readings (plane, reading), m; what was not calibrated is refused, or noted."""
     if sensor is None or settled.tilt is None:
         return data.raw
     values = []
