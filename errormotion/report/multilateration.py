@@ -184,6 +184,8 @@ def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
         ("readings less unknowns", integer(scalar(errors, "freedom"))),
         ("iterations", integer(scalar(errors, "iterations"))),
         ("condition of what can be determined", significant(scalar(errors, "condition"), 3)),
+        ("turns of the alternating scheme, beside ours", integer(scalar(errors, "alternating_iterations"))),
+        ("what it had left to go / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
         ("repeatability from returns / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
     ]
     rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]

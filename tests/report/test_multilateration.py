@@ -170,6 +170,14 @@ def test_bare_errors_have_a_chapter_that_says_what_is_missing(tmp_path):
         assert sentence in said
 
 
+def test_alternating_scheme_is_reported_beside_ours_where_it_was_run(tmp_path):
+    html = words(
+        page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
+    )
+    assert "iterations 4" in html
+    assert "turns of the alternating scheme, beside ours 715 what it had left to go / µm 0.250" in html
+
+
 def test_targets_that_are_unknown_are_counted(tmp_path):
     errors = measured()[0].copy(deep=True)
     for name in ("EX", "EY", "EZ", "covariance", "influence"):
