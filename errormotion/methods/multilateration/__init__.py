@@ -5,9 +5,10 @@ are the scale, ``drift`` is what places visited again tell, ``moving`` which sta
 errors of the axes, and ``volume`` is what these make of any grid.
 
 The numbers: ``solver`` (Gauss-Newton with every target eliminated), over ``model`` (the equations), ``kernels``
-(compiled loops), ``start`` (where the stations are, roughly), ``outliers`` (readings that are wrong), ``determinacy``
-(what distances determine), ``network`` (the answer and its covariances); ``bound`` foretells them without readings,
-and ``alternating`` is the scheme of the paper. Source: Takeuchi et al., estimation of three-dimensional volumetric
+and ``examination`` (compiled loops: to the solution, and at it), ``start`` (where the stations are, roughly),
+``turning`` (the datum), ``outliers`` (readings that are wrong), ``determinacy`` (what distances determine), ``network``
+(the answer and its covariances); ``bound`` foretells them without readings, and ``alternating`` is the scheme of the
+paper. Source: Takeuchi et al., estimation of three-dimensional volumetric
 errors of numerically controlled machine tools by a laser tracker.
 """
 
