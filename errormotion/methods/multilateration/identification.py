@@ -136,6 +136,7 @@ def _solved(raw: xr.Dataset, data: Readings, settings: Settings, notes: list[str
     corrected = d - correction
     network = first if not correction.any() else _network(corrected, data, noise, settings)
     factor = _noise_factor(network, corrected, data, noise, settings, notes)
+    _remark_on_stations(network, data, settings, notes)
     if settings.scale_uncertainty > 0:
         scale["tracker scale"] = settings.scale_uncertainty
     if not network.converged:
@@ -206,6 +207,17 @@ def _noise_factor(
     cause = "" if settings.together or settings.repeatability else " Perhaps the machine repeats worse (repeatability)."
     notes.append(f"The readings scatter {network.sigma0:.3g} times as much as stated; {what}.{cause}")
     return network.sigma0 if raised else 1.0
+
+
+def _remark_on_stations(network: Network, data: Readings, settings: Settings, notes: list[str]) -> None:
+    if data.station is None or any("swapped" in note for note in network.notes):
+        return
+    off = np.linalg.norm(network.station - data.station, axis=1)
+    for j in np.flatnonzero(off > settings.station_tolerance):
+        notes.append(
+            f"Station {data.stations[j]} was found {off[j] * 1e3:.3g} mm from its rough place. Is that place right, and "
+            "do the targets have the coordinates of the machine?"
+        )
 
 
 def _refuse_move(d: Array, data: Readings, rough: Array | None, noise: Array, error: Exception | None) -> None:

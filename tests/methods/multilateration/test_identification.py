@@ -250,6 +250,14 @@ def test_swapped_stations_are_named_and_the_targets_are_right(raw, errors):
     np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
 
 
+def test_a_station_far_from_its_rough_place_is_remarked_upon(raw, errors):
+    astray = raw.copy(deep=True)
+    astray["station_nominal"][2] += 0.2
+    found = Multilateration().identify(astray)
+    assert "Station S3 was found 3" in notes(found)  # 346 mm, and the person's 5 mm
+    np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
+
+
 def test_millimetres_for_metres_are_told(raw):
     small = raw.assign(displacement=raw["displacement"] * 1e3)
     with pytest.raises((MethodError, DatasetError), match=r"millimetres|in mm\?"):
