@@ -215,8 +215,8 @@ def _remark_on_stations(network: Network, data: Readings, settings: Settings, no
     off = np.linalg.norm(network.station - data.station, axis=1)
     for j in np.flatnonzero(off > settings.station_tolerance):
         notes.append(
-            f"Station {data.stations[j]} was found {off[j] * 1e3:.3g} mm from its rough place. Is that place right, and "
-            "do the targets have the coordinates of the machine?"
+            f"Station {data.stations[j]} was found {off[j] * 1e3:.3g} mm from its rough place. Is that place right, "
+            "and do the targets have the coordinates of the machine?"
         )
 
 
