@@ -10,6 +10,7 @@ from errormotion.campaign import runner
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import load_campaign
 from errormotion.errors import RunError
+from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.leica_emscon import SimulatedEmScon
 from errormotion.methods.multilateration import Multilateration
@@ -58,22 +59,20 @@ class Operator:
     """Carries the tracker to where it is asked for, to some millimetres."""
 
     def __init__(self):
-        self.rng = np.random.default_rng(5)
         self.messages = []
 
     def __call__(self, message):
         self.messages.append(message)
         asked = np.array(re.search(r"near \((.*)\) mm", message)[1].split(","), float) * 1e-3
         (tracker,) = (each for each in world("cframe", seed=3)._devices if isinstance(each, SimulatedEmScon))
-        tracker.scene.station = asked + 5e-3 * self.rng.normal(size=3)
-        tracker._broken = False
-        tracker.dead_path = tracker._new_dead_path()
+        tracker.carry_to(asked)
 
 
 @pytest.fixture
 def lab(tmp_path, monkeypatch):
     """Return a function that writes the lab; its tracker is carried by an operator."""
     monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
+    monkeypatch.delattr(VirtualController, "set_station")
 
     def write(fault="", **changes):
         text = CAMPAIGN

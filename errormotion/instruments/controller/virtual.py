@@ -256,6 +256,16 @@ class VirtualController(Driver):
         angles = {"inclination": inclination, "rotation": rotation}
         self._call("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
+    def set_station(self, position: Sequence[float]) -> None:
+        """Have the laser tracker beside the machine carried to a place in its coordinates, m, to some millimetres.
+
+        Raises
+        ------
+        InstrumentError
+            No tracker stands there, or something streams.
+        """
+        self._call("set_station", position=[float(x) for x in position])
+
     def _call(self, op: str, **arguments: Any) -> Any:
         self._number += 1
         self.transport.write(encode_request(self._number, op, arguments))

@@ -57,6 +57,8 @@ class SimulatedController(SimulatedDevice):
                 return {"duration": world.move_to(**arguments)}
             case "set_target":
                 world.set_target(**arguments)
+            case "set_station":
+                world.set_station(**arguments)
             case _:
                 raise ValueError(f"no such operation: {op}")
         return None

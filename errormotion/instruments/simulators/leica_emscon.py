@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count
 from typing import Any
 
@@ -23,6 +23,7 @@ LENGTHS = {0: 1.0, 1: 1e3, 2: 1e6}  # units a metre
 REFLECTORS = (("RRR 1.5in", 5, 19.05e-3), ("RRR 0.5in", 6, 6.35e-3), ("Cat's eye", 2, 0.0))
 MODELS = {"AT901": (14, "AT901-MR", 80.0), "AT4xx": (72, "AT402", 160.0)}
 NEST = (0.0, math.pi / 2, 0.3)  # direction (rad) and distance (m) of the place at the tracker for a reflector
+CARRIED = 5e-3  # m, one sigma: how well people put a tracker where they are asked to
 BEAM_ERROR = 201  # (m): a number of the tracker processor
 
 
@@ -89,6 +90,12 @@ class SimulatedEmScon(SimulatedDevice):
         now = self._begin + samples * self._milliseconds / 1000.0
         if not self.world.streaming and now > self.world.time:
             self.world.elapse(now - self.world.time)
+
+    def carry_to(self, position: Sequence[float]) -> None:
+        """Put the tracker near a place in machine coordinates, m, as people do; it counts from a new beginning."""
+        self.scene.station = np.array(position, dtype=float) + CARRIED * self._rng.normal(size=3)
+        self._broken = self._nested = False
+        self.dead_path = self._new_dead_path()
 
     # ------------------------------------------------------------------ commands
 

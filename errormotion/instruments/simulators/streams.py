@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -44,6 +45,14 @@ class TriggeredStream(Protocol):
     @property
     def seen(self) -> float | None:
         """Time, s."""
+
+
+@runtime_checkable
+class Carried(Protocol):
+    """A simulated device that somebody carries from place to place beside the machine."""
+
+    def carry_to(self, position: Sequence[float]) -> None:
+        """Put it near a place in machine coordinates, m, and have it take up its beam again."""
 
 
 class Device(Protocol):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.instruments.simulators.streams import Device, Stream, TriggeredStream
+from errormotion.instruments.simulators.streams import Carried, Device, Stream, TriggeredStream
 from errormotion.instruments.simulators.targets import TargetStand
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
@@ -227,6 +227,16 @@ class VirtualWorld:
             self.stand.put(kind, inclination, rotation)
             if self.stand.target is not None:
                 self.motion, self.path = None, here
+
+    def set_station(self, position: Sequence[float]) -> None:
+        """Have the trackers beside the machine carried to a place in its coordinates, m."""
+        trackers = [device for device in self._devices if isinstance(device, Carried)]
+        if not trackers:
+            raise InstrumentError("No tracker stands beside this machine; open it first, at the same machine and seed")
+        with self._change:
+            self._refuse_while_streaming("carry a tracker")
+        for tracker in trackers:
+            tracker.carry_to(position)
 
     def read_point(self, name: str) -> float:
         """Return what a point sensor with a range about zero reads now, m.
