@@ -144,6 +144,7 @@ def points(
     scan = _Scan(r[measured], places, beam, calibration, triangulation_normal, mid_range, extrapolate)
     surface, notes = _surface(normals, measured, scan)
     distance, N, turns = _at_rest(scan, surface)
+    notes += _extrapolated(scan, N)
 
     influence, sources = _influences(scan, N, distance)
     # The reading's noise comes through the compensation a little stretched.
@@ -282,6 +283,19 @@ def _compensated(scan: _Scan, normals: Array) -> Array:
         return scan.reading
     q = scan.tilt(normals)
     return np.asarray(scan.calibration.compensate(scan.reading, q, scan.mid_range, scan.extrapolate).value)
+
+
+def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
+    """Say how many points (normals (n, 3)) were compensated at tilts that the calibration does not speak for."""
+    if scan.calibration is None or normals is None:
+        return ()
+    beyond = int((~scan.calibration.supported(scan.tilt(normals))).sum())
+    if not beyond:
+        return ()
+    return (
+        f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not speak "
+        "for: what was taken off there is extrapolated.",
+    )
 
 
 def _influences(scan: _Scan, normals: Array | None, distance: Array) -> tuple[Array, tuple[str, ...]]:

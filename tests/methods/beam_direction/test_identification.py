@@ -248,7 +248,8 @@ def test_check_bar_is_seen_with_the_beam(machine, calibration):
     bar = machine.check_bar
     assert float(errors["bar_radius_fitted"]) == pytest.approx(bar.radius, abs=3 * float(errors["bar_radius_u"]) + 1e-7)
     across = np.cross(bar.axis, errors["bar_centre"].values - bar.point)
-    assert np.linalg.norm(across) < 30e-6
+    # Along the bar a centre means nothing; across it the beam's own uncertainty is in that of the centre.
+    assert np.linalg.norm(across) < 4 * np.linalg.norm(errors["bar_centre_u"].values)
     assert errors["bar_residual"].sizes == {"bar_reading": 20}
 
 

@@ -219,6 +219,8 @@ def test_tilt_beyond_the_calibration_is_refused(calibration: InclinationCalibrat
     options = {"calibration": calibration, "triangulation_normal": (0, 1, 0), "normals": np.tile(-steep, (3, 1))}
     with pytest.raises(MethodError, match="beyond the steepest calibrated setting"):
         points(READING, STAGE, ORIGIN, (0, 0, -1), **options)
+    allowed = points(READING, STAGE, ORIGIN, (0, 0, -1), **options, extrapolate=True)
+    assert "2 of 2 points lie at tilts" in " ".join(allowed.notes)  # the one without a reading is no point
 
 
 def test_normals_that_do_not_settle_are_told(calibration: InclinationCalibration) -> None:
