@@ -13,12 +13,17 @@ import re
 import time
 from pathlib import Path
 
-from validation import beam_direction, crossbeam_scan, spindle_drift
+from validation import beam_direction, crossbeam_scan, multilateration, spindle_drift
 
 from errormotion import __version__
 
 PAGE = Path(__file__).parent.parent / "docs" / "validation.md"
-PARTS = {"spindle_drift": spindle_drift, "crossbeam_scan": crossbeam_scan, "beam_direction": beam_direction}
+PARTS = {
+    "spindle_drift": spindle_drift,
+    "crossbeam_scan": crossbeam_scan,
+    "beam_direction": beam_direction,
+    "multilateration": multilateration,
+}
 INTRODUCTION = """\
 # Validation
 
