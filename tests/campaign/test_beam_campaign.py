@@ -8,7 +8,7 @@ import pytest
 from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
-from errormotion.errors import RunError
+from errormotion.errors import BenchError, RunError
 from errormotion.methods.beam_direction import BeamDirection
 from errormotion.twin import VirtualMachine
 
@@ -119,3 +119,9 @@ def test_an_interrupted_campaign_goes_on_with_the_faces_that_are_left(tmp_path, 
     assert raw.sizes["plane"] == 3
     np.testing.assert_allclose(raw["nominal_normal"].values[:, 2], np.cos(np.radians([25.0, 35.5, 35.5])), rtol=1e-12)
     assert run.finished
+
+
+def test_a_bench_without_a_control_is_refused_before_anything_is_measured(tmp_path):
+    control = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://cframe/controller?seed=3"'
+    with pytest.raises(BenchError, match="needs controller; the bench .* offers point_lds"):
+        write(tmp_path, [(control, "")])

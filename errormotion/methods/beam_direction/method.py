@@ -31,7 +31,7 @@ class BeamDirection:
             "errors of the stage: its axes are taken as straight and true",
         ),
     )
-    needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA, optional_instruments=("controller",))
+    needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
 
     def acquire(
