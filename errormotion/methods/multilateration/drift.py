@@ -98,8 +98,7 @@ def estimate_drift(
     square, freedom, pairs = 0.0, 0, 0
     for j in range(n):
         known = np.isfinite(displacement[j]) & np.isfinite(time[j])
-        groups = [np.flatnonzero(known & (place == k)) for k in np.unique(place[known])]
-        groups = [group for group in groups if len(group) > 1]
+        groups = _visits(place, known)
         if not groups:
             continue
         middle = float(np.mean(time[j, known]))
@@ -131,6 +130,14 @@ def estimate_drift(
             "No place was visited again within a set-up: drift and repeatability are not seen. Return to some targets."
         )
     return Drift(rate, correction, sources, repeatability, pairs)
+
+
+def _visits(place: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the known targets of each place that has several."""
+    found = np.flatnonzero(known)
+    found = found[np.argsort(place[found], kind="stable")]
+    groups = np.split(found, np.flatnonzero(np.diff(place[found])) + 1)
+    return [group for group in groups if len(group) > 1]
 
 
 def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array) -> tuple[Array, Array]:

@@ -226,8 +226,7 @@ def fit_machine(
     position, error, own, at, influence = position[known], error[known], own[known], at[known], influence[:, known]
     model = Chain.of(chain, position, at)
     terms, levels = _candidates(model, position, max_order)
-    place = position + at
-    centre = place.mean(axis=0)
+    centre = (position + at).mean(axis=0)
     N, b, square = _normal_equations(model, terms, position, at, centre, error, own, influence)
     unseen = _unseen(terms, levels, N, len(N) - len(terms))
     kept = [k for k, term in enumerate(terms) if term.error not in unseen]
@@ -244,9 +243,7 @@ def fit_machine(
             "explains: a machine that is not rigid, hysteresis, or error motions of higher order than "
             f"{max_order}. The uncertainties of the axes are raised to match."
         )
-    A = model.columns(terms, position, at)
-    G = model.motions(place, centre)
-    datum = np.linalg.lstsq(np.einsum("mai,maj->ij", G, G), np.einsum("mai,mat->it", G, A))[0]
+    datum = _datum(model, terms, position, at, centre)
     return Parametric(
         model, terms, found.value, scale * found.covariance, found.determined, unseen, float(np.sqrt(ratio)), freedom,
         datum, centre, tuple(notes),
@@ -293,6 +290,17 @@ def _normal_equations(
         square += float(y @ y)
     N[len(terms) + 6 :, len(terms) + 6 :] += np.eye(len(influence))
     return N, b, square
+
+
+def _datum(model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array) -> Array:
+    """Return the motion with the whole that fits the displacements of each term best, (6, term)."""
+    GG, GA = np.zeros((6, 6)), np.zeros((6, len(terms)))
+    for begin in range(0, len(position), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        G = model.motions(position[part] + reflector[part], centre).reshape(-1, 6)
+        GG += G.T @ G
+        GA += G.T @ model.columns(terms, position[part], reflector[part]).reshape(len(G), -1)
+    return np.asarray(np.linalg.lstsq(GG, GA)[0])
 
 
 def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, str]:
