@@ -110,6 +110,42 @@ class Samples:
     invalid: Mapping[str, int] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Touch:
+    """One touch that a probe is to make: to the start, toward the target until it trips, and back to the start.
+
+    Attributes
+    ----------
+    start, target : (3,) tuple of float
+        Commanded places of the tip, X Y Z, m: before the touch, and where the probe stops if nothing trips it.
+    item : int
+        What is touched (the number of a ball), for messages and for the dataset.
+    """
+
+    start: tuple[float, float, float]
+    target: tuple[float, float, float]
+    item: int = 0
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What came of one touch.
+
+    Attributes
+    ----------
+    position : (3,) tuple of float
+        Where the machine says that the tip was when the probe tripped, m; NaN where the touch gave none.
+    time : float
+        When it tripped, s on the clock of the machine (its ``state()["time"]``).
+    flag : str
+        Empty for a good touch; else why there is none: ``no trip``, ``tripped at the start``, ``repeat differs``.
+    """
+
+    position: tuple[float, float, float]
+    time: float
+    flag: str = ""
+
+
 @runtime_checkable
 class Instrument(Protocol):
     """A driver: one plain class. Nothing touches the wire before ``__enter__`` (or ``open``)."""
@@ -146,6 +182,9 @@ class Bench(Protocol):
 
     def of_kind(self, kind: str) -> Any:
         """Return the one instrument of this kind; BenchError names what is missing."""
+
+    def all_of_kind(self, kind: str) -> Mapping[str, Any]:
+        """Return every instrument of this kind by its name on the bench; none where there is none."""
 
     def has_kind(self, kind: str) -> bool:
         """Whether the bench offers an instrument of this kind."""

@@ -157,6 +157,10 @@ class OpenBench:
             f"Add one to {self.plan.source}."
         )
 
+    def all_of_kind(self, kind: str) -> dict[str, Any]:
+        """Return every instrument of this kind by its name on the bench; none where there is none."""
+        return {a.instrument.name: a.driver for a in self.answers if a.instrument.driver.info.kind == kind}
+
     def ask(self, message: str) -> None:
         """Ask the operator for something and wait until it is done; passes at once on a virtual bench."""
         if self.virtual:
