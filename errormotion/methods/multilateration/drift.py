@@ -53,6 +53,8 @@ class Drift:
         without returns.
     pairs : int
         Visits beyond the first of each place.
+    square, freedom : float, int
+        Sum of squares of what the returns leave, over the noise, and its freedoms.
     """
 
     rate: Array
@@ -60,6 +62,8 @@ class Drift:
     sources: list[Shared]
     repeatability: float
     pairs: int
+    square: float = 0.0
+    freedom: int = 0
 
 
 def places(nominal: Array) -> NDArray[np.intp]:
@@ -70,7 +74,7 @@ def places(nominal: Array) -> NDArray[np.intp]:
 
 def estimate_drift(
     displacement: Array, time: Array, place: NDArray[np.intp], e: Array, noise: Array, names: Sequence[str],
-    notes: list[str],
+    notes: list[str], *, certain: bool = True,
 ) -> Drift:  # fmt: skip
     """Return the drift that the returns show.
 
@@ -91,11 +95,13 @@ def estimate_drift(
         Of the stations.
     notes : list of str
         Added to.
+    certain : bool
+        The noise is; otherwise what the returns scatter is believed where it is more.
     """
     n, m = displacement.shape
     rate, correction = np.full((n, 4), np.nan), np.zeros((n, m))
     sources: list[Shared] = []
-    square, freedom, pairs = 0.0, 0, 0
+    returns: dict[int, tuple[Array, Array, Array]] = {}
     for j in range(n):
         known = np.isfinite(displacement[j]) & np.isfinite(time[j])
         groups = _visits(place, known)
@@ -104,9 +110,12 @@ def estimate_drift(
         middle = float(np.mean(time[j, known]))
         since = np.where(known, time[j] - middle, 0.0)
         terms = np.concatenate([np.ones((m, 1)), e[j]], axis=1) * since[:, None]
-        d, A = _within(groups, displacement[j], terms, noise[j])
+        returns[j] = (terms, *_within(groups, displacement[j], terms, noise[j]))
+    scatter = (1.0, 0) if certain else _scatter([(d, A) for _, d, A in returns.values()])
+    square, freedom, pairs = 0.0, 0, 0
+    for j, (terms, d, A) in returns.items():
         pairs += len(d)
-        order = _order(d, A)
+        order = _order(d, A, scatter)
         rate[j] = 0.0
         left = d
         if order:
@@ -129,7 +138,7 @@ def estimate_drift(
         notes.append(
             "No place was visited again within a set-up: drift and repeatability are not seen. Return to some targets."
         )
-    return Drift(rate, correction, sources, repeatability, pairs)
+    return Drift(rate, correction, sources, repeatability, pairs, square, freedom)
 
 
 def _visits(place: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
@@ -152,15 +161,33 @@ def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array
     return np.concatenate(left), np.concatenate(rows)
 
 
-def _order(d: Array, A: Array) -> int:
-    """Return how many of the columns of A explain d: none, 1, or all four."""
+def _scatter(returns: list[tuple[Array, Array]]) -> tuple[float, int]:
+    """Return by how much the variance is larger than stated when all drifts are free (1 or more), and its freedoms."""
+    square, freedom = 0.0, 0
+    for d, A in returns:
+        order = max((k for k in _orders(d, A)), default=0)
+        left = d - A[:, :order] @ np.linalg.lstsq(A[:, :order], d)[0] if order else d
+        square, freedom = square + float(left @ left), freedom + len(d) - order
+    return (max(square / freedom, 1.0), freedom) if freedom else (1.0, 0)
+
+
+def _orders(d: Array, A: Array) -> list[int]:
+    """Return how many of the columns of A may be tried: 1, or all four."""
+    return [k for k in (1, A.shape[1]) if len(d) > k and np.linalg.cond(A[:, :k]) <= _ALIKE]
+
+
+def _order(d: Array, A: Array, scatter: tuple[float, int]) -> int:
+    """Return how many of the columns of A explain d: none, 1, or all four.
+
+    ``scatter`` is the variance and from how many freedoms it is known, 0: exactly.
+    """
     square, found = float(d @ d), 0
-    for order in (1, A.shape[1]):
-        part = A[:, :order]
-        if len(d) <= order or np.linalg.cond(part) > _ALIKE:
-            continue
+    variance, freedom = scatter
+    for order in _orders(d, A):
+        part, more = A[:, :order], order - found
         left = d - part @ np.linalg.lstsq(part, d)[0]
-        if square - float(left @ left) > stats.chi2.ppf(1 - DRIFTS, order - found):
+        limit = more * stats.f.ppf(1 - DRIFTS, more, freedom) if freedom else stats.chi2.ppf(1 - DRIFTS, more)
+        if square - float(left @ left) > variance * limit:
             square, found = float(left @ left), order
     return found
 

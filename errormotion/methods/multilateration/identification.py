@@ -10,8 +10,9 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from errormotion.datasets import build_errors, provenance
+from errormotion.datasets import provenance
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration import assembly, repeatability, uncertainty
 from errormotion.methods.multilateration.alternating import alternate
 from errormotion.methods.multilateration.drift import Drift, estimate_drift, places
 from errormotion.methods.multilateration.expansion import (
@@ -30,10 +31,14 @@ from errormotion.methods.multilateration.volume import parametric_extras
 from errormotion.methods.multilateration.weakness import weak_targets
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from errormotion.methods.multilateration.network import Network
+    from errormotion.methods.multilateration.repeatability import Repeatability
     from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.uncertainty import Parts, Scatter
 
     Array = NDArray[np.float64]
 
@@ -61,6 +66,8 @@ class Solution:
     drift: Drift
     sources: list[Shared]
     scale: dict[str, float]
+    scatter: Scatter
+    machine: Repeatability
 
 
 def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
@@ -76,31 +83,29 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
     found = _solved(raw, data, settings, notes)
     network = found.network
     notes.extend(network.notes)
-    own, influence, names, groups = _uncertainty(found)
+    made = _uncertainty(found, settings)
     error = network.target - data.nominal
-    unknown = np.isnan(error[:, 0])
-    covariance = np.full((*error.shape[:1], 6, 6), np.nan)
-    shared = influence[[not name.startswith("stations.") for name in names]]
-    covariance[:, :3, :3] = found.factor**2 * network.target_covariance + np.einsum("sta,stb->tab", shared, shared)
     values = np.full((len(error), 6), np.nan)
     values[:, :3] = error
-    full = np.full((*influence.shape[:2], 6), np.nan)
-    full[..., :3] = np.where(unknown[:, None], np.nan, influence)
     extras = _extras(data, found)
     extras |= _alternated(data, found, notes) if settings.alternating else {}
-    extras |= _axes(raw, data, settings, error, own, influence, notes)
+    extras |= _axes(raw, data, settings, error, made, notes)
+    covariance = made.covariance(network.target_covariance, found.factor**2)
+    if settings.together and found.machine.variance > 0:
+        covariance[:, :3, :3] += found.machine.variance * np.eye(3)
     for note in notes:
         log.warning(note)
     position = data.position
-    ds = build_errors(
+    ds = assembly.build(
         values,
         covariance,
-        dims=("target",),
-        coords={
-            "target": data.targets,
-            "direction": ("direction", list("xyz")),
+        made.influence,
+        {
+            "target": ("target", np.array(data.targets), {}),
+            "direction": ("direction", list("xyz"), {}),
             **{name: ("target", position[:, k], {"units": "m"}) for k, name in enumerate("xyz")},
         },
+        extras,
         component="tool",
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
@@ -111,10 +116,8 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
         method=method,
         method_version=version,
         provenance=provenance.make(settings, raw, None, steps=_steps(found, settings)),
-        influence=full,
-        sources=names,
-        source_groups=groups,
-        extras=extras,
+        sources=made.names,
+        source_groups=made.groups,
     )
     return ds.assign_attrs(notes=notes or [""])
 
@@ -123,25 +126,49 @@ def _solved(raw: xr.Dataset, data: Readings, settings: Settings, notes: list[str
     """Solve the network, correct the readings for what its directions are needed for, and solve it again."""
     times, scale = air_scale(raw, settings.air, notes)
     d = data.displacement * times
-    noise = np.full(d.shape, data.noise if settings.together else np.hypot(data.noise, settings.repeatability))
+    machine = repeatability.stated(settings.repeatability, settings.repeatability_uncertainty)
+    noise = _noise(data, machine, settings)
     _leave_out_weak(d, data, noise, settings, notes)
-    first = _network(d, data, noise, settings)
-    e = directions(np.where(np.isnan(first.target), data.nominal, first.target), first.stations)
-    drift = _drift(d, e, data, noise, settings, notes)
-    correction, sources = drift.correction, list(drift.sources)
+    network = _network(d, data, noise, settings)
+    correction: Array | None = None
+    sources: list[Shared] = []
+    e = None
+    if _drifts(data, settings, notes):
+        e = _beams(network, data)
+        drift, machine = _drift(d, e, data, machine, settings, notes)
+        if drift.correction.any():
+            correction = drift.correction
+    else:
+        drift = Drift(np.full((len(d), 4), np.nan), np.zeros((len(d), 1)), [], float("nan"), 0)
     if settings.expansion is not None:
+        e = _beams(network, data) if e is None else e
         warmer, strain = scale_strain(raw, settings.expansion)
-        correction = correction + along_beams(strain, data.position - data.position.mean(axis=0), e)
+        stretch = along_beams(strain, data.position - data.position.mean(axis=0), e)
+        correction = stretch if correction is None else correction + stretch
         sources += expansion_sources(warmer, data.position, e, settings.expansion)
-    corrected = d - correction
-    network = first if not correction.any() else _network(corrected, data, noise, settings)
-    factor = _noise_factor(network, corrected, data, noise, settings, notes)
+    corrected = d if correction is None else d - correction
+    now = _noise(data, machine, settings)
+    if correction is not None or now[0, 0] != noise[0, 0]:
+        network = _network(corrected, data, now, settings, drift.sources)
+    if settings.together:
+        machine = repeatability.from_places(machine, network, places(data.nominal), 1.0, notes)
+    factor, scatter, machine = _noise_factor(network, corrected, data, machine, settings, notes)
     _remark_on_stations(network, data, settings, notes)
     if settings.scale_uncertainty > 0:
         scale["tracker scale"] = settings.scale_uncertainty
     if not network.converged:
         notes.append(f"The network has not settled after {network.iterations} passes; its figures are rough.")
-    return Solution(network, factor, corrected, drift, sources, scale)
+    return Solution(network, factor, corrected, drift, sources, scale, scatter, machine)
+
+
+def _noise(data: Readings, machine: Repeatability, settings: Settings) -> Array:
+    """Return the standard deviation of every reading, (n, m), m: one number, seen as many."""
+    variance = 0.0 if settings.together else machine.variance
+    return np.broadcast_to(np.sqrt(data.noise**2 + variance), data.displacement.shape)
+
+
+def _beams(network: Network, data: Readings) -> Array:
+    return directions(np.where(np.isnan(network.target), data.nominal, network.target), network.stations)
 
 
 def _leave_out_weak(d: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]) -> None:
@@ -156,11 +183,18 @@ def _leave_out_weak(d: Array, data: Readings, noise: Array, settings: Settings, 
         )
 
 
-def _network(d: Array, data: Readings, noise: Array, settings: Settings) -> Network:
-    """Solve; where readings fit no network, say whether a station moved."""
+def _network(d: Array, data: Readings, noise: Array, settings: Settings, sources: Sequence[Shared] = ()) -> Network:
+    """Solve; where readings fit no network, say whether a station moved.
+
+    ``sources`` are what is not known of the drift: further parameters, each known to 1 beforehand.
+    """
     rough = data.station if settings.start == "nominal" else None
+    extra = np.nan_to_num([source.change for source in sources]) if sources else None
     try:
-        return solve(d, data.nominal, rough, noise=noise, robust=settings.robust)
+        return solve(
+            d, data.nominal, rough, noise=noise, robust=settings.robust, extra=extra,
+            extra_prior=None if extra is None else np.ones(len(extra)),
+        )  # fmt: skip
     except MethodError as error:
         if _solvable(d, data, rough, noise):
             _refuse_move(d, data, rough, noise, error)
@@ -176,37 +210,58 @@ def _solvable(d: Array, data: Readings, rough: Array | None, noise: Array) -> bo
     return True
 
 
-def _drift(d: Array, e: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]) -> Drift:
-    n, m = d.shape
-    none = Drift(np.full((n, 4), np.nan), np.zeros((n, m)), [], float("nan"), 0)
+def _drifts(data: Readings, settings: Settings, notes: list[str]) -> bool:
+    """Return whether drift and repeatability are looked for in returns."""
     if settings.drift == "none" or settings.together:
-        return none
+        return False
     if not data.timed:
         notes.append("The times of the readings are not in the data (reading_time): drift is not seen.")
-        return none
-    return estimate_drift(d, data.time, places(data.nominal), e, noise, data.stations, notes)
+    return data.timed
+
+
+def _drift(
+    d: Array, e: Array, data: Readings, machine: Repeatability, settings: Settings, notes: list[str]
+) -> tuple[Drift, Repeatability]:
+    """Return drift and repeatability, each estimated with the other known."""
+    place, stated = places(data.nominal), machine
+    certain = bool(stated.source) and stated.spread == 0
+    noise = _noise(data, stated, settings)
+    first: list[str] = []
+    drift = estimate_drift(d, data.time, place, e, noise, data.stations, first, certain=certain)
+    machine = repeatability.from_returns(stated, drift, data.noise, float(noise[0, 0]), [])
+    if not drift.freedom or machine == stated:
+        notes.extend(first)
+        return drift, repeatability.from_returns(stated, drift, data.noise, float(noise[0, 0]), notes)
+    noise = _noise(data, machine, settings)
+    drift = estimate_drift(d, data.time, place, e, noise, data.stations, notes, certain=certain)
+    return drift, repeatability.from_returns(stated, drift, data.noise, float(noise[0, 0]), notes)
 
 
 def _noise_factor(
-    network: Network, d: Array, data: Readings, noise: Array, settings: Settings, notes: list[str]
-) -> float:
-    """Return by how much the stated noise is raised; refuse readings of a station that moved."""
-    square, freedom = network.sigma0**2 * network.freedom, network.freedom
-    wrong = len(network.left_out) + 4 * len(network.undecided)
-    excess = freedom > 0 and square > stats.chi2.ppf(1 - FALSE_ALARM, freedom)
+    network: Network, d: Array, data: Readings, machine: Repeatability, settings: Settings, notes: list[str]
+) -> tuple[float, Scatter, Repeatability]:
+    """Return by how much the noise is raised, its parts, the repeatability; refuse readings of a station that moved."""
+    freedom, wrong = network.freedom, len(network.left_out) + 4 * len(network.undecided)
+    told = 0.0 if settings.together else machine.spread / (data.noise**2 + machine.variance)
+    excess = freedom > 0 and repeatability.beyond(network, told)
     if excess or wrong > MANY_WRONG * np.isfinite(d).sum():
-        _refuse_move(d, data, network.station, noise, None)
-    if not excess:
-        if freedom > 0 and square < stats.chi2.ppf(FALSE_ALARM, freedom):
-            notes.append(
-                f"The readings scatter only {network.sigma0:.3g} times as much as stated; the stated noise was kept."
-            )
-        return 1.0
+        _refuse_move(d, data, network.station, _noise(data, machine, settings), None)
     raised = settings.noise == "auto"
-    what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
-    cause = "" if settings.together or settings.repeatability else " Perhaps the machine repeats worse (repeatability)."
-    notes.append(f"The readings scatter {network.sigma0:.3g} times as much as stated; {what}.{cause}")
-    return network.sigma0 if raised else 1.0
+    found = repeatability.explained(machine, network, data.noise, raise_it=raised, together=settings.together)
+    if excess:
+        what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
+        cause = "" if settings.together or machine.source else " Perhaps the machine repeats worse (repeatability)."
+        notes.append(f"The readings scatter {network.sigma0:.3g} times as much as stated; {what}.{cause}")
+    elif freedom > 0 and told == 0 and network.sigma0**2 * freedom < stats.chi2.ppf(FALSE_ALARM, freedom):
+        notes.append(
+            f"The readings scatter only {network.sigma0:.3g} times as much as stated; the stated noise was kept."
+        )
+    if "returns" in found[2].source and found[2].variance > 2 * found[2].spread:
+        notes.append(
+            f"The machine comes back to within {found[2].value * 1e6:.2g} um (standard deviation of a coordinate, "
+            f"known to {found[2].uncertainty * 1e6:.1g} um), by {found[2].source}."
+        )
+    return found
 
 
 def _remark_on_stations(network: Network, data: Readings, settings: Settings, notes: list[str]) -> None:
@@ -234,29 +289,23 @@ def _refuse_move(d: Array, data: Readings, rough: Array | None, noise: Array, er
     ) from error
 
 
-def _uncertainty(found: Solution) -> tuple[Array, Array, list[str], list[str]]:
-    """Return each target's own covariance (m, 3, 3), influences (source, m, 3), their names and groups."""
-    network = found.network
-    own, factor, _ = network.blocks()
-    rows = [found.factor * factor.transpose(2, 0, 1)]
-    names = [f"stations.{k}" for k in range(factor.shape[2])]
-    groups = ["stations"] * len(names)
-    if found.scale:
-        stretched, _ = network.response(np.nan_to_num(found.corrected))
-        for name, relative in found.scale.items():
-            if relative > 0:
-                rows.append(relative * stretched[None])
-                names.append(name)
-                groups.append("scale of the tracker" if name == "tracker scale" else "refraction")
-    for shared in found.sources:
-        rows.append(network.response(np.nan_to_num(shared.change))[0][None])
-        names.append(shared.name)
-        groups.append(shared.group)
-    return found.factor**2 * own, np.concatenate(rows), names, groups
+def _uncertainty(found: Solution, settings: Settings) -> Parts:
+    """Return what the targets' uncertainty is made of."""
+    scales = [
+        (name, "scale of the tracker" if name == "tracker scale" else "refraction", relative)
+        for name, relative in found.scale.items()
+        if relative > 0
+    ]
+    made = uncertainty.parts(
+        found.network, found.factor, found.scatter, scales, found.corrected if scales else np.empty(0), found.sources
+    )
+    if settings.together and found.machine.variance > 0:
+        made.own[:] += found.machine.variance * np.eye(3)
+    return made
 
 
 def _axes(
-    raw: xr.Dataset, data: Readings, settings: Settings, error: Array, own: Array, influence: Array, notes: list[str]
+    raw: xr.Dataset, data: Readings, settings: Settings, error: Array, made: Parts, notes: list[str]
 ) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as extra results; where there are none, a note says why."""
     if not settings.parametric:
@@ -270,8 +319,8 @@ def _axes(
             chain,
             data.position,
             error,
-            own,
-            np.nan_to_num(influence),
+            made.own,
+            made.influence[..., :3],
             reflector=data.reflector,
             max_order=settings.max_order,
         )
@@ -353,11 +402,19 @@ def _extras(data: Readings, found: Solution) -> dict[str, xr.DataArray]:
         "condition": array(network.condition, (), "1", "of what distances can determine"),
         "sigma0": array(network.sigma0, (), "1", "scatter of the readings over what was stated"),
         "freedom": array(network.freedom, (), "", "readings less unknowns"),
-        "noise": array(found.factor * 1 / np.max(network.weight), (), "m", "of a reading, repeatability included"),
+        "noise": array(found.factor / np.max(network.weight), (), "m", "of a reading, repeatability included"),
     }
     if data.station is not None:
         extras["station_nominal"] = array(data.station, vector, "m", "rough place of the tracker")
     if found.drift.pairs:
         extras["drift_rate"] = array(found.drift.rate, ("station", "drift_term"), "m/s", "during each set-up")
-        extras["repeatability"] = array(found.drift.repeatability, (), "m", "that the returns show beyond the noise")
+    if found.machine.source:
+        extras["repeatability"] = array(found.machine.value, (), "m", "of the machine, each coordinate of each visit")
+        extras["repeatability"].attrs["source"] = found.machine.source
+        extras["repeatability_u"] = array(found.machine.uncertainty, (), "m")
+    shares = found.scatter.shares
+    extras["scatter_share"] = xr.DataArray(
+        list(shares.values()), {"cause": list(shares)}, "cause",
+        attrs={"units": "1", "long_name": "of each cause in the variance of a reading"},
+    )  # fmt: skip
     return extras

@@ -223,15 +223,16 @@ def fit_machine(
             f"Parametric errors: expected at least ten known targets; found {np.count_nonzero(known)}. Measure more."
         )
     at = np.zeros_like(position) if reflector is None else reflector
-    position, error, own, at, influence = position[known], error[known], own[known], at[known], influence[:, known]
+    which = np.flatnonzero(known)
+    position, error, at = position[which], error[which], at[which]
     model = Chain.of(chain, position, at)
     terms, levels = _candidates(model, position, max_order)
     centre = (position + at).mean(axis=0)
-    N, b, square = _normal_equations(model, terms, position, at, centre, error, own, influence)
+    N, b, square, datum = _normal_equations(model, terms, position, at, centre, error, own, influence, which)
     unseen = _unseen(terms, levels, N, len(N) - len(terms))
     kept = [k for k, term in enumerate(terms) if term.error not in unseen]
     S = kept + list(range(len(terms), len(N)))
-    terms = [terms[k] for k in kept]
+    terms, datum = [terms[k] for k in kept], datum[:, kept]
     found = _most_evident(terms, N[np.ix_(S, S)], b[S], len(influence), square)
     freedom = 3 * len(position) - 6 - float(found.determined.sum())
     ratio = found.left / max(freedom, 1.0)
@@ -243,7 +244,6 @@ def fit_machine(
             "explains: a machine that is not rigid, hysteresis, or error motions of higher order than "
             f"{max_order}. The uncertainties of the axes are raised to match."
         )
-    datum = _datum(model, terms, position, at, centre)
     return Parametric(
         model, terms, found.value, scale * found.covariance, found.determined, unseen, float(np.sqrt(ratio)), freedom,
         datum, centre, tuple(notes),
@@ -270,37 +270,33 @@ def _candidates(model: Chain, position: Array, max_order: int) -> tuple[list[Ter
 
 def _normal_equations(
     model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array, error: Array, own: Array,
-    influence: Array,
-) -> tuple[Array, Array, float]:  # fmt: skip
-    """Return N, b and y' W y over terms, six motions of the whole, and the shared sources, which have a prior of 1."""
+    influence: Array, which: NDArray[np.intp],
+) -> tuple[Array, Array, float, Array]:  # fmt: skip
+    """Return N, b and y' W y over terms, six motions of the whole, and the shared sources, which have a prior of 1.
+
+    ``own`` and ``influence`` are of all targets, of which the others are ``which``. And the motion with the whole that
+    fits the displacements of each term best, (6, term).
+    """
     size = len(terms) + 6 + len(influence)
     N, b, square = np.zeros((size, size)), np.zeros(size), 0.0
+    GG, GA = np.zeros((6, 6)), np.zeros((6, len(terms)))
     for begin in range(0, len(position), _BLOCK):
         part = slice(begin, begin + _BLOCK)
         q, at = position[part], reflector[part]
-        A = np.concatenate(
-            [model.columns(terms, q, at), model.motions(q + at, centre), influence[:, part].transpose(1, 2, 0)], axis=2
-        )
+        G, shared = model.motions(q + at, centre), influence[:, which[part]].transpose(1, 2, 0)
+        A = np.concatenate([model.columns(terms, q, at), G, shared], axis=2)
+        G = G.reshape(-1, 6)
+        GG += G.T @ G
+        GA += G.T @ A.reshape(-1, size)[:, : len(terms)]
         # Whitened by each target's own covariance.
-        L = np.linalg.cholesky(own[part])
-        A = np.linalg.solve(L, A).reshape(-1, size)
-        y = np.linalg.solve(L, error[part][:, :, None]).ravel()
+        W = np.linalg.inv(np.linalg.cholesky(own[which[part]]))
+        A = np.matmul(W, A).reshape(-1, size)
+        y = np.matmul(W, error[part][:, :, None]).ravel()
         N += A.T @ A
         b += A.T @ y
         square += float(y @ y)
     N[len(terms) + 6 :, len(terms) + 6 :] += np.eye(len(influence))
-    return N, b, square
-
-
-def _datum(model: Chain, terms: list[Term], position: Array, reflector: Array, centre: Array) -> Array:
-    """Return the motion with the whole that fits the displacements of each term best, (6, term)."""
-    GG, GA = np.zeros((6, 6)), np.zeros((6, len(terms)))
-    for begin in range(0, len(position), _BLOCK):
-        part = slice(begin, begin + _BLOCK)
-        G = model.motions(position[part] + reflector[part], centre).reshape(-1, 6)
-        GG += G.T @ G
-        GA += G.T @ model.columns(terms, position[part], reflector[part]).reshape(len(G), -1)
-    return np.asarray(np.linalg.lstsq(GG, GA)[0])
+    return N, b, square, np.asarray(np.linalg.lstsq(GG, GA)[0])
 
 
 def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, str]:

@@ -115,7 +115,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
 
 def reading_noise(settings: Settings) -> float:
     """Return the standard deviation of a reading, m: the tracker's, and with set-ups in turn the machine's."""
-    repeated = 0.0 if settings.together else settings.repeatability
+    repeated = 0.0 if settings.together else settings.repeatability or 0.0
     return float(np.hypot(settings.layout.displacement_noise, repeated))
 
 

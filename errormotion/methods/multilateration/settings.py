@@ -90,8 +90,14 @@ class Settings(PluginSettings):
     together: bool = Field(
         default=False, description="all stations read at one moment; false: one tracker, set up in turn"
     )
-    repeatability: Length = Field(
-        default=0.0, ge=0, description="of the machine in each coordinate, standard deviation; 0: none but what shows"
+    repeatability: Length | None = Field(
+        default=None,
+        ge=0,
+        description="of the machine, each time that it comes to a place, standard deviation of each coordinate; "
+        "without: what returns show",
+    )
+    repeatability_uncertainty: Length = Field(
+        default=0.0, ge=0, description="standard uncertainty of it; 0: taken as stated, whatever returns show"
     )
     drift: Literal["auto", "none"] = Field(
         default="auto", description="estimate the drift during each set-up where places are visited again"
