@@ -26,6 +26,8 @@ class MachineKind:
         Heat of the spindle at n /min: heat_linear n + heat_square n^2, W.
     growth : mapping
         Error of the spindle to (body to um/K or urad/K), at the end of the bar.
+    behind : tuple of str
+        Bodies behind the last axis. They displace and tilt the spindle; the others also turn the frame of the axes.
     compensation : mapping
         Axis to (steady correction at top speed in m, time constant of the control's model in s).
     top_speed : float
@@ -45,6 +47,7 @@ class MachineKind:
     heat_square: float
     growth: Mapping[str, Table]
     compensation: Mapping[str, tuple[float, float]]
+    behind: tuple[str, ...] = ("spindle_front", "spindle_rear", "motor", "head")
     top_speed: float = 15000.0
     rapid: float = 20.0 / 60
 
@@ -165,12 +168,12 @@ GANTRY = MachineKind(
     heat_linear=0.016,
     heat_square=1.2e-6,
     growth={
-        "EX": {"head": 1.2, "column_front": 2.0, "column_rear": -2.0},
-        "EY": {"motor": 0.2, "head": 0.5},
-        "EZ": {"spindle_front": -1.2, "head": -1.5, "beam_top": -4.0, "beam_bottom": 6.0, "column_front": 6.0},
-        "EA": {"beam_top": -8.0, "beam_bottom": 8.0},
-        "EB": {"head": 3.0, "column_front": 6.0, "column_rear": -6.0},
-        "EC": {"motor": 0.6},
+        "EX": {"head": 2.0, "beam_bottom": 6.0, "column_front": 2.0, "column_rear": -2.0},
+        "EY": {"motor": 0.2, "head": 0.5, "beam_top": 8.0, "beam_bottom": 8.0},
+        "EZ": {"spindle_front": -1.2, "head": -3.0, "beam_top": -4.0, "beam_bottom": 6.0, "column_front": 6.0},
+        "EA": {"beam_top": -45.0, "beam_bottom": 45.0},
+        "EB": {"head": 3.0, "beam_bottom": 14.0, "column_front": 6.0, "column_rear": -6.0},
+        "EC": {"motor": 0.6, "screw_y": 6.0, "beam_top": 6.0},
     },
     compensation={"X": (3e-6, 900.0), "Y": (2e-6, 900.0), "Z": (-20e-6, 900.0)},
 )

@@ -20,6 +20,7 @@ from errormotion.twin.beam_rawdata import BeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.multilateration_rawdata import TrackerMeasurements
+from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.profiler import Profiler
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
@@ -32,10 +33,11 @@ SPIN_UP_TIME = 0.75
 #: sensors count as warm when they have been on for this time, s
 WARM_AFTER = 4 * 3600.0
 
-_PART = {name: number for number, name in enumerate(("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor"))}
+_PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "probing")
+_PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(BeamMeasurements, TrackerMeasurements):
+class VirtualMachine(BeamMeasurements, TrackerMeasurements, ProbeMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
@@ -74,7 +76,8 @@ class VirtualMachine(BeamMeasurements, TrackerMeasurements):
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
         A point sensor on the stage and what it looks at: see `BeamMeasurements`, also for the measurements with them.
-        Measurements with a laser tracker: see `TrackerMeasurements`.
+        Measurements with a laser tracker: see `TrackerMeasurements`; of balls by the machine itself: see
+        `ProbeMeasurements`.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -95,6 +98,7 @@ class VirtualMachine(BeamMeasurements, TrackerMeasurements):
         self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
         self.crossbeam: crossbeams.Crossbeam = crossbeams.seeded_crossbeam(self._rng("crossbeam"), self.travel["Y"])
         self._set_up_point_sensor(self._rng("point_sensor"))
+        self._set_up_probing(self._rng("probing"))
         self._sensing = self._sense()
 
     def __repr__(self) -> str:
@@ -121,6 +125,19 @@ class VirtualMachine(BeamMeasurements, TrackerMeasurements):
         """
         self.state = replace(self.state, schedule=self._schedule(schedule))
         self._sensing = self._sense()
+
+    def command(self, event: Event) -> None:
+        """Add to the schedule what is commanded at a time; all before that time stays as it was.
+
+        What the schedule holds for later times stays as well, and what it holds for the same time comes first.
+
+        Raises
+        ------
+        BenchError
+            As `start`; the schedule stays as it was.
+        """
+        events = sorted([*self.state.schedule.events, event], key=lambda each: each.time)
+        self.start(events)
 
     def spindle_speed(self, t: ArrayLike) -> Array:
         """Return the speed of the spindle at times t, 1/min, shape (n,)."""

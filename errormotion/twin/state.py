@@ -82,12 +82,19 @@ class ThermalState:
 
     def twist(self, t: ArrayLike) -> Array:
         """Return the spindle's thermal error at the end of the bar, m and rad, shape (n, 6), 0 in the cold state."""
+        return self.twist_and_turn(t)[0]
+
+    def twist_and_turn(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Return `twist`, and the part of its rotation that turns the frame of the axes, rad, shape (n, 3)."""
         warming = self.bodies(t) - self._cold
-        twist = np.zeros((warming.shape[0], 6))
-        for body in range(warming.shape[1]):
-            twist += warming[:, body, None] * self.growth[:, body]
+        twist, turn = np.zeros((warming.shape[0], 6)), np.zeros((warming.shape[0], 3))
+        for body, name in enumerate(self.network.names):
+            grown = warming[:, body, None] * self.growth[:, body]
+            twist += grown
+            if name not in self.kind.behind:
+                turn += grown[:, 3:]
         twist[:, :3] -= self.correction_at(t) * self.schedule.compensation(t)
-        return twist
+        return twist, turn
 
 
 def seeded_ambient(rng: np.random.Generator) -> Ambient:

@@ -1,0 +1,148 @@
+"""Balls on the table of the virtual machine, and the touch probe that finds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.errors import BenchError
+
+Array = NDArray[np.float64]
+
+#: of a ball, m: nominal radius; how far the true one may be off; roundness from peak to valley
+RADIUS, RADIUS_ERROR, FORM = 12.5e-3, 3e-6, 0.5e-6
+#: how well a ball is set up by hand, m (one sigma, each coordinate; at most three times that)
+PLACING = 0.1e-3
+#: where the balls stand, as a share of the travel: across from the middle, and up from below
+PLACES = (
+    *((-0.8, -0.8, 0.12), (0.8, -0.75, 0.50), (0.75, 0.8, 0.20), (-0.8, 0.75, 0.62)),
+    *((0.0, 0.0, 0.35), (0.1, -0.8, 0.15), (-0.1, 0.8, 0.45), (0.4, 0.1, 0.55)),
+)
+
+#: of the probe, m: nominal radius of its tip; how far the true one may be off; scatter of a trigger
+TIP_RADIUS, TIP_ERROR, NOISE = 3e-3, 1e-6, 0.25e-6
+#: pre-travel, m: its mean, and the amplitude of its three lobes
+PRETRAVEL, LOBING = 8e-6, 1.5e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Balls on posts.
+
+    Attributes
+    ----------
+    nominal : ndarray, (ball, 3)
+        Where they are said to stand, m, in commanded places of the tip.
+    centre : ndarray, (ball, 3)
+        Where they stand, m.
+    nominal_radius : float
+        m.
+    radius : ndarray, (ball,)
+        Mean radius of each, m.
+    form : ndarray, (ball, 3, 3)
+        The surface stands ``n @ form @ n`` above the mean radius in the direction n, m.
+    """
+
+    nominal: Array
+    centre: Array
+    nominal_radius: float
+    radius: Array
+    form: Array
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    @property
+    def names(self) -> list[str]:
+        """B1, B2 ..."""
+        return [f"B{i + 1}" for i in range(len(self))]
+
+    def first(self, count: int) -> Balls:
+        """Return the first ones."""
+        if not 1 <= count <= len(self):
+            raise BenchError(f"The table has room for 1 to {len(self)} balls; found {count}.")
+        part = slice(count)
+        return replace(
+            self,
+            nominal=self.nominal[part],
+            centre=self.centre[part],
+            radius=self.radius[part],
+            form=self.form[part],
+        )
+
+    def moved(self, ball: int, shift: ArrayLike) -> Balls:
+        """Return the same balls, one of them (counted from 0) pushed by ``shift`` (3,), m."""
+        if not 0 <= ball < len(self):
+            raise BenchError(f"The balls are counted from 0 to {len(self) - 1}; found {ball}.")
+        centre = self.centre.copy()
+        centre[ball] += np.asarray(shift, dtype=float)
+        return replace(self, centre=centre)
+
+    def height(self, ball: NDArray[np.intp], direction: Array) -> Array:
+        """Return how far the surfaces of balls (n,) are from their centres in unit directions (n, 3), m."""
+        form = np.einsum("ni,nij,nj->n", direction, self.form[ball], direction)
+        return np.asarray(self.radius[ball] + form)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A touch-trigger probe.
+
+    After the tip has touched, the machine goes on by the pre-travel before the probe trips; it is a little longer where
+    the three contacts of the probe's seat are stiffer. It is positive, and the spheres that are measured come out
+    smaller by its mean.
+
+    Attributes
+    ----------
+    nominal_tip_radius, tip_radius : float
+        As stated, and as it is, m.
+    noise : float
+        Scatter of one trigger along the normal (one sigma), m.
+    mean, lobing : float
+        Of the pre-travel, m.
+    phase : float
+        Azimuth of a lobe, rad.
+    """
+
+    nominal_tip_radius: float
+    tip_radius: float
+    noise: float
+    mean: float
+    lobing: float
+    phase: float
+
+    def pretravel(self, normal: ArrayLike) -> Array:
+        """Return the pre-travel for outward unit normals (n, 3) of the surface that is touched, m, shape (n,).
+
+        ``mean + lobing sin(theta)^3 cos(3 (azimuth - phase))``, theta from the axis of the spindle: without lobes along
+        the stylus.
+        """
+        n = np.atleast_2d(np.asarray(normal, dtype=float))
+        lobes = ((n[:, 0] + 1j * n[:, 1]) * np.exp(-1j * self.phase)) ** 3
+        return np.asarray(self.mean + self.lobing * lobes.real)
+
+
+def seeded_balls(rng: np.random.Generator, travel: Mapping[str, tuple[float, float]]) -> Balls:
+    """Return all the balls that the table has room for, spread in the travel at different heights."""
+    low, high = np.array([travel[axis] for axis in "XYZ"]).T
+    share = np.array(PLACES)
+    share[:, :2] = (1 + share[:, :2]) / 2
+    nominal = low + share * (high - low)
+    count = len(nominal)
+    off = np.clip(rng.normal(0, PLACING, (count, 3)), -3 * PLACING, 3 * PLACING)
+    radius = RADIUS + rng.uniform(-RADIUS_ERROR, RADIUS_ERROR, count)
+    form = rng.normal(size=(count, 3, 3))
+    form += form.transpose(0, 2, 1)
+    form -= np.trace(form, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    form *= FORM / np.ptp(np.linalg.eigvalsh(form), axis=1)[:, None, None]
+    return Balls(nominal, nominal + off, RADIUS, radius, form)
+
+
+def seeded_probe(rng: np.random.Generator) -> Probe:
+    """Return a good probe."""
+    mean, lobing = PRETRAVEL * rng.uniform(0.9, 1.1), LOBING * rng.uniform(0.9, 1.1)
+    tip = TIP_RADIUS + rng.uniform(-TIP_ERROR, TIP_ERROR)
+    return Probe(TIP_RADIUS, tip, NOISE, mean, lobing, rng.uniform(0, 2 * np.pi / 3))

@@ -1,0 +1,367 @@
+"""Balls on the table, touched by the machine itself: where the probe trips, and the truth behind it.
+
+The tip of the probe stands where the bar ended. Where the machine believes it to be at p, it is at p + e(p, t):
+
+    e(p, t) = E(t) + R(t) x M (p - f) + g(p)
+
+E is the thermal displacement of the spindle with the tip at f, R the part of its rotation that turns the frame of the
+axes, M keeps the axes that carry the tool (the others carry the table, which does not turn), and g is the geometric
+error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.twin import kernels, truth
+from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
+from errormotion.twin.geometry import GeometricErrors
+from errormotion.twin.probing_rawdata import Cycles, Moved, touches_dataset
+from errormotion.twin.state import ThermalState
+
+Array = NDArray[np.float64]
+ErrorAt = Callable[[Array], Array]
+
+#: balls on the table unless more are asked for
+BALLS = 4
+#: of a temperature sensor, K (one sigma)
+TEMPERATURE_NOISE = 0.02
+#: the probe has come free when the tip is this far off a ball, m
+RELEASE = 3e-6
+
+_TRIGGER, _THERMOMETER = 60, 61
+_SETTLED = 1e-15  # m
+_NO_SHIFT = np.zeros(3)
+
+
+class ProbeMeasurements:
+    """What a machine with a touch probe in its spindle and balls on its table can measure.
+
+    Attributes
+    ----------
+    balls : Balls
+        The four balls on the table; `balls_on_table` for more.
+    probe : Probe
+        In the spindle.
+    """
+
+    name: str
+    kind: str
+    seed: int
+    chain: str
+    travel: Mapping[str, tuple[float, float]]
+    state: ThermalState
+    geometry: GeometricErrors
+    balls: Balls
+    probe: Probe
+
+    @property
+    def spindle_functional_point(self) -> Array:
+        """Where the cold axis of rotation meets the end of the bar, m, shape (3,)."""
+        raise NotImplementedError
+
+    @property
+    def temperature_sensors(self) -> tuple[str, ...]:
+        """Names of the places whose temperature is known."""
+        raise NotImplementedError
+
+    def temperatures(self, t: ArrayLike) -> Array:
+        """Return the true temperatures at times t, degC, shape (n, sensor)."""
+        raise NotImplementedError
+
+    def spindle_speed(self, t: ArrayLike) -> Array:
+        """Return the speed of the spindle at times t, 1/min, shape (n,)."""
+        raise NotImplementedError
+
+    def _origin(self) -> truth.Origin:
+        raise NotImplementedError
+
+    def _set_up_probing(self, rng: np.random.Generator) -> None:
+        self._all_balls = seeded_balls(rng, self.travel)
+        self.balls = self._all_balls.first(BALLS)
+        self.probe = seeded_probe(rng)
+
+    # ------------------------------------------------------------------ truth
+
+    @property
+    def tool_axes(self) -> str:
+        """Axes that carry the tool, such as ``"XYZ"`` or ``"Z"``; the others carry the table."""
+        carrying = {joint.name for joint in self.geometry.machine.joints if joint.carries_tool}
+        return "".join(axis for axis in "XYZ" if axis in carrying)
+
+    @property
+    def probing_functional_point(self) -> Array:
+        """Commanded place of the tip at which it is where the bar ended, m, shape (3,)."""
+        return self.spindle_functional_point
+
+    def balls_on_table(self, count: int = BALLS) -> Balls:
+        """Return the balls when there are 1 to 8 of them; the first ones are always the same."""
+        return self._all_balls.first(count)
+
+    def probe_error(self, p: ArrayLike, t: ArrayLike) -> Array:
+        """Return where the tip is minus where the machine believes it to be, m, shape (n, 3).
+
+        Parameters
+        ----------
+        p : (n, 3) or (3,)
+            Commanded places of the tip, m.
+        t : (n,) or scalar
+            s.
+        """
+        places = np.atleast_2d(np.asarray(p, dtype=float))
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        return self._error_at(times)(places)
+
+    def truth_probing(self, t: ArrayLike, functional_point: ArrayLike | None = None) -> xr.Dataset:
+        """Return what probing can see of the thermal error, as an error dataset over ``time``, without uncertainty.
+
+        EX, EY, EZ are the displacement of the tip at ``functional_point``; EA, EB, EC the turn of the frame of the
+        axes. A tilt of the spindle behind the last axis displaces all balls alike and is in the displacement alone.
+        On a machine whose table moves, ask for each functional point anew: the error there is not the rigid motion of
+        the one here.
+
+        Parameters
+        ----------
+        t : (n,)
+            Times, s, increasing.
+        functional_point : (3,), optional
+            Commanded place of the tip, m; ``probing_functional_point`` where not given.
+        """
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        point = self.probing_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
+        twist, turn = self.state.twist_and_turn(times)
+        displacement = twist[:, :3] + np.cross(turn, self._carried(point))
+        coords = {
+            "time": ("time", times, {"units": "s"}),
+            "sensor": list(self.temperature_sensors),
+            "temperature": (("time", "sensor"), self.temperatures(times), {"units": "degC"}),
+            "spindle_speed": ("time", self.spindle_speed(times), {"units": "1/min"}),
+        }
+        where = "time", coords, "tool", point, "cold state at time 0", self._origin()
+        return truth.dataset(np.hstack([displacement, turn]), *where)
+
+    def _carried(self, place: Array) -> Array:
+        """Return M (p - f): the lever that turns with the frame of the axes, m."""
+        carried = np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)
+        return np.asarray(carried * (place - self.probing_functional_point))
+
+    def _error_at(self, times: Array) -> ErrorAt:
+        """Return the error of the tip at given times as a function of its commanded places (n, 3)."""
+        twist, turn = self.state.twist_and_turn(times)
+
+        def error(places: Array) -> Array:
+            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(places)) + self.geometry.twist(places)[:, :3])
+
+        return error
+
+    # ------------------------------------------------------------------ contacts
+
+    def probe_gap(self, p: ArrayLike, t: ArrayLike, *, balls: Balls | None = None) -> Array:
+        """Return how far the tip is from tripping on the nearest ball, m, shape (n,); 0 or less: it is tripped.
+
+        Without the scatter of the trigger.
+
+        Parameters
+        ----------
+        p : (n, 3) or (3,)
+            Commanded places of the tip, m.
+        t : (n,) or scalar
+            s.
+        balls : Balls, optional
+            `balls` where not given.
+        """
+        balls = self.balls if balls is None else balls
+        there = np.atleast_2d(np.asarray(p, dtype=float)) + self.probe_error(p, t)
+        gaps = []
+        for ball in range(len(balls)):
+            way = there - balls.centre[ball]
+            distance = np.linalg.norm(way, axis=1)
+            normal = way / np.maximum(distance, _SETTLED)[:, None]
+            gaps.append(distance - self._reach(balls, np.full(len(way), ball), normal))
+        return np.asarray(np.min(gaps, axis=0))
+
+    def contact(
+        self,
+        start: ArrayLike,
+        target: ArrayLike,
+        t: float,
+        feed: float | None = None,
+        *,
+        balls: Balls | None = None,
+        noise: bool = True,
+    ) -> tuple[Array | None, float]:
+        """Return where the probe trips on the straight way from ``start`` to ``target``.
+
+        Parameters
+        ----------
+        start, target : (3,)
+            Commanded places of the tip, m.
+        t : float
+            When it is at the start, s.
+        feed : float, optional
+            m/s; where not given, the way takes no time.
+        balls : Balls, optional
+            `balls` where not given.
+        noise : bool
+            Whether the trigger scatters: by a number that belongs to this way at this time.
+
+        Returns
+        -------
+        position : ndarray (3,) or None
+            Commanded place of the tip when the probe trips, m; None where nothing is in the way. The start, where the
+            probe is tripped there.
+        distance : float
+            Way from the start to there, or to the target, m.
+        """
+        balls = self.balls if balls is None else balls
+        begin, end = np.asarray(start, dtype=float), np.asarray(target, dtype=float)
+        length = float(np.linalg.norm(end - begin))
+        if self.probe_gap(begin, t, balls=balls)[0] <= 0:
+            return begin.copy(), 0.0
+        if length == 0:
+            return None, 0.0
+        count = len(balls)
+        direction = np.tile((end - begin) / length, (count, 1))
+        scatter = self.probe.noise * self._trigger(begin, end, t) if noise else 0.0
+        times = np.full(count, float(t))
+        way = np.full(count, np.nan)
+        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact follows from its place
+            way = self._way(begin, direction, np.arange(count), balls, self._error_at(times), np.full(count, scatter))
+            times = t + np.where(np.isfinite(way), way, 0.0) / feed if feed else times
+        way = way[way <= length]
+        if way.size == 0:
+            return None, length
+        return begin + way.min() * direction[0], float(way.min())
+
+    def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
+        """Return how far the tip's centre is from that of a ball when the probe trips, m."""
+        return np.asarray(balls.height(ball, normal) + self.probe.tip_radius - self.probe.pretravel(normal))
+
+    def _way(
+        self,
+        start: Array,
+        direction: Array,
+        ball: NDArray[np.intp],
+        balls: Balls,
+        error: ErrorAt,
+        scatter: Array,
+        shift: Array = _NO_SHIFT,
+    ) -> Array:
+        """Return the way of the tip along unit directions (n, 3) until it trips on a ball each (n,), m; NaN: never.
+
+        The error of the tip and the reach towards a ball vary by 1e-4 of the way at most: a few rounds settle them.
+        """
+        centre = balls.centre[ball] + shift
+        way = np.einsum("ni,ni->n", centre - start, direction)
+        normal = -direction
+        for _ in range(60):
+            offset = start + error(start + np.where(np.isfinite(way), way, 0.0)[:, None] * direction) - centre
+            along = np.einsum("ni,ni->n", offset, direction)
+            reach = self._reach(balls, ball, normal) + scatter
+            inside = along**2 - np.einsum("ni,ni->n", offset, offset) + reach**2
+            found = np.where((inside >= 0) & (along < 0), -along - np.sqrt(np.maximum(inside, 0.0)), np.nan)
+            change = np.abs(found - way)
+            way = found
+            normal = offset + np.where(np.isfinite(way), way, -along)[:, None] * direction
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            if not np.any(change > _SETTLED):
+                break
+        return np.asarray(np.where(way >= 0, way, np.nan))
+
+    def _trigger(self, start: Array, target: Array, t: float) -> float:
+        """Return a standard normal number that belongs to a way at a time."""
+        bits = np.array([*start, *target, t], dtype=float).view(np.int64)
+        return float(kernels.normal(kernels.stream_key(self.seed, _TRIGGER, *bits), 0))
+
+    # ------------------------------------------------------------------ raw data
+
+    def sensor_temperatures(self, t: ArrayLike, *, seed: int = 0, noise: float = TEMPERATURE_NOISE) -> Array:
+        """Return what sensors at all places read at times t, degC, shape (n, sensor).
+
+        The noise of a reading belongs to its sensor and time, whatever else is asked.
+        """
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        readings = self.temperatures(times)
+        for sensor in range(readings.shape[1]):
+            for i, bits in enumerate(times.view(np.int64)):
+                key = kernels.stream_key(self.seed, _THERMOMETER, seed, sensor, int(bits))
+                readings[i, sensor] += noise * kernels.normal(key, 0)
+        return readings
+
+    def raw_normal_vector(
+        self,
+        times: ArrayLike,
+        *,
+        seed: int,
+        balls: int = BALLS,
+        touches: int = 5,
+        cycle: float | None = None,
+        variant: str = "touches",
+        moved: Moved | None = None,
+        missing: float = 0.0,
+        noise: float | None = None,
+    ) -> xr.Dataset:
+        """Return a raw dataset of balls that the machine probes in cycles, under the schedule of `start`.
+
+        Parameters
+        ----------
+        times : (n,)
+            When each cycle begins, s, increasing; the first is the cold one and the reference.
+        seed : int
+            Of the noise alone; machine and balls stay as they are.
+        balls : int
+            1 to 8.
+        touches : int
+            Of each ball, 5 or more: four around, one from above, the others from above at 45 degrees.
+        cycle : float, optional
+            How long a cycle takes, s; 6 s for each touch where not given, 0 for none.
+        variant : {"touches", "centres"}
+            Contacts, or the centres that a controller makes of them.
+        moved : (int, float, (3,)), optional
+            A ball (counted from 0) is pushed at a time, s, by a shift, m.
+        missing : float
+            Share of the touches (of the centres) that give none.
+        noise : float, optional
+            Scatter of the trigger, m; that of the probe where not given.
+
+        Raises
+        ------
+        BenchError
+            Something of that is out of range.
+        """
+        cycles = Cycles.of(times, balls, touches, cycle, moved, missing)
+        rng = np.random.default_rng([abs(self.seed), _TRIGGER, seed])
+        set_up = self.balls_on_table(balls)
+        sigma = self.probe.noise if noise is None else float(noise)
+        contacts = self._contacts(cycles, set_up, sigma * rng.normal(size=cycles.shape))
+        temperature = self.sensor_temperatures(cycles.times, seed=seed)
+        more = {
+            "temperature": (("time", "sensor"), temperature, {"units": "degC"}),
+            "spindle_speed": ("time", self.spindle_speed(cycles.times), {"units": "1/min"}),
+            "feed": ("time", np.zeros(len(cycles.times)), {"units": "m/s"}),
+        }
+        attrs = {"machine": self.name, "chain": self.chain, "tool_axes": self.tool_axes}
+        origin = {"kind": self.kind, "seed": self.seed}
+        return touches_dataset(
+            cycles,
+            set_up,
+            self.probe,
+            contacts,
+            sigma,
+            variant,
+            rng,
+            {**more, "sensor": list(self.temperature_sensors)},
+            attrs,
+            origin,
+        )
+
+    def _contacts(self, cycles: Cycles, balls: Balls, scatter: Array) -> Array:
+        """Return the commanded places of the tip at all contacts, m, (time, ball, touch, 3)."""
+        ball, start, direction, times, shift = cycles.ways(balls)
+        error = self._error_at(times)
+        way = self._way(start, direction, ball, balls, error, scatter.ravel(), shift)
+        return np.asarray((start + way[:, None] * direction).reshape(*cycles.shape, 3))
