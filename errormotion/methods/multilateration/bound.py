@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration import determinacy
+from errormotion.methods.multilateration.descent import State
 from errormotion.methods.multilateration.model import Stations, readings
 from errormotion.methods.multilateration.network import Network
-from errormotion.methods.multilateration.solver import State, conclude, state_problem
+from errormotion.methods.multilateration.problem import state_problem
+from errormotion.methods.multilateration.solver import conclude
 
 Array = NDArray[np.float64]
 
@@ -59,9 +61,9 @@ def bound(
         d = np.where(np.asarray(seen, dtype=bool), d, np.nan)
     known = None if dead_path_uncertainty is None else (np.zeros(len(U)), dead_path_uncertainty)
     problem = state_problem(d, u, noise, known)
-    determinacy.refuse_too_few(problem.weight, int(np.count_nonzero(problem.precision == 0)))
-    target_now = u.copy()
-    return conclude(problem, State(stations, target_now, problem.reduce(stations, target_now), 0, True), U)
+    determinacy.refuse_too_few(*problem.counts, problem.unknown)
+    place = np.ascontiguousarray(u.T)
+    return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
 
 
 def relative_bound(

@@ -24,6 +24,7 @@ FLAT = 0.03
 """Stations thinner than this share of their extent count as standing in a plane, or on a line."""
 WEAK = 20.0
 """Noise multiplied by more than this in a target is worth a note."""
+_NOTHING = 1e-30
 NEAR = 0.05
 """Stations seen from the targets within this angle, rad, are in one line with them."""
 _TOLD = 3
@@ -31,30 +32,30 @@ _LISTED = 12
 _SHARE = 0.1
 
 
-def refuse_too_few(weight: Array, unknown: int) -> None:
-    """Raise MethodError where readings (n, m), by weight, are fewer than unknowns.
+def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], unknown: int) -> None:
+    """Raise MethodError where readings are fewer than unknowns.
 
     Parameters
     ----------
-    weight : ndarray (n, m)
-        0 for what is missing.
+    by_target, by_station : ndarray (m,), (n,)
+        Readings of each target and from each station.
     unknown : int
         Parameters of the stations of which nothing is known beforehand.
     """
-    n, m = weight.shape
+    n, m = len(by_station), len(by_target)
     if n < 4:
         raise MethodError(
             f"expected at least four stations, found {n}: with three every target has as many unknowns as distances, "
             "and nothing tells where the stations are; measure the targets from a further place"
         )
-    blind = np.flatnonzero(np.count_nonzero(weight, axis=1) < 4)
+    blind = np.flatnonzero(by_station < 4)
     if len(blind):
         raise MethodError(
             f"expected at least 4 readings of every station, found "
-            f"{', '.join(f'{np.count_nonzero(weight[j])} of station {j + 1}' for j in blind)}; measure more targets "
+            f"{', '.join(f'{by_station[j]} of station {j + 1}' for j in blind)}; measure more targets "
             "from it, or leave the station out"
         )
-    count = np.count_nonzero(weight, axis=0)
+    count = by_target
     equations, needed = int(np.maximum(count - 3, 0).sum()), unknown - 6
     if equations < needed:
         full = -(-needed // (n - 3))
@@ -82,11 +83,16 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     rough : ndarray (n, 3)
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    if not (np.isfinite(information).all() and np.isfinite(basis).all() and np.trace(information) > 0):
+        raise MethodError(
+            "expected stations and targets at places of their own, found distances that have no direction or say "
+            f"nothing of the stations. What is special: {_reason(rough, target)}"
+        )
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _NOTHING * np.trace(information)))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     centre = target.mean(axis=0)
     distance = float(np.sqrt(np.mean(np.sum((stations.place - centre) ** 2, axis=1))))
-    motions = basis @ (scale[:, None] * vectors) / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    motions = basis @ (scale[:, None] * vectors) / np.sqrt(np.maximum(values, _NOTHING * values[-1]))
     sigma = np.linalg.norm(motions[: 4 * len(stations.place)], axis=0)
     loose = (values < DIGITS * values[-1]) | (sigma > LOOSE * distance)
     if not loose.any():
@@ -185,6 +191,18 @@ def weak_layout(covariance: Array, weight: Array, place: Array, target: Array) -
         return []
     what = f"this layout makes {factor:.3g} times the noise of a reading of it in each direction of a target"
     return [f"{what}: {_reason(place, target[known])}"]
+
+
+def without_say(carries: NDArray[np.bool_], target: Array) -> list[str]:
+    """Return a note on the targets (m, 3) that have a place and do not carry the datum."""
+    weak = np.flatnonzero(~carries & np.isfinite(target[:, 0]))
+    if not len(weak):
+        return []
+    more = f" and {len(weak) - _LISTED} more" if len(weak) > _LISTED else ""
+    return [
+        f"targets that their readings hardly fix have no say in where the whole lies ({len(weak)} of them): "
+        f"{', '.join(str(i + 1) for i in weak[:_LISTED])}{more}"
+    ]
 
 
 def without_place(weight: Array, told: tuple[int, ...]) -> list[str]:

@@ -1,63 +1,18 @@
-"""Compiled loops over the targets at the solution: covariances in the datum, residuals and redundancies.
+"""Compiled loops over the targets at the solution: covariances in the datum, and redundancies.
 
 The equations are those of `network`. Chunks of targets and their order are those of `kernels`, and so are the bits.
 """
 
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from errormotion.methods.multilateration.kernels import CHUNK, FAST, MANY, Array, chunks, compiled, reach_of
+from errormotion.methods.multilateration.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
+from errormotion.methods.multilateration.kernels import sight
 
-# Directions to the stations closer to a plane than this leave a target without a place.
-_FLAT = 1e-6
-
-
-@compiled()
-def _sight(
-    w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
-) -> bool:  # pragma: no cover - compiled
-    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; False where that has none."""
-    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for j in range(len(station)):
-        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
-        distance[j] = math.sqrt(x * x + y * y + z * z)
-        k = 1.0 / distance[j]
-        x, y, z = k * x, k * y, k * z
-        e[j, 0], e[j, 1], e[j, 2] = x, y, z
-        k = w[j] * w[j]
-        a00 += k * x * x
-        a01 += k * x * y
-        a02 += k * x * z
-        a11 += k * y * y
-        a12 += k * y * z
-        a22 += k * z * z
-    # E^T E = R^T R, and D = R^-1 R^-T.
-    least = _FLAT * _FLAT * (a00 + a11 + a22)
-    if not a00 > least:
-        return False
-    r00 = math.sqrt(a00)
-    r01, r02 = a01 / r00, a02 / r00
-    if not a11 - r01 * r01 > least:
-        return False
-    r11 = math.sqrt(a11 - r01 * r01)
-    r12 = (a12 - r01 * r02) / r11
-    if not a22 - r02 * r02 - r12 * r12 > least:
-        return False
-    i00, i11, i22 = 1.0 / r00, 1.0 / r11, 1.0 / math.sqrt(a22 - r02 * r02 - r12 * r12)
-    i01, i12 = -i00 * r01 * i11, -i11 * r12 * i22
-    i02 = -(i00 * r02 + i01 * r12) * i22
-    D[0, 0] = i00 * i00 + i01 * i01 + i02 * i02
-    D[0, 1] = i01 * i11 + i02 * i12
-    D[0, 2] = i02 * i22
-    D[1, 1] = i11 * i11 + i12 * i12
-    D[1, 2] = i12 * i22
-    D[2, 2] = i22 * i22
-    D[1, 0], D[2, 0], D[2, 1] = D[0, 1], D[0, 2], D[1, 2]
-    return True
+Flags = NDArray[np.bool_]
 
 
 @compiled()
@@ -104,7 +59,7 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
 
 @compiled()
 def _datum_part(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, part: int, sums: Array
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, part: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
     n = len(station)
     w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
@@ -112,7 +67,7 @@ def _datum_part(
     for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
         for j in range(n):
             w[j] = weight[j, i]
-        if not _sight(w, station, target[i], e, distance, D):
+        if not carries[i] or not sight(w, station, target[i], e, distance, D):
             continue
         for k in range(3):
             c[k] = target[i, k] - centre[k]
@@ -129,29 +84,31 @@ def _datum_part(
 
 @compiled()
 def _datum_alone(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
 ) -> None:  # pragma: no cover - compiled
     for part in range(len(sums)):
-        _datum_part(weight, station, extra, target, centre, part, sums[part])
+        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
 
 
 @compiled(parallel=True)
 def _datum_shared(
-    weight: Array, station: Array, extra: Array, target: Array, centre: Array, sums: Array
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
 ) -> None:  # pragma: no cover - compiled
     for part in numba.prange(len(sums)):
-        _datum_part(weight, station, extra, target, centre, part, sums[part])
+        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
 
 
-def datum_sums(weight: Array, station: Array, extra: Array, target: Array, centre: Array) -> tuple[Array, Array, Array]:
-    """Return sums over the targets of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
+def datum_sums(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array
+) -> tuple[Array, Array, Array]:
+    """Return sums over the targets that carry the datum of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
 
     G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
     the stations' parameters.
     """
     sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
     work = _datum_shared if len(target) > MANY else _datum_alone
-    work(weight, station, extra, target, centre, sums)
+    work(weight, station, extra, target, carries, centre, sums)
     total = sums.sum(axis=0)
     return total[:, :6], total[:, 6:12], total[:, 12:]
 
@@ -180,27 +137,26 @@ def _covariance(
 
 @compiled(fastmath=FAST)
 def _examine_part(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
-    redundancy: Array,
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
     part: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     stations, p = len(station), W.shape[1]
-    reach, w, distance, c = np.empty(stations), np.empty(stations), np.empty(stations), np.empty(3)
+    w, distance, c = np.empty(stations), np.empty(stations), np.empty(3)
     e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
     DG, G, room = np.empty((3, 6)), np.zeros((3, 6)), np.empty((3, 6))
     for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
-        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-        fine = _sight(w, station, target[i], e, distance, D)
         for j in range(stations):
-            residual[j, i] = reach[j] - distance[j] if w[j] > 0.0 else np.nan
-            redundancy[j, i] = np.nan
-        if not fine:
+            w[j], redundancy[j, i] = weight[j, i], np.nan
+        if not sight(w, station, target[i], e, distance, D):
             covariance[i] = np.nan
             continue
         for k in range(3):
             c[k] = target[i, k] - centre[k]
-        _spread_motions(D, c, DG)
+        if carries[i]:
+            _spread_motions(D, c, DG)
+        else:
+            DG[:] = 0.0
         # Readings by the stations' factor, then targets: both sum over the stations.
         for j in range(stations):
             for k in range(p):
@@ -239,36 +195,31 @@ def _examine_part(
 
 @compiled()
 def _examine_alone(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
-    redundancy: Array,
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in range((len(target) + CHUNK - 1) // CHUNK):
         _examine_part(
-            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
-            H, K, covariance, residual, redundancy, part,
+            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
         )  # fmt: skip
 
 
 @compiled(parallel=True)
 def _examine_shared(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, residual: Array,
-    redundancy: Array,
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
         _examine_part(
-            reading, weight, station, dead_path, extra, value, target, centre, W, shift,
-            H, K, covariance, residual, redundancy, part,
+            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
         )  # fmt: skip
 
 
 def examine(
-    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return covariances (m, 3, 3) of the targets, residuals (n, m), m, and redundancies (n, m) of the readings.
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return covariances (m, 3, 3) of the targets, m^2, and redundancies (n, m) of the readings.
 
     Parameters
     ----------
@@ -279,11 +230,8 @@ def examine(
     H, K : ndarray (6, 6)
         Inverse of the sum of G^T G; and H (sum of G^T D G) H.
     """
-    n, m = reading.shape
-    covariance, residual, redundancy = np.empty((m, 3, 3)), np.empty((n, m)), np.empty((n, m))
+    n, m = weight.shape
+    covariance, redundancy = np.empty((m, 3, 3)), np.empty((n, m))
     work = _examine_shared if m > MANY else _examine_alone
-    work(
-        reading, weight, station, dead_path, extra, value, target, centre, W, shift, H, K,
-        covariance, residual, redundancy,
-    )  # fmt: skip
-    return covariance, residual, redundancy
+    work(weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy)
+    return covariance, redundancy

@@ -11,34 +11,25 @@ result has the same bits on any number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Function = TypeVar("Function", bound=Callable[..., Any])
+from errormotion.methods.multilateration.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
+from errormotion.methods.multilateration.four import reduce_four, settle_four
 
-CHUNK = 1024
-"""Targets that one thread adds up."""
 LANES = 128
 """Equations whose products are added up together."""
-MANY = 20_000
-"""More targets than these are shared out to several threads."""
-# Sums of products may be taken in any order (so that they vectorise).
-FAST = {"reassoc", "contract", "nsz"}
 # A target with its directions this close to a plane is not moved.
 _FLAT = 1e-13
 # Steps of a target in one pass, and below which length, m, one is the last.
 _STEPS = 8
 _SHORT = 3e-5
-
-
-def compiled(**options: Any) -> Callable[[Function], Function]:
-    """Compile with numba: cached on disk, without the interpreter's lock."""
-    return cast(Callable[[Function], Function], numba.njit(cache=True, nogil=True, error_model="numpy", **options))
+# The same where the stations are final.
+_LAST_STEPS = 30
+_SETTLED = 1e-7
+# Directions to the stations closer to a plane than this leave a target without a place.
+_NO_PLACE = 1e-6
 
 
 @compiled()
@@ -81,13 +72,15 @@ def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragm
 
 
 @compiled()
-def _place(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
+def _place(
+    reach: Array, w: Array, station: Array, u: Array, steps: int, short: float
+) -> float:  # pragma: no cover - compiled
     """Move a target to where its distances put it; return how far the first step took it, m."""
     first = _locate(reach, w, station, u)
     size = first
-    for _ in range(_STEPS):
+    for _ in range(steps):
         # The next step goes as the square of this one over the distance.
-        if size < _SHORT:
+        if size < short:
             break
         size = _locate(reach, w, station, u)
     return first
@@ -163,9 +156,9 @@ def reach_of(
 @compiled()
 def _reduce_chunk(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, first: int, last: int, sums: Array,
+    place: Array, first: int, last: int, sums: Array,
 ) -> float:  # pragma: no cover - compiled  # fmt: skip
-    """Do the work of `reduce_targets` for one chunk."""
+    """Do the work of `reduce_targets` for some targets; return the square of the longest first step, m^2."""
     n, more = len(station), len(value)
     q = 4 * n + more
     reach, w, r, u = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
@@ -173,9 +166,9 @@ def _reduce_chunk(
     v, filled, furthest = np.empty((q + 1, LANES)), 0, 0.0
     for i in range(first, last):
         reach_of(reading, weight, dead_path, extra, value, i, reach, w)
-        u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
-        furthest = max(furthest, _place(reach, w, station, u))
-        target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
+        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
+        furthest = max(furthest, _place(reach, w, station, u, _STEPS, _SHORT))
+        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
         reflect(reach, w, station, u, e, r, E, Q)
         for a in range(3, n):
             rest = 0.0
@@ -194,120 +187,189 @@ def _reduce_chunk(
                 _add_products(v, filled, sums)
                 filled = 0
     _add_products(v, filled, sums)
-    return furthest
+    return furthest * furthest
 
 
 @compiled()
-def _reduce_four(
-    reading: Array,
-    weight: Array,
-    station: Array,
-    dead_path: Array,
-    target: Array,
-    first: int,
-    last: int,
-    sums: Array,
-) -> float:  # pragma: no cover - compiled
-    """Do the work of `reduce_targets` for one chunk seen by four stations, no further parameters.
+def sight(
+    w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
+) -> bool:  # pragma: no cover - compiled
+    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; False where that has none."""
+    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(len(station)):
+        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+        distance[j] = math.sqrt(x * x + y * y + z * z)
+        k = 1.0 / distance[j]
+        x, y, z = k * x, k * y, k * z
+        e[j, 0], e[j, 1], e[j, 2] = x, y, z
+        k = w[j] * w[j]
+        a00 += k * x * x
+        a01 += k * x * y
+        a02 += k * x * z
+        a11 += k * y * y
+        a12 += k * y * z
+        a22 += k * z * z
+    # E^T E = R^T R, and D = R^-1 R^-T.
+    least = _NO_PLACE * _NO_PLACE * (a00 + a11 + a22)
+    if not a00 > least:
+        return False
+    r00 = math.sqrt(a00)
+    r01, r02 = a01 / r00, a02 / r00
+    if not a11 - r01 * r01 > least:
+        return False
+    r11 = math.sqrt(a11 - r01 * r01)
+    r12 = (a12 - r01 * r02) / r11
+    if not a22 - r02 * r02 - r12 * r12 > least:
+        return False
+    i00, i11, i22 = 1.0 / r00, 1.0 / r11, 1.0 / math.sqrt(a22 - r02 * r02 - r12 * r12)
+    i01, i12 = -i00 * r01 * i11, -i11 * r12 * i22
+    i02 = -(i00 * r02 + i01 * r12) * i22
+    D[0, 0] = i00 * i00 + i01 * i01 + i02 * i02
+    D[0, 1] = i01 * i11 + i02 * i12
+    D[0, 2] = i02 * i22
+    D[1, 1] = i11 * i11 + i12 * i12
+    D[1, 2] = i12 * i22
+    D[2, 2] = i22 * i22
+    D[1, 0], D[2, 0], D[2, 1] = D[0, 1], D[0, 2], D[1, 2]
+    return True
 
-    The one row N is the vector of minors of E: four triple products, from two cross products.
-    """
-    E, w, r, c = np.empty((4, 3)), np.empty(4), np.empty(4), np.empty((2, 3))
-    v, filled, furthest = np.empty((17, LANES)), 0, 0.0
-    reach, u = np.empty(4), np.empty(3)
+
+@compiled()
+def _settle_chunk(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, first: int, last: int, nominal: Array, centre: Array, openness: Array, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `settle_targets` for some targets; return the square of the longest first step, m^2."""
+    n = len(station)
+    reach, w, u, e = np.empty(n), np.empty(n), np.empty(3), np.empty((n, 3))
+    distance, D, furthest = np.empty(n), np.empty((3, 3)), 0.0
     for i in range(first, last):
-        for j in range(4):
-            w[j], reach[j] = weight[j, i], reading[j, i] + dead_path[j]
-        u[0], u[1], u[2] = target[i, 0], target[i, 1], target[i, 2]
-        furthest = max(furthest, _place(reach, w, station, u))
-        target[i, 0], target[i, 1], target[i, 2] = u[0], u[1], u[2]
-        for j in range(4):
-            x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
-            distance = math.sqrt(x * x + y * y + z * z)
-            k = w[j] / distance
-            E[j, 0], E[j, 1], E[j, 2], r[j] = x * k, y * k, z * k, w[j] * (reach[j] - distance)
-        for h in range(2):
-            a, b = E[2 * h], E[2 * h + 1]
-            c[h, 0], c[h, 1] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
-            c[h, 2] = a[0] * b[1] - a[1] * b[0]
-        n0 = E[1, 0] * c[1, 0] + E[1, 1] * c[1, 1] + E[1, 2] * c[1, 2]
-        n1 = -E[0, 0] * c[1, 0] - E[0, 1] * c[1, 1] - E[0, 2] * c[1, 2]
-        n2 = E[3, 0] * c[0, 0] + E[3, 1] * c[0, 1] + E[3, 2] * c[0, 2]
-        n3 = -E[2, 0] * c[0, 0] - E[2, 1] * c[0, 1] - E[2, 2] * c[0, 2]
-        square = n0 * n0 + n1 * n1 + n2 * n2 + n3 * n3
-        if square == 0.0:
+        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
+        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
+        furthest = max(furthest, _place(reach, w, station, u, _LAST_STEPS, _SETTLED))
+        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
+        openness[i] = math.inf
+        if not sight(w, station, u, e, distance, D):
             continue
-        unit = 1.0 / math.sqrt(square)
-        for j in range(4):
-            n = unit * (n0 if j == 0 else n1 if j == 1 else n2 if j == 2 else n3)
-            v[4 * j, filled], v[4 * j + 1, filled] = -n * E[j, 0], -n * E[j, 1]
-            v[4 * j + 2, filled], v[4 * j + 3, filled] = -n * E[j, 2], -n * w[j]
-        v[16, filled] = unit * (n0 * r[0] + n1 * r[1] + n2 * r[2] + n3 * r[3])
-        filled += 1
-        if filled == LANES:
-            _add_products(v, filled, sums)
-            filled = 0
-    _add_products(v, filled, sums)
-    return furthest
+        openness[i] = D[0, 0] + D[1, 1] + D[2, 2]
+        sums[0] += 1.0
+        for k in range(3):
+            sums[1 + k] += u[k] - centre[k]
+            sums[4 + k] += nominal[i, k] - centre[k]
+            for h in range(3):
+                sums[7 + 3 * k + h] += (nominal[i, k] - centre[k]) * (u[h] - centre[h])
+    return furthest * furthest
 
 
 @compiled()
-def _reduce_part(
-    reading: Array,
-    weight: Array,
-    station: Array,
-    dead_path: Array,
-    extra: Array,
-    value: Array,
-    target: Array,
-    part: int,
-    sums: Array,
-) -> float:  # pragma: no cover - compiled
-    first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
+def reduce_part(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, part: int, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `reduce_targets` for one chunk; return the square of the longest first step, m^2."""
+    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
     if len(station) == 4 and len(value) == 0:
-        return _reduce_four(reading, weight, station, dead_path, target, first, last, sums)
-    return _reduce_chunk(reading, weight, station, dead_path, extra, value, target, first, last, sums)
+        return reduce_four(reading, weight, station, dead_path, place, first, last, sums)
+    return _reduce_chunk(reading, weight, station, dead_path, extra, value, place, first, last, sums)
+
+
+@compiled()
+def _settle_part(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, part: int, nominal: Array, centre: Array, openness: Array, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
+    if len(station) == 4 and len(value) == 0:
+        return settle_four(
+            reading, weight, station, dead_path, place, first, last, nominal, centre, openness, sums
+        )  # fmt: skip
+    return _settle_chunk(
+        reading, weight, station, dead_path, extra, value, place, first, last, nominal, centre, openness, sums
+    )
+
+
+@compiled()
+def total(sums: Array) -> Array:  # pragma: no cover - compiled
+    """Return the sum of the chunks' sums (k, q, q), in their order, with the lower triangle that they leave out."""
+    q = sums.shape[1]
+    whole = np.zeros((q, q))
+    for part in range(len(sums)):
+        for i in range(q):
+            for j in range(i, q):
+                whole[i, j] += sums[part, i, j]
+    for i in range(q):
+        for j in range(i):
+            whole[i, j] = whole[j, i]
+    return whole
 
 
 @compiled()
 def _reduce_alone(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, sums: Array, moved: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in range(len(sums)):
-        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, target, part, sums[part])
+    place: Array,
+) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
+    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
+    sums, moved = np.zeros((count, q, q)), 0.0
+    for part in range(count):
+        far = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
+        moved = max(moved, far)
+    return total(sums), math.sqrt(moved)
 
 
 @compiled(parallel=True)
 def _reduce_shared(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array, sums: Array, moved: Array,
-) -> None:  # pragma: no cover - compiled  # fmt: skip
+    place: Array,
+) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
+    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
+    sums, moved = np.zeros((count, q, q)), np.zeros(count)
+    for part in numba.prange(count):
+        moved[part] = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
+    return total(sums), math.sqrt(moved.max())
+
+
+@compiled()
+def _settle_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array, openness: Array,
+) -> Array:  # pragma: no cover - compiled  # fmt: skip
+    sums = np.zeros((chunks(place.shape[1]), 16))
+    for part in range(len(sums)):
+        _settle_part(
+            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
+        )
+    return sums
+
+
+@compiled(parallel=True)
+def _settle_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array, openness: Array,
+) -> Array:  # pragma: no cover - compiled  # fmt: skip
+    sums = np.zeros((chunks(place.shape[1]), 16))
     for part in numba.prange(len(sums)):
-        moved[part] = _reduce_part(reading, weight, station, dead_path, extra, value, target, part, sums[part])
-
-
-def chunks(targets: int) -> int:
-    """Return into how many chunks so many targets are cut."""
-    return (targets + CHUNK - 1) // CHUNK
+        _settle_part(
+            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
+        )
+    return sums
 
 
 def reduce_targets(
     reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
-    target: Array,
+    place: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """Move every target and add up what the targets say about the stations.
 
     Parameters
     ----------
     reading, weight : ndarray (n, m)
-        Displacements, m, finite everywhere, and 1 / standard deviation, 1/m; 0 for what does not count.
+        Displacements, m, and 1 / standard deviation, 1/m; 0 for what does not count, be it a number or not.
     station, dead_path : ndarray (n, 3), (n,)
         m.
     extra, value : ndarray (k, n, m), (k,)
         What a unit of each further parameter adds to a reading, and the parameters.
-    target : ndarray (m, 3)
-        m; changed in place.
+    place : ndarray (3, m)
+        Targets, m; changed in place.
 
     Returns
     -------
@@ -317,9 +379,26 @@ def reduce_targets(
     moved : float
         Longest first step of a target, m.
     """
-    q = 4 * len(station) + len(value) + 1
-    sums, moved = np.zeros((chunks(len(target)), q, q)), np.zeros(chunks(len(target)))
-    work = _reduce_shared if len(target) > MANY else _reduce_alone
-    work(reading, weight, station, dead_path, extra, value, target, sums, moved)
-    total = sums.sum(axis=0)
-    return total + np.triu(total, 1).T, float(moved.max())
+    work = _reduce_shared if place.shape[1] > MANY else _reduce_alone
+    sums, moved = work(reading, weight, station, dead_path, extra, value, place)
+    return sums, moved
+
+
+def settle_targets(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Put every target (3, m) where its distances from the final stations are best fulfilled.
+
+    Returns
+    -------
+    openness : ndarray (m,)
+        Trace of each target's covariance with the stations known, m^2; infinite where readings leave a direction open.
+    moments : ndarray (16,)
+        Of the targets with a place: their number, sums of targets and of nominal ones (m, 3) about ``centre`` (3,), and
+        the sum (3, 3) of nominal times target.
+    """
+    openness = np.empty(place.shape[1])
+    work = _settle_shared if place.shape[1] > MANY else _settle_alone
+    sums = work(reading, weight, station, dead_path, extra, value, place, nominal, centre, openness)
+    return openness, sums.sum(axis=0)

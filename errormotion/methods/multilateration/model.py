@@ -31,6 +31,11 @@ class Stations:
         block = step[: 4 * n].reshape(n, 4)
         return Stations(self.place + block[:, :3], self.dead_path + block[:, 3], self.value + step[4 * n :])
 
+    @property
+    def vector(self) -> Array:
+        """Parameters (4 n + k,)."""
+        return np.concatenate([np.column_stack([self.place, self.dead_path]).ravel(), self.value])
+
     def motions(self, centre: Array) -> Array:
         """Return what a rigid motion (t, r about ``centre``) of the whole does to the parameters, (4 n + k, 6)."""
         n = len(self.place)

@@ -9,19 +9,24 @@ G_i = [1, -(c_i x)] the motions of target i with the whole. Covariances of one t
 
     D_i delta_ik + F'_i F'_k^T - D_i G_i H G_k^T - G_i H G_k^T D_k + G_i K G_k^T,   K = H (sum G^T D G) H,
 
-F' the factor of the stations after the datum has taken its part.
+F' the factor of the stations after the datum has taken its part. A target that its readings hardly fix does not carry
+the datum: the sums leave it out, and so do the terms in its own D G. What follows from a solution (datum, covariances,
+residuals and notes) is reckoned when it is asked for, and then kept.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.methods.multilateration.model import Stations, directions, motions
-
-Array = NDArray[np.float64]
+from errormotion.methods.multilateration import determinacy, outliers
+from errormotion.methods.multilateration.compiling import Array
+from errormotion.methods.multilateration.examination import datum_sums, examine
+from errormotion.methods.multilateration.model import Stations, directions, motions, readings
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,20 @@ class Datum:
     K: Array
 
 
+class _OnDemand:
+    """The datum of a network: as given, or else reckoned when it is first asked for."""
+
+    def __set__(self, network: Network, value: Any) -> None:
+        network.__dict__["_datum"] = None if value is self else value
+
+    def __get__(self, network: Network | None, owner: type) -> Any:
+        if network is None:
+            return self
+        if network.__dict__["_datum"] is None:
+            network.__dict__["_datum"] = network._reckoned_datum()
+        return network.__dict__["_datum"]
+
+
 @dataclass(frozen=True)
 class Network:
     """Targets and stations from displacements.
@@ -57,14 +76,8 @@ class Network:
         Estimated places, m, in the frame of the nominal ones; NaN where readings do not determine a target.
     stations : Stations
         Places, dead paths and further parameters in the same frame.
-    target_covariance : ndarray (m, 3, 3)
-        m^2; of the datum, in which the six motions of the whole have none.
-    joint_covariance : ndarray (4 n + k, 4 n + k)
-        Of (U_1, L_1, U_2, ..., p) in the same datum.
-    residual : ndarray (n, m)
-        Reading minus model, m; of every reading that exists and whose target is determined, left out or not.
-    redundancy : ndarray (n, m)
-        Share of a reading's error that shows in its residual, 0 to 1; NaN where there is no reading in use.
+    reading : ndarray (n, m)
+        Displacements, m; NaN where there is none.
     weight : ndarray (n, m)
         1 / standard deviation, 1/m; 0 for readings that are missing or left out.
     left_out : tuple of (int, int)
@@ -78,20 +91,27 @@ class Network:
     iterations : int
         Passes over the targets.
     converged : bool
-        Whether the last step was below the tolerance.
+        Whether a further step would be below the tolerance.
     condition : float
         Of the stations' information, its diagonal scaled to 1: largest over smallest eigenvalue of what distances can
         determine.
-    notes : tuple of str
-        What a person should know.
+    extra : ndarray (k, n, m)
+        Derivatives of the readings by further parameters.
+    carries : ndarray of bool (m,)
+        Targets that carry the datum: those that their readings fix about as well as the others.
+    centre : ndarray (3,)
+        Mean of these, m.
+    factor : ndarray (4 n + k, p)
+        W, W W^T the covariance of the stations' parameters in some datum.
+    rough : ndarray (n, 3) or None
+        Rough places of the stations as given, m.
+    datum : Datum
+        What is needed to carry covariances into the datum.
     """
 
     target: Array
     stations: Stations
-    target_covariance: Array = field(repr=False)
-    joint_covariance: Array = field(repr=False)
-    residual: Array = field(repr=False)
-    redundancy: Array = field(repr=False)
+    reading: Array = field(repr=False)
     weight: Array = field(repr=False)
     left_out: tuple[tuple[int, int], ...]
     undecided: tuple[int, ...]
@@ -100,9 +120,63 @@ class Network:
     iterations: int
     converged: bool
     condition: float
-    notes: tuple[str, ...]
     extra: Array = field(repr=False)
-    datum: Datum = field(repr=False)
+    carries: NDArray[np.bool_] = field(repr=False)
+    centre: Array = field(repr=False)
+    factor: Array = field(repr=False)
+    rough: Array | None = field(repr=False)
+    datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
+
+    def _reckoned_datum(self) -> Datum:
+        GG, GDG, GF = datum_sums(self.weight, self.station, self.extra, self.target, self.carries, self.centre)
+        H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
+        return Datum(self.centre, self.factor, H @ GF @ self.factor, H, H @ GDG @ H)
+
+    @cached_property
+    def joint_covariance(self) -> Array:
+        """Covariance (4 n + k, 4 n + k) of (U_1, L_1, U_2, ..., p) in the datum, m^2."""
+        T = self.stations.motions(self.datum.centre)
+        F = self.datum.factor - T @ self.datum.shift
+        return np.asarray(F @ F.T + T @ self.datum.K @ T.T)
+
+    @property
+    def target_covariance(self) -> Array:
+        """Covariances (m, 3, 3), m^2, in the datum, in which the six motions of the whole have none."""
+        return self._examined[0]
+
+    @property
+    def redundancy(self) -> Array:
+        """Share (n, m) of a reading's error that shows in its residual, 0 to 1; NaN where none is in use."""
+        return self._examined[1]
+
+    @cached_property
+    def residual(self) -> Array:
+        """Reading minus model (n, m), m: of every reading that exists and whose target has a place, left out or not.
+
+        NaN for all others. A reading that was left out has had no say in its target's place, so that its residual
+        shows its whole error.
+        """
+        return self.reading - readings(self.target, self.stations, self.extra)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know."""
+        return (
+            *outliers.told(self.left_out, self.undecided),
+            *determinacy.without_place(self.weight, self.undecided),
+            *determinacy.without_say(self.carries, self.target),
+            *determinacy.weak_layout(self.target_covariance, self.weight, self.station, self.target),
+            *determinacy.weak_targets(self.target, self.target_covariance, self.station),
+            *determinacy.swapped_stations(self.station, self.rough),
+        )
+
+    @cached_property
+    def _examined(self) -> tuple[Array, Array]:
+        datum = self.datum
+        return examine(
+            self.weight, self.station, self.extra, self.target, self.carries,
+            datum.centre, datum.factor, datum.shift, datum.H, datum.K,
+        )  # fmt: skip
 
     @property
     def station(self) -> Array:
@@ -160,8 +234,8 @@ class Network:
     def covariance(self, targets: NDArray[np.intp] | slice = slice(None)) -> Array:
         """Return the joint covariance (3 t, 3 t), m^2, of some targets (t of them)."""
         own, F, G = self.blocks(targets)
-        t = len(own)
-        F, DG, G = F.reshape(3 * t, -1), (own @ G).reshape(3 * t, 6), G.reshape(3 * t, 6)
+        t, DG = len(own), np.where(self.carries[targets][:, None, None], own @ G, 0.0)
+        F, DG, G = F.reshape(3 * t, -1), DG.reshape(3 * t, 6), G.reshape(3 * t, 6)
         side = DG @ self.datum.H @ G.T
         C: Array = F @ F.T - side - side.T + G @ self.datum.K @ G.T
         C.reshape(t, 3, t, 3)[np.arange(t), :, np.arange(t), :] += own
@@ -185,7 +259,7 @@ class Network:
         g = np.concatenate([-np.einsum("jt,jta->ja", rest, np.nan_to_num(e)), -rest.sum(axis=1)[:, None]], axis=1)
         gradient = np.concatenate([g.ravel(), np.einsum("kjt,jt->k", self.extra, rest)])
         parts = self.datum.factor.T @ gradient
-        shift = self.datum.H @ np.einsum("tab,ta->b", G[used], alone[used])
+        shift = self.datum.H @ np.einsum("tab,ta->b", G[self.carries], alone[self.carries])
         moved = alone + factor @ parts - G @ shift
         T = self.stations.motions(self.datum.centre)
         return moved, self.datum.factor @ parts - T @ (self.datum.shift @ parts + shift)

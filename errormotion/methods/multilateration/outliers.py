@@ -9,13 +9,16 @@ other targets. Where several would do, the target is given up and named.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
 from errormotion.methods.multilateration.model import directions
-from errormotion.methods.multilateration.network import Network
+
+if TYPE_CHECKING:
+    from errormotion.methods.multilateration.network import Network
 
 Array = NDArray[np.float64]
 
@@ -32,7 +35,7 @@ _SHOWN = 12
 
 @dataclass(frozen=True)
 class Found:
-    """Readings left out (station, target), targets given up, both from 0, and what to say about them."""
+    """Readings left out (station, target) and targets given up, both from 0."""
 
     left_out: tuple[tuple[int, int], ...]
     undecided: tuple[int, ...]
@@ -47,22 +50,22 @@ class Found:
         """Return the weights (n, m) with what was found at 0."""
         return np.where(self.out, 0.0, weight)
 
-    @property
-    def notes(self) -> list[str]:
-        """What a person should know."""
-        notes = []
-        if self.left_out:
-            shown = ", ".join(f"station {j + 1} of target {i + 1}" for j, i in self.left_out[:_SHOWN])
-            more = f" and {len(self.left_out) - _SHOWN} more" if len(self.left_out) > _SHOWN else ""
-            notes.append(f"wrong readings left out ({len(self.left_out)}): {shown}{more}")
-        if self.undecided:
-            shown = ", ".join(str(i + 1) for i in self.undecided[:_SHOWN])
-            more = f" and {len(self.undecided) - _SHOWN} more" if len(self.undecided) > _SHOWN else ""
-            notes.append(
-                f"targets given up ({len(self.undecided)}), since a reading of theirs is wrong and nothing tells "
-                f"which: {shown}{more}; readings from a further station would tell"
-            )
-        return notes
+
+def told(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> list[str]:
+    """Return what a person should know of readings left out and targets given up."""
+    notes = []
+    if left_out:
+        shown = ", ".join(f"station {j + 1} of target {i + 1}" for j, i in left_out[:_SHOWN])
+        more = f" and {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
+        notes.append(f"wrong readings left out ({len(left_out)}): {shown}{more}")
+    if undecided:
+        shown = ", ".join(str(i + 1) for i in undecided[:_SHOWN])
+        more = f" and {len(undecided) - _SHOWN} more" if len(undecided) > _SHOWN else ""
+        notes.append(
+            f"targets given up ({len(undecided)}), since a reading of theirs is wrong and nothing tells "
+            f"which: {shown}{more}; readings from a further station would tell"
+        )
+    return notes
 
 
 def normalised(network: Network) -> Array:

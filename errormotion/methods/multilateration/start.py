@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.kernels import compiled
+from errormotion.methods.multilateration.compiling import compiled
 
 Array = NDArray[np.float64]
 

@@ -2,56 +2,76 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.methods.multilateration.kernels import Array, compiled
+from errormotion.methods.multilateration.compiling import Array, compiled
 from errormotion.methods.multilateration.model import Stations
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A point goes to R (point - a) + b: means (3,) of targets and nominal ones, and the rotation R (3, 3)."""
+
+    a: Array
+    b: Array
+    R: Array
+
+    @classmethod
+    def of(cls, moments: Array, centre: Array) -> Motion:
+        """Return the motion that fits targets to nominal ones best, from their moments (16,) (see `moments`).
+
+        The rotation is that of Kabsch: from the singular vectors of the targets' cross products.
+        """
+        n, a, b = moments[0], moments[1:4] / moments[0], moments[4:7] / moments[0]
+        U, _, Vt = np.linalg.svd(moments[7:].reshape(3, 3) - n * np.outer(b, a))
+        U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+        return cls(centre + a, centre + b, U @ Vt)
+
+    def stations(self, stations: Stations) -> Stations:
+        """Return the stations moved."""
+        return replace(stations, place=(stations.place - self.a) @ self.R.T + self.b)
 
 
 def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.bool_]) -> tuple[Stations, Array, Array]:
     """Return stations and targets (m, 3) moved onto the nominal targets, and the rotation (3, 3).
 
-    The rotation is that of Kabsch: from the singular vectors of the targets' cross products. ``used`` (m,) are the
-    targets that count.
+    ``used`` (m,) are the targets that count.
     """
-    a, b, C = _moments(target, nominal, used)
-    U, _, Vt = np.linalg.svd(C)
-    R: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return replace(stations, place=(stations.place - a) @ R.T + b), _moved(target, a, b, R), R
+    place, centre = np.ascontiguousarray(target.T), nominal.mean(axis=0)
+    motion = Motion.of(moments(place, nominal, used, centre), centre)
+    everywhere = np.zeros(len(target))
+    return motion.stations(stations), moved(place, motion.a, motion.b, motion.R, everywhere), motion.R
 
 
 @compiled()
-def _moments(
-    target: Array, nominal: Array, used: NDArray[np.bool_]
-) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
-    """Return means (3,) of targets and nominal ones, and the sum (3, 3) of nominal times target about them."""
-    a, b, C, count = np.zeros(3), np.zeros(3), np.zeros((3, 3)), 0
-    for i in range(len(target)):
+def moments(
+    place: Array, nominal: Array, used: NDArray[np.bool_], centre: Array
+) -> Array:  # pragma: no cover - compiled
+    """Return number, sums and products (16,) of targets (3, m) and nominal ones (m, 3) that count, about ``centre``."""
+    sums, u, v = np.zeros(16), np.empty(3), np.empty(3)
+    for i in range(len(nominal)):
         if used[i]:
-            count += 1
+            sums[0] += 1.0
             for k in range(3):
-                a[k] += target[i, k]
-                b[k] += nominal[i, k]
-    for k in range(3):
-        a[k] /= count
-        b[k] /= count
-    for i in range(len(target)):
-        if used[i]:
+                u[k], v[k] = place[k, i] - centre[k], nominal[i, k] - centre[k]
+                sums[1 + k] += u[k]
+                sums[4 + k] += v[k]
             for k in range(3):
-                for n in range(3):
-                    C[k, n] += (nominal[i, k] - b[k]) * (target[i, n] - a[n])
-    return a, b, C
+                for h in range(3):
+                    sums[7 + 3 * k + h] += v[k] * u[h]
+    return sums
 
 
 @compiled()
-def _moved(target: Array, a: Array, b: Array, R: Array) -> Array:  # pragma: no cover - compiled
-    """Return R (target - a) + b."""
-    moved = np.empty_like(target)
+def moved(place: Array, a: Array, b: Array, R: Array, openness: Array) -> Array:  # pragma: no cover - compiled
+    """Return R (u - a) + b (m, 3) of targets u (3, m); NaN where the openness (m,) is infinite."""
+    target = np.empty((place.shape[1], 3))
     for i in range(len(target)):
-        x, y, z = target[i, 0] - a[0], target[i, 1] - a[1], target[i, 2] - a[2]
+        x, y, z = place[0, i] - a[0], place[1, i] - a[1], place[2, i] - a[2]
         for k in range(3):
-            moved[i, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + b[k]
-    return moved
+            found = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + b[k]
+            target[i, k] = found if openness[i] < np.inf else np.nan
+    return target

@@ -13,6 +13,8 @@ import numpy as np
 from errormotion.methods.multilateration.model import Stations, directions
 from errormotion.methods.multilateration.start import initial_stations
 
+_SOME = 1000
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -46,5 +48,21 @@ def weak_targets(displacement: Array, nominal: Array, station: Array | None, noi
     values = np.linalg.eigvalsh(information)
     with np.errstate(divide="ignore"):
         u = np.sqrt((1 / np.maximum(values, 0.0)).sum(axis=1))
-    limit = max(WEAK, 0.5 * np.sqrt(len(nominal))) * float(np.median(u[fixed]))
-    return np.asarray(fixed & ~(u <= limit), dtype=bool)
+    return np.asarray(fixed & ~(u <= _limit(len(nominal)) * float(np.median(u[fixed]))), dtype=bool)
+
+
+def carriers(openness: Array) -> NDArray[np.bool_]:
+    """Return which targets (m,) may carry the datum, by the traces (m,) of their covariances, m^2, the stations known.
+
+    Infinite where a target has no place. The middle one is that of an even choice where there are many.
+    """
+    some = openness[:: max(1, len(openness) // _SOME)]
+    some = some[some < np.inf]
+    if not len(some):
+        some = openness[openness < np.inf]
+    limit = _limit(len(openness)) ** 2 * np.median(some) if len(some) else 0.0
+    return np.asarray(openness <= limit)
+
+
+def _limit(targets: int) -> float:
+    return float(max(WEAK, 0.5 * np.sqrt(targets)))

@@ -35,8 +35,8 @@ def measured(target, station, noise=0.0, seed=0, dead_path=0.3):
     return d + np.random.default_rng([7, seed]).normal(0.0, 1.0, d.shape) * noise
 
 
-def dense_covariance(target, station, weight):
-    """Covariance of (targets, stations) under inner constraints on the targets, from the full bordered system."""
+def dense_covariance(target, station, weight, carries):
+    """Covariance of (targets, stations) under inner constraints on some targets, from the full bordered system."""
     m, n = len(target), len(station)
     known = weight > 0
     stations = Stations(station, np.zeros(n), np.zeros(0))
@@ -45,6 +45,7 @@ def dense_covariance(target, station, weight):
     size = np.sqrt(np.mean((target - centre) ** 2))
     G = np.zeros((3 * m + 4 * n, 6))
     G[: 3 * m] = motions(target, centre).reshape(3 * m, 6) / [1, 1, 1, size, size, size]
+    G[: 3 * m][np.repeat(~carries, 3)] = 0.0
     # Scaled to one, so that the bordered matrix loses no digits.
     s = np.linalg.norm(J)
     N = np.block([[J.T @ J / s**2, G], [G.T, np.zeros((6, 6))]])
@@ -119,7 +120,7 @@ def test_covariances_are_those_of_the_full_system(n, missing):
     for i in rng.choice(20, missing, replace=False):
         seen[rng.integers(n), i] = False
     network = bound(u, NEAR[:n], noise=noise, seen=seen)
-    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0))
+    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.carries)
     scale = np.abs(C[:60, :60]).max()
     blocks = C[:60, :60].reshape(20, 3, 20, 3)[np.arange(20), :, np.arange(20)]
     # Eight digits: the condition of the bordered system is its square.
@@ -132,7 +133,7 @@ def test_redundancies_are_those_of_the_hat_matrix():
     u = nominal_targets(14)
     network = bound(u, NEAR[:5], noise=NOISE)
     J = jacobian(u, network.stations, np.ones((5, 14), dtype=bool)).toarray() / NOISE
-    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE)) @ J.T
+    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.carries) @ J.T
     assert np.abs(network.redundancy.T.ravel() - (1 - np.diag(hat))).max() < 1e-6
     assert network.redundancy.sum() == pytest.approx(network.freedom, rel=1e-8)
 

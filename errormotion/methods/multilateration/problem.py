@@ -1,0 +1,216 @@
+"""What is to be solved: readings, their weights, and what is known of the stations' parameters beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.compiling import Array, compiled
+from errormotion.methods.multilateration.kernels import reduce_targets
+from errormotion.methods.multilateration.model import Stations
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Readings, their weights, and what is known of the stations' parameters.
+
+    Attributes
+    ----------
+    reading, weight : ndarray (n, m)
+        m, NaN where there is none, and 1 / standard deviation, 1/m, 0 for what does not count.
+    extra : ndarray (k, n, m)
+        Derivatives of the readings by further parameters.
+    precision : ndarray (4 n + k,)
+        1 / variance of what is known of each parameter beforehand, about ``prior``; infinite for what is fixed.
+    prior : ndarray (4 n + k,)
+        Only where the precision is not 0.
+    nominal : ndarray (m, 3)
+        Nominal targets, m: the datum.
+    centre : ndarray (3,)
+        Their mean, m.
+    """
+
+    reading: Array
+    weight: Array
+    extra: Array
+    precision: Array
+    prior: Array
+    nominal: Array
+    centre: Array
+
+    @cached_property
+    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Readings that count, of each target (m,) and of each station (n,)."""
+        by_target, by_station = _count(self.weight)
+        return by_target, by_station
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Parameters that are estimated."""
+        return np.isfinite(self.precision)
+
+    @cached_property
+    def known(self) -> bool:
+        """Whether anything is known of the parameters that are estimated."""
+        return bool((self.free & (self.precision > 0)).any())
+
+    @property
+    def unknown(self) -> int:
+        """Parameters of which nothing is known."""
+        return int(np.count_nonzero(self.precision == 0))
+
+    def weighted(self, weight: Array) -> Problem:
+        """Return the problem with other weights (n, m); a target with fewer than three readings has no place."""
+        weight[:, _count(weight)[0] < 3] = 0.0
+        return replace(self, weight=weight)
+
+    def sample(self, every: int) -> Problem:
+        """Return the problem of every so many-th target."""
+        part = slice(every // 2, None, every)
+        reading, weight = (np.ascontiguousarray(a[:, part]) for a in (self.reading, self.weight))
+        extra = np.ascontiguousarray(self.extra[:, :, part])
+        return replace(self, reading=reading, weight=weight, extra=extra, nominal=self.nominal[part].copy())
+
+    def basis(self, stations: Stations, centre: Array) -> Array:
+        """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
+        T = stations.motions(centre)[self.free]
+        size = np.sqrt(np.einsum("ij,ij->j", T, T))
+        full = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0]
+        Z = np.zeros((len(self.free), full.shape[1] - 6))
+        Z[self.free] = full[:, 6:]
+        return Z
+
+    def reduce(self, stations: Stations, place: Array) -> Sums:
+        """Move the targets (3, m) in place and return what they say about the stations."""
+        sums, moved = reduce_targets(
+            self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, place
+        )
+        H, h, square = sums[:-1, :-1].copy(), sums[:-1, -1].copy(), float(sums[-1, -1])
+        if self.known:
+            known = self.free & (self.precision > 0)
+            off = np.where(known, self.prior - stations.vector, 0.0)
+            weight = np.where(known, self.precision, 0.0)
+            H += np.diag(weight)
+            h += weight * off
+            square += float(weight @ off**2)
+        return Sums(H, h, square, moved)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Information H, gradient h, sum of squares, and how far targets went, m."""
+
+    H: Array
+    h: Array
+    square: float
+    moved: float
+
+    def turned(self, R: Array, stations: int) -> Array:
+        """Return the information when the whole, with so many stations, has been turned by R (3, 3)."""
+        B = np.eye(len(self.h))
+        for j in range(0, 4 * stations, 4):
+            B[j : j + 3, j : j + 3] = R
+        return np.asarray(B @ self.H @ B.T)
+
+
+def state_problem(
+    displacement: ArrayLike,
+    target: ArrayLike,
+    noise: ArrayLike,
+    dead_path: tuple[ArrayLike, ArrayLike] | None = None,
+    extra: ArrayLike | None = None,
+    extra_prior: ArrayLike | None = None,
+) -> Problem:
+    """Check shapes and values, and turn them into a problem."""
+    d, u = np.asarray(displacement, dtype=float), np.array(target, dtype=float, order="C")
+    if d.ndim != 2 or u.shape != (d.shape[1], 3):
+        raise MethodError(
+            f"expected displacements (station, target) and targets (target, 3), found {d.shape} and {u.shape}; "
+            "give a row of displacements for every station and a place for every target"
+        )
+    n, m = d.shape
+    if not np.isfinite(u).all():
+        raise MethodError("expected a nominal place for every target, found NaN among them; leave such targets out")
+    sigma = np.asarray(noise, dtype=float)
+    if sigma.ndim == 1 and len(sigma) == n:
+        sigma = sigma[:, None]
+    if sigma.shape not in ((), (n, 1), (n, m)):
+        raise MethodError(f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; say whose it is")
+    sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
+    reading, weight, positive = _weigh(np.ascontiguousarray(d), sigma)
+    if not positive:
+        raise MethodError("expected a positive standard deviation for every reading; state the instrument's noise, m")
+    c = np.zeros((0, n, m)) if extra is None else np.nan_to_num(np.asarray(extra, dtype=float))
+    if c.ndim != 3 or c.shape[1:] != d.shape:
+        raise MethodError(f"expected further parameters as (k, {n}, {m}), found {c.shape}; give a value per reading")
+    precision, prior = np.zeros((2, 4 * n + len(c)))
+    if dead_path is not None:
+        value, uncertainty = (np.broadcast_to(np.asarray(a, dtype=float), (n,)) for a in dead_path)
+        with np.errstate(divide="ignore"):
+            precision[3 : 4 * n : 4] = 1.0 / uncertainty**2
+        prior[3 : 4 * n : 4] = np.where(np.isfinite(value), value, 0.0)
+    if extra_prior is not None:
+        precision[4 * n :] = 1.0 / np.broadcast_to(np.asarray(extra_prior, dtype=float), (len(c),)) ** 2
+    return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, _mean(u))
+
+
+@compiled()
+def _weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:  # pragma: no cover - compiled
+    """Return readings, their weights (n, m), and whether standard deviations ((n, 1) or (n, m)) are positive."""
+    n, m = d.shape
+    reading, weight, positive = np.empty((n, m)), np.empty((n, m)), True
+    count = np.zeros(m, dtype=np.int64)
+    for j in range(n):
+        if sigma.shape[1] == m:
+            bad = 0
+            for i in range(m):
+                there = d[j, i] - d[j, i] == 0.0
+                bad += 1 if there and not sigma[j, i] > 0.0 else 0
+                reading[j, i] = d[j, i] if there else np.nan
+                weight[j, i] = 1.0 / sigma[j, i] if there else 0.0
+                count[i] += there
+        else:
+            w, some = 1.0 / sigma[j, 0], 0
+            for i in range(m):
+                there = d[j, i] - d[j, i] == 0.0
+                reading[j, i] = d[j, i] if there else np.nan
+                weight[j, i] = w if there else 0.0
+                count[i] += there
+                some += there
+            bad = some if not sigma[j, 0] > 0.0 else 0
+        positive = positive and bad == 0
+    # A target with fewer than three readings has no place.
+    for i in range(m):
+        if count[i] < 3:
+            for j in range(n):
+                weight[j, i] = 0.0
+    return reading, weight, positive
+
+
+@compiled()
+def _count(weight: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # pragma: no cover - compiled
+    """Return how many weights (n, m) are not 0, by column and by row."""
+    n, m = weight.shape
+    by_target, by_station = np.zeros(m, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    for j in range(n):
+        some = 0
+        for i in range(m):
+            by_target[i] += weight[j, i] > 0.0
+            some += weight[j, i] > 0.0
+        by_station[j] = some
+    return by_target, by_station
+
+
+@compiled()
+def _mean(u: Array) -> Array:  # pragma: no cover - compiled
+    """Return the mean (3,) of places (m, 3)."""
+    x, y, z = 0.0, 0.0, 0.0
+    for i in range(len(u)):
+        x += u[i, 0]
+        y += u[i, 1]
+        z += u[i, 2]
+    return np.array([x, y, z]) / len(u)
