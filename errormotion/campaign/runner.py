@@ -142,6 +142,8 @@ def resume(
     runs = runs or (campaign.runs if campaign else Path("runs"))
     groups: dict[str, list[RunFolder]] = {}
     for folder in list_runs(runs):
+        if "campaign" not in folder.data:  # the log of a monitor
+            continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
     changed = ""
     for run_id, folders in reversed(groups.items()):

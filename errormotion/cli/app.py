@@ -134,6 +134,21 @@ def import_(
 
 @app.command()
 @guarded
+def monitor(
+    bench: Annotated[Path, typer.Argument(help="A bench file with thermometers, a controller, or both.")],
+    runs: Annotated[Path, typer.Option(help="Folder for the run folder of the log.")] = Path("runs"),
+    interval: Annotated[str, typer.Option(help="Time between two rows of the log.")] = "1 s",
+    duration: Annotated[str | None, typer.Option(help="When to end; default: at Ctrl-C.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each row.")] = False,
+) -> None:
+    """Show all temperatures and working parameters live, and log them."""
+    from errormotion.cli import monitoring
+
+    monitoring.run(bench, runs, interval, duration, json_)
+
+
+@app.command()
+@guarded
 def plan(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test.")] = None,

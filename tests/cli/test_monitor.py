@@ -1,0 +1,111 @@
+"""`errormotion monitor`: what a person sees, and what a program reads."""
+
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from errormotion.campaign.monitor import Snapshot
+from errormotion.cli.app import app
+from errormotion.cli.monitoring import Screen, bars, clock
+
+BENCH = """\
+schema = "errormotion.bench/1"
+name = "Shop"
+machine = "Mill 5"
+[instruments.modules]
+driver = "dcon_temperature"
+address = "sim://cframe/t?seed=21&sensors=spindle_front,column&open=1"
+channels = ["spindle", "column"]
+"""
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH)
+    return path
+
+
+def test_each_row_is_a_line_of_json_for_a_program(bench: Path) -> None:
+    result = CliRunner().invoke(app, ["monitor", str(bench), "--interval", "500 ms", "--duration", "2 s", "--json"])
+    assert result.exit_code == 0, result.output
+    rows = [json.loads(line) for line in result.stdout.splitlines()]
+    assert 1 <= len(rows) <= 5
+    assert all(row["time"] < 2.5 for row in rows)
+    assert 15 < rows[-1]["temperatures"]["spindle"] < 25
+    assert rows[-1]["temperatures"]["column"] is None
+    assert "column" in rows[-1]["flags"]
+
+
+def test_the_end_says_where_the_log_is(bench: Path) -> None:
+    result = CliRunner().invoke(app, ["monitor", str(bench), "--interval", "50 ms", "--duration", "100 ms"])
+    assert re.match(r"[123] rows over 00:00:00 in runs/\S+-monitor-\S+\.", result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--interval", "5"], "--interval: expected a time with its unit, such as '104 min'; found '5'"),
+        (["--duration", "0 s"], "--duration: expected more than 0 s; found '0 s'"),
+    ],
+)
+def test_a_time_without_sense_is_told(bench: Path, arguments: list[str], message: str) -> None:
+    result = CliRunner().invoke(app, ["monitor", str(bench), *arguments])
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert not list(Path().glob("runs/*"))
+
+
+def page(*snapshots: Snapshot) -> str:
+    screen = Screen(tuple(snapshots[0].temperatures))
+    for snapshot in snapshots:
+        screen.take(snapshot)
+    console = Console(width=120, file=io.StringIO())
+    with console.capture() as captured:
+        console.print(screen.page("Mill 5", snapshots[-1], Path("runs/x")))
+    return captured.get()
+
+
+def test_the_page_shows_temperatures_parameters_alarms_and_who_is_silent() -> None:
+    state = {
+        "position": [0.1, 0.0, -0.05],
+        "spindle_speed": 12000.0,
+        "spindle_load": math.nan,
+        "feed": 0.025,
+        "mode": "automatic",
+        "program": "warm.ngc",
+        "alarms": ["spindle hot"],
+    }
+    cold = Snapshot(0.0, {"spindle": 20.0, "column": 19.5}, {}, state, {}, 1)
+    warm = Snapshot(
+        1800.0, {"spindle": 26.0, "column": math.nan}, {"column": "open"}, state, {"far": "no answer"}, 2, {"far": 7}
+    )
+    lines = page(cold, warm).splitlines()
+    assert "00:30:00" in lines[0]
+    spindle = next(line for line in lines if line.startswith("spindle")).split()
+    assert spindle[:6] == ["spindle", "26.00", "+6.00", "+12.00", "20.00", "26.00"]
+    assert next(line for line in lines if line.startswith("column")).split()[:2] == ["column", "open"]
+    text = "\n".join(lines)
+    for told in ("X 100.000  Y 0.000  Z -50.000 mm", "12000 /min", "1500 mm/min", "warm.ngc", "spindle hot"):
+        assert told in text
+    assert "far is silent: no answer" in text
+    assert "rows without an answer: far 7" in text
+
+
+def test_bars_leave_a_blank_for_what_is_not_known() -> None:
+    assert bars([20.0, math.nan, 28.0]) == "▁ █"
+    assert bars([20.0, 20.001]) == "▁▁"  # a thousandth of a kelvin is no mountain
+    assert bars([math.nan]) == ""
+
+
+def test_a_clock_counts_days() -> None:
+    assert clock(59.9) == "00:00:59"
+    assert clock(2 * 86400 + 3661) == "2 d 01:01:01"
