@@ -1,4 +1,4 @@
-"""Moving bytes: serial lines, TCP, simulators, recordings. Only this package touches ``serial`` and ``socket``.
+"""Moving bytes: serial lines, TCP, buses, simulators, recordings. Only this package touches ``serial`` and ``socket``.
 
 ``open_transport(url)`` returns a `Transport`:
 
@@ -6,6 +6,9 @@
 * ``tcp://host:port`` a TCP connection; `transports.lines` opens several to one device
 * ``sim://machine/device?seed=3`` a simulated device, behind a real TCP connection or pty of its own
 * ``replay://session.rec`` a recorded session, played back strictly
+
+Buses have modules of their own: `transports.modbus` (``modbus+tcp``, ``modbus+rtu``, ``modbus+rtu-tcp``) and
+`transports.can` (``can``). A line that comes back by itself after it was lost is in `transports.reconnecting`.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.transports.address import SCHEMES, Address, parse_address
+from errormotion.instruments.transports.address import BYTES, SCHEMES, Address, parse_address
 from errormotion.instruments.transports.base import Transport
 
 if TYPE_CHECKING:
@@ -65,10 +68,15 @@ def open_transport(
             transport = SerialTransport(address, timeout=timeout, baudrate=baudrate)
         case "replay":
             transport = ReplayTransport(Path(address.path), timeout=timeout)
-        case _:
+        case "sim":
             from errormotion.instruments.transports.simulated import SimulatedTransport
 
             transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout)
+        case _:
+            raise InstrumentError(
+                f"This instrument speaks no {address.scheme}: expected {', '.join(f'{each}://' for each in BYTES)}; "
+                f"found '{url}'"
+            )
     if recorder is None:
         return transport
     try:

@@ -8,8 +8,23 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from errormotion.errors import InstrumentError
 
-SCHEMES = ("serial", "tcp", "sim", "replay")
+BYTES = ("serial", "tcp", "sim", "replay")
+"""Schemes of a plain stream of bytes; the others are buses with frames of their own."""
+MODBUS = ("modbus+tcp", "modbus+rtu", "modbus+rtu-tcp")
+CAN = "can"
+HTTP = "http"
+SCHEMES = (*BYTES, *MODBUS, CAN, HTTP)
+MODBUS_PORT = 502
 _EXAMPLES = "serial:///dev/ttyUSB0?baudrate=921600, tcp://192.168.0.2:23, sim://cframe/X1?seed=3, replay://session.rec"
+_FORMS = {
+    "tcp": "tcp://HOST:PORT",
+    "serial": "serial:///dev/NAME?baudrate=N",
+    "modbus+tcp": "modbus+tcp://HOST:502?unit=1",
+    "modbus+rtu-tcp": "modbus+rtu-tcp://HOST:PORT?unit=1",
+    "modbus+rtu": "modbus+rtu:///dev/NAME?baudrate=9600&unit=1",
+    "can": "can://INTERFACE/CHANNEL?node=5",
+    "http": "http://HOST:PORT/PATH",
+}
 
 
 @dataclass(frozen=True)
@@ -21,13 +36,13 @@ class Address:
     url : str
         As written.
     scheme : str
-        ``serial``, ``tcp``, ``sim`` or ``replay``.
+        One of ``SCHEMES``.
     host : str
-        Host of ``tcp``, machine of ``sim``; else empty.
+        Host of a TCP connection, machine of ``sim``, interface of ``can``; else empty.
     port : int or None
         TCP port.
     path : str
-        Device file of ``serial``, file of ``replay``, device of ``sim``.
+        Device file of a serial line, file of ``replay``, device of ``sim``, channel of ``can``.
     params : mapping of str to str
         What follows the question mark.
     """
@@ -62,6 +77,13 @@ class Address:
             raise InstrumentError(f"'{name}' in '{self.url}': expected a port from 1 to 65535; found {port:g}")
         return replace(self, url=f"tcp://{self.host}:{port:.0f}", port=int(port), params={})
 
+    def whole(self, name: str, default: int, most: int) -> int:
+        """Return a parameter as a whole number from 0 to ``most``; InstrumentError names a value that is none."""
+        value = float(self.number(name, default))
+        if not (value.is_integer() and 0 <= value <= most):
+            raise InstrumentError(f"'{name}' in '{self.url}': expected a number from 0 to {most}; found {value:g}")
+        return int(value)
+
     def with_path(self, path: str) -> str:
         """Return the URL with another path, its parameters kept."""
         query = f"?{urlencode(self.params)}" if self.params else ""
@@ -89,9 +111,12 @@ def parse_address(url: str) -> Address:
         params = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
     except ValueError as error:
         raise InstrumentError(f"The address '{url}' cannot be read: {error}; such as {_EXAMPLES}") from None
-    if scheme == "tcp" and (not parts.hostname or port is None):
-        raise InstrumentError(f"Expected tcp://HOST:PORT; found '{url}'")
-    if scheme == "serial" and not parts.path.strip("/"):
-        raise InstrumentError(f"Expected serial:///dev/NAME?baudrate=N; found '{url}'")
-    path = parts.path if scheme == "serial" else parts.path.strip("/")
+    serial = scheme in ("serial", "modbus+rtu")
+    path = parts.path if serial else parts.path.strip("/")
+    if scheme == "modbus+tcp" and port is None:
+        port = MODBUS_PORT
+    needed = {"tcp": parts.hostname and port is not None, "can": parts.hostname and path, "http": parts.hostname}
+    needed["modbus+tcp"] = needed["modbus+rtu-tcp"] = needed["tcp"]
+    if not (path.strip("/") if serial else needed.get(scheme, True)):
+        raise InstrumentError(f"Expected {_FORMS[scheme]}; found '{url}'")
     return Address(url, scheme, parts.hostname or "", port, path, params)

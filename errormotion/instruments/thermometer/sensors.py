@@ -1,0 +1,99 @@
+"""What all thermometers share: named sensors with places on the machine, and a flag where one gives no temperature."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from errormotion.datasets.units import Length
+from errormotion.errors import InstrumentError
+from errormotion.instruments.driver import Driver
+from errormotion.plugins import PluginSettings
+
+Place = tuple[Length, Length, Length]
+
+GOOD = ""
+OPEN, SHORTED, OUT_OF_RANGE, NO_ANSWER, NOT_READ = "open", "shorted", "out of range", "no answer", "not read"
+FLAGS = (GOOD, OPEN, SHORTED, OUT_OF_RANGE, NO_ANSWER, NOT_READ)
+
+
+class ThermometerSettings(PluginSettings):
+    """Settings of every thermometer."""
+
+    channels: tuple[str, ...] = Field(
+        default=("frame", "ambient", "spindle_front", "spindle_rear", "column"),
+        description="what the inputs measure, from the first one on",
+        min_length=1,
+    )
+    places: dict[str, Place] = Field(
+        default_factory=dict, description="where sensors sit on the machine: name to X, Y, Z; as far as known"
+    )
+
+    @model_validator(mode="after")
+    def _names(self) -> Self:
+        if double := {name for name in self.channels if self.channels.count(name) > 1}:
+            raise ValueError(f"'channels' names {', '.join(sorted(double))} twice; each sensor needs a name of its own")
+        if unknown := [name for name in self.places if name not in self.channels]:
+            raise ValueError(
+                f"'places' has {', '.join(unknown)}, but there are the channels {', '.join(self.channels)}"
+            )
+        return self
+
+
+class Thermometer(Driver):
+    """Base of thermometers: `_measure` returns temperatures and flags, `read` keeps the flags.
+
+    Attributes
+    ----------
+    flags : dict of str to str
+        Of the last reading: empty for a good temperature, else ``open``, ``shorted``, ``out of range``, ``no answer``
+        (all of them, when `read` has failed), or ``not read`` before the first reading.
+    """
+
+    settings: ThermometerSettings
+    flags: dict[str, str]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of what is measured."""
+        return self.settings.channels
+
+    @property
+    def places(self) -> dict[str, tuple[float, float, float] | None]:
+        """Where each sensor sits on the machine, m; None where nobody has said so."""
+        return {name: self.settings.places.get(name) for name in self.channels}
+
+    @property
+    def open_sensors(self) -> tuple[str, ...]:
+        """Channels that had no value in the last reading."""
+        return tuple(name for name, flag in self.flags.items() if flag not in (GOOD, NOT_READ))
+
+    def open(self) -> None:
+        """Open the connection and greet the device; idempotent."""
+        if self._transport is None:
+            self.flags = dict.fromkeys(self.channels, NOT_READ)
+        super().open()
+
+    def read(self) -> dict[str, float]:
+        """Return the temperatures now, degC by channel; NaN for a sensor without one, whose flag says why.
+
+        Raises
+        ------
+        InstrumentError
+            There is no answer at all, or one that cannot be understood; after a lost connection the next call
+            connects again.
+        """
+        try:
+            found = self._measure()
+        except InstrumentError:
+            self.flags = dict.fromkeys(self.channels, NO_ANSWER)
+            raise
+        self.flags = {name: flag for name, (_, flag) in found.items()}
+        return {name: math.nan if flag else value for name, (value, flag) in found.items()}
+
+    def _measure(self) -> Mapping[str, tuple[float, str]]:
+        """Return temperature (degC) and flag of each channel, in their order."""
+        raise NotImplementedError
