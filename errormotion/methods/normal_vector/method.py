@@ -1,0 +1,98 @@
+"""The plugin ``normal_vector``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import xarray as xr
+
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.normal_vector.settings import Settings as BallSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SCHEMA = "errormotion.raw.normal_vector/1"
+
+
+class NormalVector:
+    """How the frame of a machine's axes moves and turns while it warms up, from balls that its own probe touches."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(
+        id="normal_vector",
+        summary="Thermal error from balls on the table, touched by the machine's own probe while it warms up",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "a tilt of the spindle behind the last axis: the tip always sits at the same place of it, and all balls "
+            "seem to move alike",
+            "where two axes carry the workpiece: the turn about the one that carries the tool, and the other turns "
+            "without balls at different heights along it",
+            "what bends or stretches the axes: they are taken to move as one rigid frame",
+            "drift faster than the probing cycles follow one another",
+        ),
+    )
+    needs: ClassVar[Needs] = Needs(
+        instruments=("controller", "touch_probe"), raw_schema=SCHEMA, optional_instruments=("thermometer",)
+    )
+    Settings: ClassVar[type[PluginSettings]] = BallSettings
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: BallSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield one raw dataset a probing cycle. See ``acquisition``."""
+        from errormotion.methods.normal_vector import acquisition
+
+        return acquisition.acquire(bench, settings, inputs, done)
+
+    def programs(self, settings: BallSettings) -> Mapping[str, str]:
+        """Return the NC programs with which a machine makes the test by itself, the name of each file to its text."""
+        from errormotion.methods.normal_vector import acquisition
+
+        return acquisition.programs(settings)
+
+    def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
+        """Return ``time``."""
+        return "time"
+
+    def progress(self, settings: BallSettings) -> float:
+        """Return the number of probing cycles, the cold one included."""
+        return float(settings.duration // settings.interval + 1)
+
+    def identify(self, raw: xr.Dataset, settings: BallSettings | None = None) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset of component ``tool`` over ``time``.
+
+        Parameters
+        ----------
+        raw : Dataset
+            Schema ``errormotion.raw.normal_vector/1``, either variant; stays as it is.
+        settings : Settings, optional
+
+        Raises
+        ------
+        DatasetError
+            The raw dataset does not follow its schema; all violations at once.
+        MethodError
+            The data do not determine the answer, or contradict what is stated of the balls.
+        """
+        from errormotion.methods.normal_vector.identification import identify_motion
+
+        settings = settings or BallSettings()
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        validate(checked)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"normal_vector reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        return identify_motion(checked, settings, self.info.id, self.info.version)
+
+    def plan(self, settings: BallSettings | None = None) -> xr.Dataset:
+        """Return an error dataset of zeros over the cycles whose covariance is the one to expect. See ``planning``."""
+        from errormotion.methods.normal_vector.planning import plan
+
+        return plan(self, settings or BallSettings())
