@@ -55,7 +55,7 @@ def test_an_address_is_taken_apart(url: str, scheme: str, host: str, port: int |
     ("url", "message"),
     [
         ("/dev/ttyUSB0", "such as serial:///dev/ttyUSB0"),
-        ("http://x:1", "such as"),
+        ("ftp://x:1", "such as"),
         ("tcp://host", "tcp://HOST:PORT"),
         ("tcp://host:abc", "cannot be read"),
         ("serial://", "serial:///dev/NAME"),

@@ -1,0 +1,103 @@
+"""The server's end of HTTP, on loopback: what simulated agents speak through."""
+
+from __future__ import annotations
+
+import socket
+import socketserver
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+_LONGEST = 8192
+_MOST_HEADERS = 100
+
+Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
+
+
+class HttpServer:
+    """Answers GET requests on a free port of 127.0.0.1, as many connections as come.
+
+    Parameters
+    ----------
+    name : str
+        For the names of the threads.
+    respond : callable
+        ``respond(path, query)`` returns what goes out, head and all, piece by piece; an empty piece, or None instead
+        of all, hangs up. It is called in the thread of the connection.
+
+    Attributes
+    ----------
+    url : str
+        Where a client reaches it.
+    ended : threading.Event
+        Set when the server closes: a stream has to end then.
+    """
+
+    def __init__(self, name: str, respond: Respond) -> None:
+        self.ended = threading.Event()
+        self._lines: set[socket.socket] = set()
+        self._lock = threading.Lock()
+        outer = self
+
+        class Handler(socketserver.StreamRequestHandler):
+            disable_nagle_algorithm = True
+
+            def setup(self) -> None:
+                super().setup()
+                with outer._lock:
+                    outer._lines.add(self.connection)
+
+            def handle(self) -> None:
+                with suppress(OSError, ValueError):
+                    while (asked := _request(self)) is not None and not outer.ended.is_set():
+                        pieces = respond(*asked)
+                        if pieces is None:
+                            return
+                        for piece in pieces:
+                            if not piece:
+                                return
+                            self.connection.sendall(piece)
+
+            def finish(self) -> None:
+                with outer._lock:
+                    outer._lines.discard(self.connection)
+                with suppress(OSError):
+                    super().finish()
+
+        class Server(socketserver.ThreadingTCPServer):
+            allow_reuse_address = True
+            daemon_threads = False  # so that closing waits for them
+
+        self._server = Server(("127.0.0.1", 0), Handler)
+        self.url = f"tcp://127.0.0.1:{self._server.server_address[1]}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.05,), name=f"sim-{name}-http", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """End all connections and threads; idempotent."""
+        if self.ended.is_set():
+            return
+        self.ended.set()
+        self._server.shutdown()
+        self._thread.join()
+        with self._lock:
+            lines = list(self._lines)
+        for line in lines:
+            with suppress(OSError):
+                line.shutdown(socket.SHUT_RDWR)
+        self._server.server_close()
+
+
+def _request(handler: socketserver.StreamRequestHandler) -> tuple[str, dict[str, str]] | None:
+    """Return path and query of the next request; None where the client has gone or sends something else."""
+    words = handler.rfile.readline(_LONGEST).decode("latin-1").split()
+    for _ in range(_MOST_HEADERS):
+        if handler.rfile.readline(_LONGEST) in (b"\r\n", b"\n", b""):
+            break
+    if len(words) != 3 or words[0] != "GET":
+        return None
+    parts = urlsplit(words[1])
+    return unquote(parts.path), dict(parse_qsl(parts.query))

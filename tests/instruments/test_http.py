@@ -1,0 +1,180 @@
+"""Requests over HTTP: connections that end, answers that are none, streams of parts, recordings."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
+from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.http import HttpTransport
+from errormotion.instruments.transports.http_serving import HttpServer
+
+Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
+MULTIPART = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x\r\n"
+
+
+def answer(body: bytes, status: bytes = b"200 OK", head: bytes = b"") -> bytes:
+    return b"HTTP/1.1 %s\r\nContent-Type: text/xml\r\n%sContent-Length: %d\r\n\r\n%s" % (status, head, len(body), body)
+
+
+def part(body: bytes) -> bytes:
+    return b"--x\r\nContent-type: text/xml\r\nContent-length: %d\r\n\r\n%s\r\n" % (len(body), body)
+
+
+class Site:
+    """A server of which a test says what it answers, path by path."""
+
+    def __init__(self) -> None:
+        self.pages: dict[str, list[bytes] | None] = {}
+        self.asked: list[tuple[str, Mapping[str, str]]] = []
+        self.server = HttpServer("site", self._respond)
+        self.url = self.server.url.replace("tcp://", "http://")
+
+    def _respond(self, path: str, query: Mapping[str, str]) -> Iterator[bytes] | None:
+        self.asked.append((path, query))
+        pieces = self.pages[path]
+        return None if pieces is None else iter(pieces)
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    made = Site()
+    yield made
+    made.server.close()
+
+
+@pytest.fixture
+def http(site: Site) -> Iterator[HttpTransport]:
+    transport = HttpTransport(site.url, timeout=0.3)
+    yield transport
+    transport.close()
+
+
+def test_an_address_has_a_host_and_perhaps_a_port_and_a_device() -> None:
+    address = parse_address("http://agent:5000/vmc/")
+    assert (address.scheme, address.host, address.port, address.path) == ("http", "agent", 5000, "vmc")
+    assert parse_address("http://agent").port is None
+    with pytest.raises(InstrumentError, match="http://HOST:PORT/PATH"):
+        parse_address("http:///vmc")
+
+
+def test_a_body_comes_back_with_its_status(site: Site, http: HttpTransport) -> None:
+    site.pages["/current"] = [answer(b"<x/>")]
+    site.pages["/a b"] = [answer(b"no", b"404 Not Found")]
+    got = http.get("/current", {"path": "//Axes"})
+    assert (got.status, got.content_type, got.body) == (200, "text/xml", b"<x/>")
+    assert site.asked == [("/current", {"path": "//Axes"})]
+    assert http.get("/a b").status == 404
+
+
+def test_a_connection_that_the_server_ended_is_renewed(site: Site, http: HttpTransport) -> None:
+    site.pages["/once"] = [answer(b"1", head=b"Connection: close\r\n")]
+    site.pages["/gone"] = None
+    assert [http.get("/once").body for _ in range(2)] == [b"1", b"1"]
+    with pytest.raises(InstrumentError, match="ends it without an answer"):
+        http.get("/gone")
+    assert len(site.asked) == 3  # on a new connection nobody asks twice
+    assert http.get("/once").body == b"1"
+
+
+def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: HttpTransport) -> None:
+    site.pages["/kept"] = [answer(b"1")]
+    site.pages["/gone"] = None
+    http.get("/kept")
+    with pytest.raises(InstrumentError, match="lost"):
+        http.get("/gone")
+    assert [path for path, _ in site.asked] == ["/kept", "/gone", "/gone"]
+
+
+@pytest.mark.parametrize(
+    ("page", "error", "message"),
+    [
+        ([b"\x00\xff" + answer(b"<x/>")], ProtocolError, "expected an answer of HTTP"),
+        ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an answer of HTTP"),
+        ([answer(b"1")[:-5]], InstrumentTimeoutError, "silent"),
+        ([], InstrumentTimeoutError, "silent"),
+        ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
+        ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n"], ProtocolError, "cut off"),
+    ],
+)
+def test_what_is_no_answer_is_an_error_and_the_next_one_is_right(
+    site: Site, http: HttpTransport, page: list[bytes], error: type[InstrumentError], message: str
+) -> None:
+    site.pages |= {"/bad": page, "/good": [answer(b"1")]}
+    with pytest.raises(error, match=message):
+        http.get("/bad", limit=1000)
+    assert http.get("/good").body == b"1"
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_parts_of_a_stream_come_one_by_one(site: Site, http: HttpTransport, chunked: bool) -> None:
+    parts = [part(body) for body in (b"<a/>", b"", b"<b>\r\n--y</b>")]
+    if chunked:
+        head = MULTIPART + b"Transfer-Encoding: chunked\r\n\r\n"
+        whole = b"".join(b"%x\r\n%s\r\n" % (len(each), each) for each in parts) + b"0\r\n\r\n"
+        site.pages["/sample"] = [head, whole]
+    else:
+        site.pages["/sample"] = [MULTIPART + b"Connection: close\r\n\r\n", *parts, b"--x--\r\n"]
+    assert list(http.parts("/sample", {"interval": "10"})) == [b"<a/>", b"", b"<b>\r\n--y</b>"]
+    site.pages["/current"] = [answer(b"1")]
+    assert http.get("/current").body == b"1"
+
+
+def test_an_answer_of_one_piece_is_a_stream_of_one_part(site: Site, http: HttpTransport) -> None:
+    site.pages["/sample"] = [answer(b"<error/>")]
+    assert list(http.parts("/sample")) == [b"<error/>"]
+
+
+@pytest.mark.parametrize(
+    ("rest", "message"),
+    [
+        (b"--other\r\n\r\n", "expected the boundary"),
+        (b"--x\r\nContent-length: 2000\r\n\r\n", "part of 0 to 1000 bytes; found 2000"),
+        (b"--x\r\nContent-length: -1\r\n\r\n", "found None"),
+        (b"--x\r\nContent-type: text/xml\r\n\r\n", "found None"),
+        (b"x" * 5000, "line of a part"),
+    ],
+)
+def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: bytes, message: str) -> None:
+    site.pages["/sample"] = [MULTIPART + b"\r\n", part(b"1"), rest]
+    stream = http.parts("/sample", limit=1000)
+    assert next(stream) == b"1"
+    with pytest.raises(ProtocolError, match=message):
+        next(stream)
+
+
+def test_a_silent_stream_is_a_time_out(site: Site, http: HttpTransport) -> None:
+    site.pages["/sample"] = [MULTIPART + b"\r\n", part(b"1")]
+    stream = http.parts("/sample")
+    assert next(stream) == b"1"
+    with pytest.raises(InstrumentTimeoutError):
+        next(stream)
+
+
+def test_a_session_plays_back_with_its_broken_connections(site: Site, tmp_path: Path) -> None:
+    site.pages["/kept"] = [answer(b"1")]
+    site.pages["/old"] = [b"HTTP/1.0 200 OK\r\n\r\nto the end", b""]
+    site.pages["/gone"] = None
+    path = tmp_path / "http.rec"
+
+    def session(transport: HttpTransport) -> list[bytes]:
+        with pytest.raises(InstrumentError, match="lost"):
+            transport.get("/gone")
+        bodies = [transport.get(page).body for page in ("/kept", "/old", "/kept")]
+        transport.close()
+        return bodies
+
+    recorded = session(HttpTransport(site.url, recorder=path))
+    assert recorded == [b"1", b"to the end", b"1"]
+    assert session(HttpTransport(f"replay://{path}")) == recorded
+    other = HttpTransport(f"replay://{path}")
+    with pytest.raises(ReplayError, match="expected the driver to write"):
+        other.get("/kept")
+
+
+def test_other_addresses_are_refused() -> None:
+    with pytest.raises(InstrumentError, match="such as http://"):
+        HttpTransport("serial:///dev/ttyUSB0")
+    with pytest.raises(InstrumentError, match="No connection"):
+        HttpTransport("http://127.0.0.1:9")
