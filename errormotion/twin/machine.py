@@ -136,8 +136,22 @@ class VirtualMachine(BeamMeasurements, TrackerMeasurements, ProbeMeasurements):
         BenchError
             As `start`; the schedule stays as it was.
         """
-        events = sorted([*self.state.schedule.events, event], key=lambda each: each.time)
+        events = sorted([*self._events, event], key=lambda each: each.time)
         self.start(events)
+
+    def stop_spindle(self, time: float) -> None:
+        """Stop the spindle at a time, s, and take what was commanded for it later out of the schedule."""
+        events = [event if event.time < time else replace(event, spindle_speed=None) for event in self._events]
+        self.start(events)
+        self.command(Event(time, spindle_speed=0.0))
+
+    @property
+    def _events(self) -> tuple[Event, ...]:
+        return self.state.schedule.events
+
+    def spindle_load(self, t: ArrayLike) -> Array:
+        """Return the heat of the spindle at times t as a share of that at top speed, shape (n,)."""
+        return np.asarray(self.state.power(self.spindle_speed(t)) / self.state.power(self.top_speed))
 
     def spindle_speed(self, t: ArrayLike) -> Array:
         """Return the speed of the spindle at times t, 1/min, shape (n,)."""
@@ -240,7 +254,7 @@ class VirtualMachine(BeamMeasurements, TrackerMeasurements, ProbeMeasurements):
             raise BenchError(f"Only the virtual machine 'gantry' has a crossbeam; this one is '{self.kind}'.")
 
     def _origin(self) -> truth.Origin:
-        return truth.Origin(self.name, self.kind, self.seed, self.state.schedule.events)
+        return truth.Origin(self.name, self.kind, self.seed, self._events)
 
     # ------------------------------------------------------------------ readings
 

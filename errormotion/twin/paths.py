@@ -61,6 +61,23 @@ class Path:
         t = np.asarray(t, dtype=float)
         return np.stack([np.interp(t, self.times, axis) for axis in self.places.T], axis=-1)
 
+    def cut(self, time: float) -> Path:
+        """Return the same path up to a time, s, at which the machine stops."""
+        if time <= self.begin:
+            return Path(np.array([time]), self.places[:1], self.rapid[:0])
+        before = self.times < time
+        last = int(np.sum(before))
+        times, places = np.append(self.times[before], time), np.vstack([self.places[before], self.place(time)])
+        return Path(times, places, self.rapid[:last])
+
+    def feed(self, time: float) -> float:
+        """Return how fast the machine moves at a time, m/s."""
+        piece = int(np.searchsorted(self.times, time, side="right")) - 1
+        if not 0 <= piece < len(self.times) - 1:
+            return 0.0
+        way = np.linalg.norm(self.places[piece + 1] - self.places[piece])
+        return float(way / (self.times[piece + 1] - self.times[piece]))
+
     def warm_up(self) -> float | None:
         """Return when the first move begins that warms the crossbeam up, s; None where there is none.
 

@@ -184,6 +184,10 @@ class ProbeMeasurements:
             gaps.append(distance - self._reach(balls, np.full(len(way), ball), normal))
         return np.asarray(np.min(gaps, axis=0))
 
+    def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
+        """Whether a probe that has tripped is free again with the tip at a commanded place p (3,), m."""
+        return bool(self.probe_gap(p, t, balls=balls)[0] > RELEASE)
+
     def contact(
         self,
         start: ArrayLike,
@@ -193,6 +197,7 @@ class ProbeMeasurements:
         *,
         balls: Balls | None = None,
         noise: bool = True,
+        leaving: bool = False,
     ) -> tuple[Array | None, float]:
         """Return where the probe trips on the straight way from ``start`` to ``target``.
 
@@ -208,6 +213,8 @@ class ProbeMeasurements:
             `balls` where not given.
         noise : bool
             Whether the trigger scatters: by a number that belongs to this way at this time.
+        leaving : bool
+            Whether the probe may be tripped at the start by a ball that it then moves off.
 
         Returns
         -------
@@ -220,7 +227,7 @@ class ProbeMeasurements:
         balls = self.balls if balls is None else balls
         begin, end = np.asarray(start, dtype=float), np.asarray(target, dtype=float)
         length = float(np.linalg.norm(end - begin))
-        if self.probe_gap(begin, t, balls=balls)[0] <= 0:
+        if not leaving and self.probe_gap(begin, t, balls=balls)[0] <= 0:
             return begin.copy(), 0.0
         if length == 0:
             return None, 0.0
@@ -253,6 +260,8 @@ class ProbeMeasurements:
     ) -> Array:
         """Return the way of the tip along unit directions (n, 3) until it trips on a ball each (n,), m; NaN: never.
 
+        It trips never on a ball that it moves off, and at once where it is tripped and does not.
+
         The error of the tip and the reach towards a ball vary by 1e-4 of the way at most: a few rounds settle them.
         """
         centre = balls.centre[ball] + shift
@@ -270,7 +279,7 @@ class ProbeMeasurements:
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
             if not np.any(change > _SETTLED):
                 break
-        return np.asarray(np.where(way >= 0, way, np.nan))
+        return np.asarray(np.maximum(way, 0.0))
 
     def _trigger(self, start: Array, target: Array, t: float) -> float:
         """Return a standard normal number that belongs to a way at a time."""

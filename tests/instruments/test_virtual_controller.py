@@ -55,16 +55,28 @@ def test_the_state_follows_the_schedule() -> None:
         controller.start([Event(0.0, spindle_speed=15000.0), Event(60.0, compensation={"Z": False})])
         assert controller.state() == {
             "time": 0.0,
-            "spindle_speed": 15000.0,
+            "position": [0.0, 0.0, 0.0],
+            "commanded_position": [0.0, 0.0, 0.0],
+            "spindle_speed": 0.0,  # it has only been told to turn
+            "commanded_spindle_speed": 15000.0,
+            "spindle_load": 0.0,
+            "feed": 0.0,
+            "mode": "mdi",
+            "program": "",
+            "running": False,
+            "homed": True,
+            "enabled": True,
+            "estop": False,
+            "alarms": [],
             "compensation": {"X": True, "Y": True, "Z": True},
             "stepping": False,
-            "running": False,
-            "position": [0.0, 0.0, 0.0],
             "tool": "bar",
-            "alarms": [],
         }
         controller.elapse(60.0)
-        assert controller.read()["compensation"]["Z"] is False
+        state = controller.read()
+        assert state["compensation"]["Z"] is False
+        assert state["spindle_speed"] == pytest.approx(15000.0, abs=1e-6)
+        assert state["spindle_load"] == pytest.approx(1.0, abs=1e-9)
         controller.start([])
         assert controller.state()["time"] == 0.0
 

@@ -87,7 +87,7 @@ class VirtualController(Driver):
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="virtual_controller",
         kind="controller",
-        summary="Controller of the virtual machine: tool, spindle, compensation, step programs, NC programs",
+        summary="Controller of the virtual machine: tool, spindle, touch probe, compensation, step and NC programs",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.controller:SimulatedController",
     )
@@ -117,15 +117,23 @@ class VirtualController(Driver):
     def state(self) -> dict[str, Any]:
         """Return what the control shows.
 
-        ``time`` (s since the start of the schedule), ``spindle_speed`` (1/min), ``compensation`` (axis to on or off),
-        ``position`` (X, Y, Z, m), ``tool``, ``stepping`` and ``running`` (whether a step program, or an NC program,
-        waits or runs), ``alarms`` (list of str); and ``target`` where one is set (``kind``, and of a plane
-        ``inclination`` and ``rotation``, rad).
+        As every controller: ``time`` (s since the start of the schedule), ``position`` and ``commanded_position`` (X,
+        Y, Z, m), ``spindle_speed`` (1/min, as it turns), ``spindle_load`` (share of that at top speed), ``feed`` (m/s,
+        as it moves; NaN while the sphere is stepped), ``mode`` (``mdi``, or ``automatic`` while a program waits or
+        runs), ``program`` (its title), ``running`` (whether an NC program waits or runs), ``homed``, ``enabled``,
+        ``estop``, ``alarms`` (list of str).
+
+        And what others do not show: ``commanded_spindle_speed`` (1/min), ``compensation`` (axis to on or off),
+        ``tool``, ``stepping`` (whether a step program waits or runs); ``target`` where one is set (``kind``, and of a
+        plane ``inclination`` and ``rotation``, rad).
         """
         return dict(self._call("state"))
 
     def mount(self, tool: str) -> None:
-        """Put ``"bar"`` or ``"sphere"`` into the spindle."""
+        """Put ``"bar"``, ``"sphere"`` or ``"probe"`` into the spindle.
+
+        The probe comes by itself when the machine probes, and goes, for the bar, when the spindle is to turn.
+        """
         self._call("mount", tool=tool)
 
     def start(self, schedule: Iterable[Any]) -> None:
@@ -237,6 +245,52 @@ class VirtualController(Driver):
         """
         place = [float(x) for x in position]
         return dict(self._call("move_to", position=place, feed=None if feed is None else float(feed)))
+
+    def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
+        """Move the touch probe in a straight line until it trips; there the machine stands, or at the target.
+
+        Parameters
+        ----------
+        target : (3,)
+            Commanded place of the tip, X, Y, Z, m.
+        feed : float
+            m/s.
+
+        Returns
+        -------
+        dict
+            ``tripped`` (bool), ``position`` (of the tip when it has tripped, m; None when it has not) and ``time`` (s).
+
+        Raises
+        ------
+        InstrumentError
+            The probe is tripped before it moves, the spindle turns, the target is out of travel, alarm or emergency
+            stop: nothing moves.
+        """
+        found = dict(self._call("probe", target=[float(x) for x in target], feed=float(feed)))
+        return {**found, "position": None if found["position"] is None else [float(x) for x in found["position"]]}
+
+    def spindle(self, speed: float) -> None:
+        """Turn the spindle at a speed in 1/min from now on; 0 stops it.
+
+        Raises
+        ------
+        InstrumentError
+            The spindle cannot turn that fast, alarm or emergency stop.
+        """
+        self._call("spindle", speed=float(speed))
+
+    def stop(self, *, spindle: bool = False) -> None:
+        """Abort all motion of the axes, and with ``spindle`` stop the spindle, too; always allowed."""
+        self._call("stop", spindle=bool(spindle))
+
+    def press_estop(self) -> None:
+        """Press the emergency stop: axes and spindle stop, and nothing moves until `reset`."""
+        self._call("estop")
+
+    def reset(self) -> None:
+        """Leave alarm and emergency stop; nothing begins to move by itself."""
+        self._call("reset")
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
         """Put a target before the point sensors, which ride on the stage while there is one.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from errormotion.errors import ErrormotionError
 from errormotion.instruments.simulators.device import SimulatedDevice
@@ -12,19 +12,30 @@ from errormotion.instruments.simulators.virtual_world import LEAD_IN
 from errormotion.instruments.transports import Address
 from errormotion.twin import Event
 
+MACHINE_FAULTS = ("alarm", "estop", "no_trip", "tripped")
+
 
 class SimulatedController(SimulatedDevice):
-    """Answers requests in JSON lines."""
+    """Answers requests in JSON lines.
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect")
+    Further parameters of the address: ``balls`` (how many stand on the table; 4), and of faults, counted in requests:
+    ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or somebody presses the emergency
+    stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or for good, the probe never trips, or
+    is stuck).
+    """
+
+    faults = ("silence", "split", "garbage", "drop", "disconnect", *MACHINE_FAULTS)
 
     def __init__(self, address: Address) -> None:
         super().__init__(address, line_end=b"\n", default_name="controller")
+        if "balls" in address.params:
+            self.world.balls = self.world.machine.balls_on_table(int(address.number("balls", 0)))
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request."""
         number: Any = None
         try:
+            self._befall()
             message = json.loads(request)
             number = message.pop("id")
             reply = {"id": number, "ok": True, "result": self._obey(message.pop("op"), message)}
@@ -34,13 +45,27 @@ class SimulatedController(SimulatedDevice):
             reply = {"id": number, "ok": False, "error": f"this is no request: {error!r}"}
         return json.dumps(reply).encode() + b"\n"
 
+    def _befall(self) -> None:
+        """Let happen to the machine what is due at this request."""
+        if self.fault.kind == "alarm" and self._answers == self.fault.at:
+            self.world.raise_alarm("servo alarm (simulated)")
+        if self.fault.kind == "estop" and self._answers == self.fault.at:
+            self.world.press_estop()
+
+    def _stuck(self) -> Literal["open", "closed"] | None:
+        """Return how the probe is broken at this request."""
+        since = self._answers - self.fault.at
+        if since < 0 or (self.fault.length and since >= self.fault.length):
+            return None
+        return {"no_trip": "open", "tripped": "closed"}.get(self.fault.kind)  # type: ignore[return-value]
+
     def _obey(self, op: str, arguments: Mapping[str, Any]) -> Any:
         world = self.world
         match op:
             case "identify":
                 return {"manufacturer": "errormotion", "model": world.name, "serial_number": f"seed {world.seed}"}
             case "state":
-                return {**world.commanded(), "position": world.position(), "tool": world.tool, "alarms": []}
+                return world.commanded()
             case "mount":
                 world.mount(**arguments)
             case "start":
@@ -55,6 +80,18 @@ class SimulatedController(SimulatedDevice):
                 return {"duration": path.duration, "longest_lead_in": LEAD_IN[1]}
             case "move_to":
                 return {"duration": world.move_to(**arguments)}
+            case "probe":
+                return world.probe(**arguments, stuck=self._stuck())
+            case "spindle":
+                world.spindle(**arguments)
+            case "stop":
+                world.stop()
+                if arguments["spindle"]:
+                    world.spindle(0.0)
+            case "estop":
+                world.press_estop()
+            case "reset":
+                world.reset_alarms()
             case "set_target":
                 world.set_target(**arguments)
             case "set_station":

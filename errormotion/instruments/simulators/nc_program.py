@@ -62,6 +62,12 @@ def interpret(
     raise InstrumentError("The program ends without M30 or M2: is it whole?")
 
 
+def title(text: str) -> str:
+    """Return the first comment of a program, which says what it does; "program" where it has none."""
+    found = re.search(r"\(([^()\n]*)\)|;(.*)", text)
+    return ((found[1] or found[2] or "").strip() if found else "") or "program"
+
+
 def _words(line: str) -> list[tuple[str, float]]:
     """Return letters and numbers of a line without its comments."""
     plain = _COMMENT.sub(" ", line).partition(";")[0].strip().upper()
