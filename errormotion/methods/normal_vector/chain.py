@@ -70,7 +70,7 @@ def solve(T: Array, after: Array, G: Array, D: Array, r: Array, s: Array) -> Sol
     back = np.empty_like(after)
     loose = not after.any()
     if loose:
-        inverse = np.linalg.inv(T)
+        inverse[:] = np.linalg.inv(T)
         y = inverse @ right
     else:
         inverse[0] = np.linalg.inv(T[0])

@@ -100,7 +100,7 @@ def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
     if spread(centres) == 0:
         raise MethodError(f"Balls {', '.join(names)} all lie at one place; expected places far apart.")
     away = centres - centres.mean(axis=0)
-    _, size, axes = np.linalg.svd(away, full_matrices=False)
+    size = np.linalg.svd(away, compute_uv=False)
     turns = ", ".join(DOF[k] for k in loose)
     if tool_axes == "XYZ":
         off = size[1] / np.sqrt(len(centres))

@@ -204,24 +204,33 @@ def at_times(to_knots: Array, twist: Array) -> Array:
     """Return the twists at the times that the weights (k, b, m, 3) belong to, (k, b, m, 6)."""
     edge = np.zeros((1, 6))
     around = np.stack([np.concatenate([edge, twist[:-1]]), twist, np.concatenate([twist[1:], edge])], axis=1)
-    return np.einsum("kbms,ksd->kbmd", to_knots, around)
+    return np.asarray(np.einsum("kbms,ksd->kbmd", to_knots, around))
+
+
+def spheres(seen: Observations) -> tuple[Array, Array]:
+    """Return centres (b, 3) and radii (b,) of spheres through the touches of each ball, m, as if nothing drifted."""
+    return _spheres(seen.place, seen)
 
 
 def _anchors(place: Array, seen: Observations) -> Array:
-    """Return the centres of spheres through the mean places of each ball's touches, (b, 3)."""
+    return _spheres(place, seen)[0]
+
+
+def _spheres(place: Array, seen: Observations) -> tuple[Array, Array]:
+    """Return the spheres through the mean places of each ball's touches."""
     valid = seen.valid
     count = valid.sum(axis=0)
     mean = np.where(valid[..., None], place, 0.0).sum(axis=0) / np.maximum(count, 1)[..., None]
     found = []
     for i, points in enumerate(mean):
         try:
-            found.append(fit_sphere(points[count[i] > 0]).centre)
+            found.append(fit_sphere(points[count[i] > 0]))
         except FitError as error:
             raise MethodError(
                 f"Ball {i + 1} has no sphere through its touches in {int((count[i] > 0).sum())} directions: {error}. "
                 "Touch every ball five times or more: around it and on top."
             ) from error
-    return np.array(found)
+    return np.array([sphere.centre for sphere in found]), np.array([sphere.radius for sphere in found])
 
 
 def _directions(place: Array, anchor: Array) -> Array:
@@ -274,9 +283,9 @@ def _normal_equations(
         r[where] += own_r[inside, i]
         for j in range(i, 3):
             N[j - i][where] += local[inside, i, :, j]
-    D = np.zeros((b, m, b, m))
-    D[np.arange(b), :, np.arange(b)] = seen.weight.sum(axis=0)
-    D = D.reshape(b * m, b * m)
+    blocks = np.zeros((b, m, b, m))
+    blocks[np.arange(b), :, np.arange(b)] = seen.weight.sum(axis=0)
+    D = blocks.reshape(b * m, b * m)
     s = Wy.sum(axis=0).ravel()
     never = np.diagonal(D) == 0
     D[never, never] = 1.0
@@ -305,7 +314,7 @@ def _shifted(k: int, by: int) -> tuple[slice, slice]:
 
 
 def _paired(N: list[Array], g: Array, r: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the equations of all cycles but the first, two and two of them taken together: then only neighbours touch."""
+    """Return the equations of all cycles but the first, two and two taken together."""
     n, p = len(r) - 1, r.shape[1]
     odd = n % 2
     pairs = (n + odd) // 2

@@ -1,0 +1,141 @@
+"""What to expect before anything is touched, and which freedoms will not be seen."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.units import format_quantity
+from errormotion.errors import MethodError
+from errormotion.kinematics.iso import DOF
+from errormotion.methods.normal_vector import normals as published
+from errormotion.methods.normal_vector import touching
+from errormotion.methods.normal_vector.freedoms import Motion, check_layout
+from errormotion.methods.normal_vector.rigid import Observations, fit
+from errormotion.methods.normal_vector.spheres import centres
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.plugins import Method
+
+    Array = NDArray[np.float64]
+
+TIP_RADIUS, NOISE = 3e-3, 0.25e-6
+"""Taken where the settings leave them to the probe, m."""
+
+
+def plan(method: Method, settings: Settings) -> xr.Dataset:
+    """Return an error dataset of zeros over the cycles, with the covariance to expect of balls, touches and noise.
+
+    ``normals_loss(dof)`` is by what factor the published construction is less certain; ``notes`` say in words what
+    will be known how well, and what not at all.
+
+    Raises
+    ------
+    MethodError
+        Fewer than three balls, or balls that leave open what they could show.
+    """
+    names = touching.names(settings)
+    rough = np.array([ball.centre for ball in settings.balls], dtype=float).reshape(-1, 3)
+    check_layout(rough, names, settings.tool_axes)
+    point = settings.functional_point
+    motion = Motion(settings.tool_axes, np.round(rough.mean(axis=0), 4) if point is None else np.array(point, float))
+    noise, count = settings.touch_noise or NOISE, int(method.progress(settings))
+    if count < 2:
+        raise MethodError(
+            f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at intervals "
+            f"of {settings.interval:g} s."
+        )
+    seen = planned_touches(settings, count, noise)
+    found = fit(seen, motion, interpolate=False)
+    covariance = found.covariance
+    unseen = [k for k in range(6) if k not in motion.seen]
+    values = np.zeros((count, 6))
+    values[:, unseen] = np.nan
+    loss = _loss(seen, settings, motion, found.anchor, found.reach, covariance)
+    factors = _factors(covariance[-1] - found.own[-1])
+    influence = np.repeat(factors[:, None], count, axis=1)
+    influence[:, 0] = 0.0
+    ds = build_errors(
+        values,
+        covariance,
+        dims=("time",),
+        coords={"time": ("time", settings.interval * np.arange(count), {"units": "s"}), "ball": names},
+        component="tool",
+        machine="plan",
+        frame="machine",
+        functional_point=motion.point,
+        reference="planned, not measured",
+        method=method.info.id,
+        method_version=method.info.version,
+        provenance=provenance.make(settings, None, None, steps=["plan"]),
+        influence=influence,
+        sources=[f"cold reference {i + 1}" for i in range(len(influence))],
+        source_groups=["cold reference"] * len(influence),
+        extras={"normals_loss": xr.DataArray(loss, dims="dof", attrs={"units": "1"})},
+    )
+    return ds.assign_attrs(notes=_notes(settings, motion, covariance[-1], loss, noise), tool_axes=settings.tool_axes)
+
+
+def planned_touches(settings: Settings, cycles: int, noise: float) -> Observations:
+    """Return the touches of cycles in which nothing moves, one cycle an interval."""
+    normal = touching.normals(settings)
+    reach = np.array([ball.radius for ball in settings.balls]) + (settings.tip_radius or TIP_RADIUS)
+    place = np.array([ball.centre for ball in settings.balls])[:, None] + reach[:, None, None] * normal
+    b, m, _ = place.shape
+    weight = np.zeros((cycles, b, m, m))
+    weight[..., range(m), range(m)] = noise**-2
+    time = settings.interval * np.arange(cycles)
+    every = np.broadcast_to(time[:, None, None], (cycles, b, m))
+    return Observations(np.tile(place, (cycles, 1, 1, 1)), weight, every, time, touched=True)
+
+
+def _loss(
+    seen: Observations, settings: Settings, motion: Motion, anchor: Array, reach: Array, covariance: Array
+) -> Array:
+    if motion.tool_axes != "XYZ" or len(anchor) < 4:
+        return np.full(6, np.nan)
+    names = touching.names(settings)
+    chosen = settings.normals_balls or tuple(names[:4])
+    if missing := [name for name in chosen if name not in names]:
+        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
+    four = [names.index(name) for name in chosen]
+    measured = centres(seen, anchor, reach)
+    C = published.covariance(
+        measured.cofactor[0, four], measured.cofactor[1:2, four], motion.point, measured.centre[0, four]
+    )
+    return np.sqrt(np.diagonal(C[0]) / np.diagonal(covariance[1]))
+
+
+def _factors(shared: Array) -> Array:
+    """Return columns whose squares sum to a covariance (6, 6): (source, 6)."""
+    u = np.sqrt(np.maximum(np.diagonal(shared), 0.0))
+    unit = np.where(u > 0, u, 1.0)
+    values, vectors = np.linalg.eigh(shared / np.outer(unit, unit))
+    some = values > 1e-9
+    return np.asarray((vectors[:, some] * np.sqrt(values[some])).T * u)
+
+
+def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, noise: float) -> list[str]:
+    u = np.sqrt(np.diagonal(covariance))
+    said = ", ".join(f"{DOF[k]} {format_quantity(float(u[k]), 'um' if k < 3 else 'arcsec', 3)}" for k in motion.seen)
+    touches = settings.touches * len(settings.balls)
+    notes = [
+        f"With {touches} touches a cycle and {format_quantity(noise, 'um', 2)} noise of each, the standard uncertainties "
+        f"relative to the cold cycle are {said}. Half of the variance is the cold cycle's, which is probed once."
+    ]
+    if unseen := [DOF[k] for k in range(6) if k not in motion.seen]:
+        notes.append(
+            f"Not seen: {', '.join(unseen)}. Only {' and '.join(motion.tool_axes) or 'no axis'} carries the tool, and "
+            "its way is the lever by which a turn shows."
+        )
+    notes.append("Not seen: a tilt of the spindle behind the last axis; it displaces all balls alike.")
+    if np.isfinite(loss).all():
+        worse = ", ".join(f"{name} {factor:.2f}" for name, factor in zip(DOF, loss, strict=True))
+        notes.append(f"The normals of two planes would be less certain by the factors {worse}.")
+    return notes
