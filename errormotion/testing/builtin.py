@@ -42,9 +42,19 @@ def builtin_subjects(
         return (multilateration(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
         return (InstrumentSubject(cls, str(scan_file())),)
+    if (group, plugin_id) == ("instruments", "mtconnect"):
+        return (mtconnect(cls),)
     if (group, plugin_id) == ("instruments", "tracker_table"):
         return (InstrumentSubject(cls, str(length_table())),)
     return ()
+
+
+def mtconnect(cls: Any) -> InstrumentSubject:
+    """Return ``mtconnect``; a buffer that is overwritten, and a new instance of the agent, harm no reading of the state.
+
+    An alarm is a word in it, no number.
+    """
+    return InstrumentSubject(cls, "sim://cframe/mtconnect", harmless=("split", "overrun", "jump", "restart", "alarm"))
 
 
 def own_folder() -> Path:

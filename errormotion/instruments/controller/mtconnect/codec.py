@@ -1,0 +1,343 @@
+"""The XML of MTConnect agents (ANSI/MTC1.4, parts 1 and 2): what a device has, what was observed, what went wrong.
+
+Names count without their namespaces, so that all versions from 1.2 to 2.x are read alike. A document with a document
+type is refused before anything in it is expanded: entities, external or nested, never come to be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+from xml.etree import ElementTree
+
+from errormotion.errors import ProtocolError
+
+UNAVAILABLE = "UNAVAILABLE"
+LEVELS = ("Normal", "Warning", "Fault", "Unavailable")
+"""Elements of a condition."""
+
+_SI: Mapping[str, float] = {
+    "MILLIMETER": 1e-3,
+    "MILLIMETER_3D": 1e-3,
+    "MILLIMETER/SECOND": 1e-3,
+    "MILLIMETER/MINUTE": 1e-3 / 60,
+    "MILLIMETER/SECOND^2": 1e-3,
+    "MILLIMETER/REVOLUTION": 1e-3,
+    "INCH": 25.4e-3,
+    "INCH_3D": 25.4e-3,
+    "INCH/SECOND": 25.4e-3,
+    "INCH/MINUTE": 25.4e-3 / 60,
+    "FOOT": 0.3048,
+    "METER": 1.0,
+    "METER/SECOND": 1.0,
+    "DEGREE": math.pi / 180,
+    "DEGREE_3D": math.pi / 180,
+    "DEGREE/SECOND": math.pi / 180,
+    "DEGREE/MINUTE": math.pi / 180 / 60,
+    "RADIAN": 1.0,
+    "REVOLUTION/MINUTE": 1.0,  # spindle speeds stay per minute
+    "REVOLUTION/SECOND": 60.0,
+    "PERCENT": 0.01,
+    "CELSIUS": 1.0,
+    "SECOND": 1.0,
+    "HERTZ": 1.0,
+    "COUNT": 1.0,
+}
+_UNITS_OF: Mapping[str, str] = {
+    "POSITION": "MILLIMETER",
+    "PATH_POSITION": "MILLIMETER_3D",
+    "AXIS_FEEDRATE": "MILLIMETER/SECOND",
+    "PATH_FEEDRATE": "MILLIMETER/SECOND",
+    "ROTARY_VELOCITY": "REVOLUTION/MINUTE",
+    "SPINDLE_SPEED": "REVOLUTION/MINUTE",
+    "ANGLE": "DEGREE",
+    "LOAD": "PERCENT",
+    "TEMPERATURE": "CELSIUS",
+}
+"""Units by the standard, for an agent that leaves them out."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """Head of a document; ``first`` to ``last`` are the sequence numbers that the agent still holds."""
+
+    instance: int
+    created: float  # s since 1970
+    first: int = 0
+    last: int = 0
+    next: int = 0
+    buffer: int = 0
+    version: str = ""
+    sender: str = ""
+
+
+@dataclass(frozen=True)
+class DataItem:
+    """Something that a device tells, and the component that it stands in: its element, names and id."""
+
+    id: str
+    category: str
+    type: str
+    sub_type: str = ""
+    name: str = ""
+    units: str = ""
+    coordinate_system: str = ""
+    component: str = ""
+    component_name: str = ""
+    native_name: str = ""
+    component_id: str = ""
+
+    @property
+    def scale(self) -> float:
+        """What a value is multiplied by to be in SI; per minute for speeds of rotation.
+
+        Raises
+        ------
+        ProtocolError
+            Units that are not known.
+        """
+        units = self.units or _UNITS_OF.get(self.type, "")
+        if units not in _SI:
+            known = ", ".join(sorted(_SI))
+            raise ProtocolError(f"The data item '{self.id}' ({self.type}) is in '{units}'; known are {known}")
+        return _SI[units]
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device of an agent, and its data items by id."""
+
+    name: str
+    uuid: str
+    manufacturer: str = ""
+    model: str = ""
+    serial_number: str = ""
+    items: Mapping[str, DataItem] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Something that was observed.
+
+    Attributes
+    ----------
+    item : str
+        Id of the data item.
+    sequence : int
+        Number of the observation; counts up over all data items while the agent runs.
+    time : float
+        When, s since 1970 by the agent's clock.
+    value : str
+        As the agent tells it, ``UNAVAILABLE`` included; of a condition its text.
+    level : str
+        Of a condition ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``; else empty.
+    type, code : str
+        Of a condition: what it is about, and the machine's own code.
+    """
+
+    item: str
+    sequence: int
+    time: float
+    value: str
+    level: str = ""
+    type: str = ""
+    code: str = ""
+
+    def number(self, scale: float = 1.0) -> float:
+        """Return the value times ``scale``; NaN where it is unavailable.
+
+        Raises
+        ------
+        ProtocolError
+            Neither a number nor unavailable.
+        """
+        return self.numbers(scale)[0]
+
+    def numbers(self, scale: float = 1.0) -> list[float]:
+        """Return the values of a list such as ``1.5 2 3`` times ``scale``; one NaN where it is unavailable."""
+        if self.value.upper() == UNAVAILABLE:
+            return [math.nan]
+        try:
+            return [float(word) * scale for word in self.value.split()] or [math.nan]
+        except ValueError:
+            raise ProtocolError(f"The data item '{self.item}': expected a number; found '{self.value[:40]}'") from None
+
+
+@dataclass(frozen=True)
+class Document:
+    """What an agent answered: devices (of /probe), observations (of /current and /sample), or errors by their code."""
+
+    header: Header
+    devices: tuple[Device, ...] = ()
+    observations: tuple[Observation, ...] = ()
+    errors: Mapping[str, str] = field(default_factory=dict)
+
+
+def parse(data: bytes) -> Document:
+    """Read an agent's answer.
+
+    Raises
+    ------
+    ProtocolError
+        No XML, not of MTConnect, a document type, a header or an observation without what belongs to it.
+    """
+    root = _tree(data)
+    kind = _local(root)
+    header = _header(root)
+    match kind:
+        case "MTConnectDevices":
+            return Document(header, devices=tuple(_devices(root)))
+        case "MTConnectStreams":
+            found = sorted(_observations(root), key=lambda each: each.sequence)
+            return Document(header, observations=tuple(found))
+        case "MTConnectError":
+            return Document(header, errors=_errors(root))
+        case _:
+            raise ProtocolError(f"Expected a document of MTConnect (devices, streams or an error); found <{kind}>")
+
+
+class _NoDoctype(ElementTree.TreeBuilder):
+    def doctype(self, name: str, *_: str | None) -> None:
+        """Refuse a document type: no document of MTConnect has one, and all entities are made there."""
+        raise ProtocolError(f"Expected a document of MTConnect; found one with a document type '{name[:40]}', refused")
+
+
+def _tree(data: bytes) -> ElementTree.Element:
+    parser = ElementTree.XMLParser(target=_NoDoctype())
+    try:
+        parser.feed(data)
+        root: Any = parser.close()
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the others: encodings nobody knows
+        raise ProtocolError(f"Expected XML; it cannot be read ({error}); it starts {data[:60]!r}") from None
+    if not isinstance(root, ElementTree.Element):
+        raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
+    return root
+
+
+def _local(element: ElementTree.Element) -> str:
+    return element.tag.rpartition("}")[2]
+
+
+def _child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
+    return next((child for child in element if _local(child) == name), None)
+
+
+def _whole(element: ElementTree.Element, name: str, default: int | None = None) -> int:
+    text = element.get(name)
+    if text is None and default is not None:
+        return default
+    try:
+        value = int(text or "")
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise ProtocolError(f"<{_local(element)}>: expected a number '{name}'; found {text!r}")
+    return value
+
+
+def parse_time(text: str) -> float:
+    """Return a time such as ``2025-03-01T12:00:00.25Z`` as s since 1970; without a zone it is UTC.
+
+    Raises
+    ------
+    ProtocolError
+        No such time.
+    """
+    try:
+        time = datetime.fromisoformat(text.partition("@")[0].strip())
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'") from None
+
+
+def _header(root: ElementTree.Element) -> Header:
+    header = _child(root, "Header")
+    if header is None:
+        raise ProtocolError(f"Expected a document of MTConnect; found <{_local(root)[:40]}> without a header")
+    return Header(
+        instance=_whole(header, "instanceId"),
+        created=parse_time(header.get("creationTime", "")),
+        first=_whole(header, "firstSequence", 0),
+        last=_whole(header, "lastSequence", 0),
+        next=_whole(header, "nextSequence", 0),
+        buffer=_whole(header, "bufferSize", 0),
+        version=header.get("version", ""),
+        sender=header.get("sender", ""),
+    )
+
+
+def _devices(root: ElementTree.Element) -> Iterator[Device]:
+    for devices in root:
+        if _local(devices) != "Devices":
+            continue
+        for device in devices:
+            if _local(device) != "Device":  # an agent tells of itself as well
+                continue
+            told = _child(device, "Description")
+            about = {} if told is None else told.attrib
+            items = {item.id: item for item in _items(device)}
+            yield Device(
+                name=device.get("name", ""),
+                uuid=device.get("uuid", ""),
+                manufacturer=about.get("manufacturer", ""),
+                model=about.get("model", ""),
+                serial_number=about.get("serialNumber", ""),
+                items=items,
+            )
+
+
+def _items(device: ElementTree.Element) -> Iterator[DataItem]:
+    """Yield the data items of a device; those of a component stand in its ``DataItems``."""
+    waiting = [device]
+    while waiting:
+        component = waiting.pop()
+        for part in component:
+            match _local(part):
+                case "DataItems":
+                    yield from (_item(item, component) for item in part if _local(item) == "DataItem")
+                case "Components":
+                    waiting.extend(part)
+
+
+def _item(item: ElementTree.Element, component: ElementTree.Element) -> DataItem:
+    if not item.get("id") or not item.get("type"):
+        raise ProtocolError(f"Expected data items with id and type; found {dict(item.attrib)}")
+    return DataItem(
+        id=item.get("id", ""),
+        category=item.get("category", ""),
+        type=item.get("type", ""),
+        sub_type=item.get("subType", ""),
+        name=item.get("name", ""),
+        units=item.get("units", "") or item.get("nativeUnits", ""),
+        coordinate_system=item.get("coordinateSystem", ""),
+        component=_local(component),
+        component_name=component.get("name", ""),
+        native_name=component.get("nativeName", ""),
+        component_id=component.get("id", ""),
+    )
+
+
+def _observations(root: ElementTree.Element) -> Iterator[Observation]:
+    for element in root.iter():
+        item = element.get("dataItemId")
+        if item is None:
+            continue
+        level = _local(element) if _local(element) in LEVELS else ""
+        yield Observation(
+            item=item,
+            sequence=_whole(element, "sequence"),
+            time=parse_time(element.get("timestamp", "")),
+            value="".join(element.itertext()).strip(),
+            level=level,
+            type=element.get("type", "") if level else "",
+            code=element.get("nativeCode", "") if level else "",
+        )
+
+
+def _errors(root: ElementTree.Element) -> dict[str, str]:
+    found = {each.get("errorCode", ""): " ".join("".join(each.itertext()).split()) for each in root.iter()}
+    found.pop("", None)
+    return found or {"UNKNOWN": "no error is named"}

@@ -1,0 +1,382 @@
+"""Driver of MTConnect agents: what the machine does now, and everything that was observed since."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.controller.mtconnect.choice import choose
+from errormotion.instruments.controller.mtconnect.codec import (
+    UNAVAILABLE,
+    DataItem,
+    Device,
+    Document,
+    Observation,
+    parse,
+)
+from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports.http import HttpTransport
+from errormotion.plugins import Identity, InstrumentInfo
+
+OUT_OF_RANGE = "OUT_OF_RANGE"
+_MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
+_ATTEMPTS = 3  # to catch up with an agent that overwrites its buffer
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Observations in the order of their sequence numbers, and what is missing before them.
+
+    Attributes
+    ----------
+    observations : tuple of Observation
+        May be empty: an agent that has nothing new still answers.
+    next : int
+        Sequence number that follows.
+    lost : int
+        Observations that the agent had overwritten before they were asked for; of all its devices.
+    restarted : bool
+        The agent was started anew: its numbers begin again, and what it held is gone uncounted.
+    """
+
+    observations: tuple[Observation, ...]
+    next: int
+    lost: int = 0
+    restarted: bool = False
+
+
+class MTConnect(Driver):
+    """A machine that an MTConnect agent tells of; read-only.
+
+    Parameters
+    ----------
+    address : str
+        ``http://host:5000/device`` (without device where the agent has only one), ``sim://cframe/mtconnect``,
+        ``replay://file``.
+    settings : MTConnectSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    lost, restarts : int
+        Observations that were overwritten unread, and restarts of the agent, both since the driver was made.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="mtconnect",
+        kind="controller",
+        summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.mtconnect:SimulatedAgent",
+    )
+    Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
+    settings: MTConnectSettings
+
+    def __init__(self, address: str, settings: MTConnectSettings | None = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
+        self.lost = 0
+        self.restarts = 0
+        self._instance: int | None = None
+        self._next: int | None = None
+        self._began: float | None = None
+        self._restarted = False  # while nobody listened
+        self._device = Device("", "")
+        self._items: Mapping[str, DataItem] = {}
+
+    @property
+    def items(self) -> Mapping[str, DataItem]:
+        """Data items of the device by id, with type, units and component."""
+        return self._device.items
+
+    def identify(self) -> Identity:
+        """Tell what the agent says of its device."""
+        document = self._ask("probe")
+        device = self._one(document)
+        return Identity(
+            manufacturer=device.manufacturer or "unknown",
+            model=device.model or device.name,
+            serial_number=device.serial_number or device.uuid,
+            firmware=f"MTConnect {document.header.version}",
+            simulated=self.transport.simulated,
+            details={"address": self.address, "device": device.name, "sender": document.header.sender},
+        )
+
+    def configure(self, settings: MTConnectSettings) -> None:
+        """Use other settings from now on."""
+        self._items = choose(self._device, settings)
+        self.settings = settings
+
+    def read(self) -> dict[str, Any]:
+        """Return the state now, without what the agent cannot tell at all."""
+        return {name: value for name, value in self.state().items() if value is not None}
+
+    def state(self) -> dict[str, Any]:
+        """Return what the agent knows of the machine now.
+
+        Returns
+        -------
+        dict
+            ``time`` (s on the agent's clock since the driver was first opened), ``position`` and
+            ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
+            clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
+            ``mdi``, ``automatic`` or empty), ``program``, ``running``, ``homed`` (None: no agent tells it),
+            ``enabled``, ``estop``, ``alarms`` and ``warnings`` (lists of str), and ``unavailable``: names of what is
+            unknown. Unknown numbers are NaN.
+
+        Raises
+        ------
+        ProtocolError
+            No answer of an agent, or a value that is none.
+        InstrumentTimeoutError
+            Silence.
+        """
+        document = self._ask("current")
+        self._notice(document)
+        last = {each.item: each for each in document.observations if not each.level}
+        now = document.header.created - self._start(document)
+        values = {key: last.get(item.id) for key, item in self._items.items()}
+        position, moved = self._places("position", values)
+        text = {key: _text(values.get(key)) for key in ("mode", "program", "execution", "estop", "availability")}
+        state: dict[str, Any] = {
+            "time": now,
+            "position": position,
+            "commanded_position": self._places("commanded_position", values)[0],
+            "position_time": moved - self._start(document),
+            **{key: self._number(key, values) for key in ("spindle_speed", "spindle_load", "feed")},
+            "mode": _MODES.get(text["mode"], ""),
+            "program": text["program"],
+            "running": text["execution"] == "ACTIVE",
+            "homed": None,
+            "enabled": text["availability"] == "AVAILABLE" and text["estop"] != "TRIGGERED",
+            "estop": text["estop"] == "TRIGGERED",
+            "alarms": _conditions(document, "Fault"),
+            "warnings": _conditions(document, "Warning"),
+        }
+        state["unavailable"] = [
+            *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
+            *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
+            *(key for key, value in text.items() if not value),
+        ]
+        return state
+
+    def sample(self) -> Observed:
+        """Return what was observed since the last call; the first call returns the last value of every data item.
+
+        Raises
+        ------
+        ProtocolError
+            No answer of an agent.
+        InstrumentError
+            The agent overwrites its buffer faster than it can be read.
+        """
+        if self._next is None:
+            document = self._ask("current")
+            self._notice(document)
+            restarted, self._restarted = self._restarted, False
+            return self._taken(document, 0, restarted=restarted)
+        document = self._ask("sample", self._from(), refused=False)
+        return self._understood(document) or self._caught_up(document)
+
+    def observations(self, interval: float = 0.1) -> Iterator[Observed]:
+        """Yield what is observed as the agent sends it, beginning where `sample` or an earlier stream ended.
+
+        A stream that the agent ends is asked for again. While it runs nothing else can be asked on this connection.
+
+        Parameters
+        ----------
+        interval : float
+            Shortest time between two deliveries, s.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            Not even the heartbeat came, which is asked for at half the time limit.
+        ProtocolError, InstrumentError
+            As of `sample`.
+        """
+        if self._next is None:
+            yield self.sample()
+        while True:
+            came = False
+            query = self._from() | {
+                "interval": str(round(1000 * interval)),
+                "heartbeat": str(max(1, round(500 * self.settings.timeout))),
+            }
+            parts = self._http.parts(self._path("sample"), query, limit=self.settings.most_bytes)
+            try:
+                for part in parts:
+                    document, came = parse(part), True
+                    observed = self._understood(document)
+                    if observed is None:
+                        break
+                    yield observed
+            finally:
+                parts.close()  # type: ignore[attr-defined]
+            if not came:
+                raise InstrumentError(f"The agent at {self.address} ends its stream before anything came")
+            yield self.sample()
+
+    # ------------------------------------------------------------------ sequence numbers
+
+    def _from(self) -> dict[str, str]:
+        return {"from": str(self._next), "count": str(self.settings.count)}
+
+    def _understood(self, document: Document) -> Observed | None:
+        """Return what is in an answer to a request for what follows; None where the numbers have to be found anew."""
+        assert self._next is not None
+        if document.header.instance != self._instance or OUT_OF_RANGE in document.errors:
+            return None
+        self._refuse(document, "sample")
+        return self._taken(document, max(0, document.header.first - self._next), restarted=False)
+
+    def _taken(self, document: Document, lost: int, *, restarted: bool) -> Observed:
+        begin = 0 if self._next is None else self._next
+        fresh = tuple(each for each in document.observations if each.sequence >= begin)
+        self._next = max(document.header.next, begin)
+        self._count(lost)
+        return Observed(fresh, self._next, lost, restarted)
+
+    def _caught_up(self, document: Document) -> Observed:
+        """Go on at the first observation that the agent still holds."""
+        lost, restarted = 0, False
+        for _ in range(_ATTEMPTS):
+            document = self._ask("current")
+            header = document.header
+            assert self._next is not None
+            again = self._notice(document)
+            if again or self._next > header.next:  # a restart shows in the numbers too, whatever the instance says
+                restarted = True
+                self._next = header.first
+            elif header.first > self._next:
+                lost += header.first - self._next
+                self._next = header.first
+            document = self._ask("sample", self._from(), refused=False)
+            if document.header.instance == self._instance and OUT_OF_RANGE not in document.errors:
+                self._refuse(document, "sample")
+                lost += max(0, document.header.first - self._next)
+                return self._taken(document, lost, restarted=restarted)
+        self._count(lost)
+        raise InstrumentError(
+            f"The agent at {self.address} overwrites its {document.header.buffer} observations faster than they can be "
+            "asked for; give it a larger buffer, or ask for fewer data items"
+        )
+
+    def _count(self, lost: int) -> None:
+        if lost:
+            self.lost += lost
+            log.warning("%s: %d observations were overwritten before they were asked for", self.address, lost)
+
+    def _notice(self, document: Document) -> bool:
+        """Learn the device anew where the agent was restarted; return whether it was."""
+        if document.header.instance == self._instance:
+            return False
+        self.restarts += 1
+        log.warning("%s: the agent was restarted", self.address)
+        self._examine()
+        if self._next is not None:
+            self._next = document.header.first
+        return True
+
+    # ------------------------------------------------------------------ values
+
+    def _start(self, document: Document) -> float:
+        if self._began is None:
+            self._began = document.header.created
+        return self._began
+
+    def _number(self, key: str, values: Mapping[str, Observation | None]) -> float:
+        observation = values.get(key)
+        return math.nan if observation is None else observation.number(self._items[key].scale)
+
+    def _places(self, key: str, values: Mapping[str, Observation | None]) -> tuple[list[float], float]:
+        """Return X, Y, Z, and when they last changed, s since 1970."""
+        keys = [f"{key}.{axis}" for axis in "XYZ"]
+        if key in self._items and (whole := values.get(key)) is not None:
+            found = whole.numbers(self._items[key].scale)
+            return (found[:3] if len(found) >= 3 else [math.nan] * 3), whole.time
+        times = [each.time for each in (values.get(name) for name in keys) if each is not None]
+        return [self._number(name, values) for name in keys], max(times, default=math.nan)
+
+    # ------------------------------------------------------------------ requests
+
+    @property
+    def _http(self) -> HttpTransport:
+        transport = self.transport
+        assert isinstance(transport, HttpTransport)
+        return transport
+
+    def _path(self, request: str) -> str:
+        target = self._http.target
+        device = target.path if target.scheme in ("http", "tcp") else ""
+        return f"/{device}/{request}" if device else f"/{request}"
+
+    def _ask(self, request: str, query: Mapping[str, str] | None = None, *, refused: bool = True) -> Document:
+        answer = self._http.get(self._path(request), query, limit=self.settings.most_bytes)
+        try:
+            document = parse(answer.body)
+        except ProtocolError as error:
+            status = f" (HTTP status {answer.status})" if answer.status != 200 else ""
+            raise ProtocolError(f"{self.address}/{request}{status}: {error}") from None
+        if refused:
+            self._refuse(document, request)
+        return document
+
+    def _refuse(self, document: Document, request: str) -> None:
+        if document.errors:
+            told = "; ".join(f"{code}: {text}" for code, text in document.errors.items())
+            raise InstrumentError(f"The agent at {self.address} refuses '{request}': {told}")
+
+    def _one(self, document: Document) -> Device:
+        if len(document.devices) != 1:
+            names = ", ".join(device.name or device.uuid for device in document.devices) or "none"
+            raise InstrumentError(
+                f"The agent at {self.address} has the devices {names}; name one in the address, as in "
+                "http://HOST:5000/DEVICE"
+            )
+        return document.devices[0]
+
+    def _examine(self) -> None:
+        document = self._ask("probe")
+        self._instance = document.header.instance
+        self._device = self._one(document)
+        self._items = choose(self._device, self.settings)
+        for item in self._items.values():
+            if item.category == "SAMPLE":
+                _ = item.scale  # units that nobody knows are told now
+        self._start(document)
+
+    def _connect(self) -> HttpTransport:
+        return HttpTransport(
+            self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
+        )
+
+    def _begin(self) -> None:
+        before = self._instance
+        self._examine()
+        if before is not None and before != self._instance:
+            self.restarts += 1
+            self._next, self._restarted = None, True
+
+
+def _text(observation: Observation | None) -> str:
+    if observation is None or observation.value.upper() == UNAVAILABLE:
+        return ""
+    return observation.value
+
+
+def _conditions(document: Document, level: str) -> list[str]:
+    """Return what conditions of a level say, such as ``SYSTEM 1104: overtravel``."""
+    return [
+        f"{' '.join(filter(None, (each.type, each.code)))}: {each.value}".rstrip(": ")
+        for each in document.observations
+        if each.level == level
+    ]

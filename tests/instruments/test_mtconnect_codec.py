@@ -1,0 +1,220 @@
+"""XML of MTConnect agents: every version, hostile documents, and which data item tells what."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.controller.mtconnect.choice import choose
+from errormotion.instruments.controller.mtconnect.codec import DataItem, Device, Observation, parse, parse_time
+from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
+
+HEADER = '<Header creationTime="2025-03-01T12:00:00Z" instanceId="17" version="2.0.0.1" sender="shop"'
+DEVICES = f"""<?xml version="1.0" encoding="UTF-8"?>
+<m:MTConnectDevices xmlns:m="urn:mtconnect.org:MTConnectDevices:2.0" xmlns="urn:mtconnect.org:MTConnectDevices:2.0">
+{HEADER}/>
+<Devices>
+ <Agent id="agent" name="Agent"><DataItems><DataItem category="EVENT" id="av" type="AVAILABILITY"/></DataItems></Agent>
+ <Device id="d" name="VMC" uuid="000">
+  <Description manufacturer="Maker" model="V5" serialNumber="123">A mill</Description>
+  <DataItems><DataItem category="EVENT" id="avail" type="AVAILABILITY"/></DataItems>
+  <Components>
+   <Axes id="a" name="base"><Components>
+    <Linear id="x" name="X1" nativeName="X"><DataItems>
+     <DataItem category="SAMPLE" id="xw" type="POSITION" subType="ACTUAL" units="MILLIMETER" coordinateSystem="WORK"/>
+     <DataItem category="SAMPLE" id="xm" type="POSITION" subType="ACTUAL" units="MILLIMETER"
+      coordinateSystem="MACHINE"><Source>X</Source></DataItem>
+     <DataItem category="CONDITION" id="xc" type="POSITION"/>
+    </DataItems></Linear>
+    <Rotary id="c" name="C"><DataItems>
+     <DataItem category="SAMPLE" id="cv" type="ROTARY_VELOCITY" subType="ACTUAL" units="REVOLUTION/MINUTE"/>
+     <DataItem category="SAMPLE" id="cl" type="LOAD" units="PERCENT"/>
+    </DataItems></Rotary>
+    <Rotary id="b" name="B"><DataItems>
+     <DataItem category="SAMPLE" id="bv" type="ROTARY_VELOCITY" subType="ACTUAL" units="REVOLUTION/MINUTE"/>
+    </DataItems></Rotary>
+   </Components></Axes>
+   <Controller id="ct"><Components><Path id="p" name="P1"><DataItems>
+     <DataItem category="SAMPLE" id="pp" type="PATH_POSITION" subType="ACTUAL" units="MILLIMETER_3D"/>
+     <DataItem category="SAMPLE" id="pf" type="PATH_FEEDRATE" nativeUnits="MILLIMETER/MINUTE"/>
+   </DataItems></Path></Components></Controller>
+  </Components>
+ </Device>
+</Devices></m:MTConnectDevices>"""
+STREAMS = f"""<MTConnectStreams xmlns="urn:mtconnect.org:MTConnectStreams:1.2">
+{HEADER} firstSequence="5" lastSequence="9" nextSequence="10" bufferSize="131072"/>
+<Streams><DeviceStream name="VMC" uuid="000"><ComponentStream component="Linear" name="X" componentId="x">
+ <Samples><Position dataItemId="xm" timestamp="2025-03-01T11:59:59.1234567Z" sequence="9" subType="ACTUAL">-12.5
+ </Position></Samples>
+ <Events><Execution dataItemId="ex" timestamp="2025-03-01T11:59:59Z" sequence="5">UNAVAILABLE</Execution></Events>
+ <Condition><Fault dataItemId="xc" timestamp="2025-03-01T11:59:59Z" sequence="7" type="POSITION" nativeCode="1104"
+  nativeSeverity="1">overtravel</Fault>
+  <Normal dataItemId="y" timestamp="2025-03-01T11:59:59Z" sequence="8" type="SYSTEM"/></Condition>
+</ComponentStream></DeviceStream></Streams></MTConnectStreams>"""
+
+
+def device(**settings: object) -> tuple[Device, MTConnectSettings]:
+    return parse(DEVICES.encode()).devices[0], MTConnectSettings(**settings)
+
+
+def test_devices_are_read_with_components_and_without_namespaces() -> None:
+    document = parse(DEVICES.encode())
+    assert (document.header.instance, document.header.version) == (17, "2.0.0.1")
+    (vmc,) = document.devices  # the agent itself is none
+    assert (vmc.name, vmc.manufacturer, vmc.model, vmc.serial_number) == ("VMC", "Maker", "V5", "123")
+    assert vmc.items["xm"] == DataItem(
+        *("xm", "SAMPLE", "POSITION", "ACTUAL", "", "MILLIMETER", "MACHINE", "Linear", "X1", "X", "x")
+    )
+    assert vmc.items["pf"].units == "MILLIMETER/MINUTE"
+    assert len(vmc.items) == 9
+
+
+def test_observations_come_in_the_order_of_their_numbers() -> None:
+    document = parse(STREAMS.encode())
+    header = document.header
+    assert (header.first, header.last, header.next, header.buffer) == (5, 9, 10, 131072)
+    assert [each.sequence for each in document.observations] == [5, 7, 8, 9]
+    position = document.observations[-1]
+    assert position.number(1e-3) == -0.0125
+    assert position.time == pytest.approx(1740830399.123456, abs=1e-6)
+    fault = document.observations[1]
+    assert (fault.level, fault.type, fault.code, fault.value) == ("Fault", "POSITION", "1104", "overtravel")
+    assert math.isnan(document.observations[0].number())
+
+
+@pytest.mark.parametrize(
+    "errors",
+    [
+        '<Errors><Error errorCode="OUT_OF_RANGE">from must be more</Error></Errors>',
+        '<Errors><OutOfRange errorCode="OUT_OF_RANGE"><URI/><ErrorMessage>from must be more</ErrorMessage>'
+        "</OutOfRange></Errors>",
+        '<Error errorCode="OUT_OF_RANGE">from must be more</Error>',  # agents of version 1.0 still stand about
+    ],
+)
+def test_errors_are_known_by_their_code_in_every_version(errors: str) -> None:
+    document = parse(f"<MTConnectError>{HEADER}/>{errors}</MTConnectError>".encode())
+    assert document.errors == {"OUT_OF_RANGE": "from must be more"}
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ("", "cannot be read"),
+        ("<MTConnectStreams", "cannot be read"),
+        ('{"json": 1}', "cannot be read"),
+        ('<?xml version="1.0" encoding="klingon"?><a/>', "cannot be read"),
+        ("<html><body/></html>", "without a header"),
+        (f"<Other>{HEADER}/></Other>", "found <Other>"),
+        ('<MTConnectStreams><Header creationTime="2025-03-01T12:00:00Z"/></MTConnectStreams>', "'instanceId'"),
+        ('<MTConnectStreams><Header creationTime="noon" instanceId="1"/></MTConnectStreams>', "such as 2025"),
+        (STREAMS.replace('sequence="7"', 'sequence="-7"'), "'sequence'"),
+        (STREAMS.replace('sequence="7"', ""), "'sequence'"),
+        (DEVICES.replace('id="xm"', ""), "id and type"),
+    ],
+)
+def test_anything_else_is_a_protocol_error(document: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match=message):
+        parse(document.encode())
+
+
+@pytest.mark.parametrize(
+    "doctype",
+    [
+        '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]>',
+        '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>',
+        '<!DOCTYPE a SYSTEM "http://127.0.0.1:9/evil.dtd">',
+        '<!DOCTYPE html PUBLIC "-//W3C//DTD XHTML 1.0//EN" "xhtml.dtd">',
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_no_entity_ever_comes_to_be(doctype: str, encoding: str) -> None:
+    document = f'<?xml version="1.0" encoding="{encoding}"?>{doctype}<a>&x;&b;</a>'
+    with pytest.raises(ProtocolError, match="document type .* refused"):
+        parse(document.encode(encoding))
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_do_anything_but_a_protocol_error(data: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        parse(data)
+
+
+@given(st.integers(0, len(STREAMS)), st.binary(max_size=4))
+def test_a_damaged_document_is_read_or_refused(place: int, stray: bytes) -> None:
+    data = STREAMS.encode()
+    try:
+        document = parse(data[:place] + stray + data[place:])
+    except ProtocolError:
+        return
+    assert document.header.created > 0
+
+
+@given(st.lists(st.floats(-1e4, 1e4), min_size=1, max_size=3))
+def test_numbers_come_back_in_si(values: list[float]) -> None:
+    observation = Observation("p", 1, 0.0, " ".join(map(repr, values)))
+    assert observation.numbers(1e-3) == [value * 1e-3 for value in values]
+
+
+@pytest.mark.parametrize("text", ["two", "1,5", "0x10"])
+def test_a_value_that_is_no_number_is_an_error(text: str) -> None:
+    with pytest.raises(ProtocolError, match="'p': expected a number"):
+        Observation("p", 1, 0.0, text).number()
+
+
+@pytest.mark.parametrize(
+    ("units", "value", "si"),
+    [
+        ("MILLIMETER", 1.0, 1e-3),
+        ("MILLIMETER/SECOND", 60.0, 0.06),
+        ("MILLIMETER/MINUTE", 60.0, 1e-3),
+        ("REVOLUTION/MINUTE", 15000.0, 15000.0),
+        ("DEGREE", 180.0, math.pi),
+        ("PERCENT", 50.0, 0.5),
+        ("INCH", 1.0, 0.0254),
+    ],
+)
+def test_units_become_si(units: str, value: float, si: float) -> None:
+    assert value * DataItem("i", "SAMPLE", "POSITION", units=units).scale == pytest.approx(si, rel=1e-12)
+
+
+def test_units_that_are_left_out_follow_from_the_type_and_unknown_ones_are_refused() -> None:
+    assert DataItem("i", "SAMPLE", "POSITION").scale == 1e-3
+    with pytest.raises(ProtocolError, match="is in 'FURLONG'"):
+        _ = DataItem("i", "SAMPLE", "POSITION", units="FURLONG").scale
+
+
+def test_times_without_a_zone_are_utc() -> None:
+    assert parse_time("2025-03-01T12:00:00") == parse_time("2025-03-01T13:00:00+01:00") == 1740830400.0
+
+
+# ---------------------------------------------------------------------- which item tells what
+
+
+def test_native_names_and_machine_coordinates_decide() -> None:
+    chosen = choose(*device(spindle="C"))
+    assert chosen["position.X"].id == "xm"
+    assert chosen["spindle_speed"].id == "cv"
+    assert chosen["spindle_load"].id == "cl"
+    assert chosen["feed"].id == "pf"
+    assert chosen["availability"].id == "avail"
+    assert "position.Y" not in chosen
+    assert "mode" not in chosen
+
+
+def test_a_path_position_stands_in_where_no_axis_tells_its_own() -> None:
+    chosen = choose(*device(spindle="C", axes=("U", "V", "W")))
+    assert chosen["position"].id == "pp"
+
+
+def test_two_spindles_are_named_and_a_setting_decides() -> None:
+    with pytest.raises(InstrumentError, match=r"Several data items tell 'spindle_speed': .*[cb]v .*items = "):
+        choose(*device())
+    assert choose(*device(items={"spindle_speed": "bv"}))["spindle_speed"].id == "bv"
+    with pytest.raises(InstrumentError, match="no rotary axis 'S'; it has B, C"):
+        choose(*device(spindle="S"))
+    with pytest.raises(InstrumentError, match="no data item 'nope'; it has avail"):
+        choose(*device(spindle="C", items={"feed": "nope"}))
+    with pytest.raises(ValueError, match="found colour"):
+        MTConnectSettings(items={"colour": "x"})
