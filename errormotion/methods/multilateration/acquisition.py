@@ -161,7 +161,7 @@ class Stand:
                 "to a place (move_to); the bench has none. Export the tracker's readings as a table instead."
             )
         position, target = layout.grid(settings.layout)
-        self.order = layout.serpentine(settings.layout.count)
+        self.order = layout.route(settings.layout)
         again = self.order[: len(self.order) // 2 + 1]
         again = [again[int(k)] for k in np.linspace(0, len(again) - 1, min(measuring.returns, len(again)))]
         self.order = [*self.order, *range(len(target), len(target) + len(again))]

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from errormotion.methods.multilateration.settings import Layout
     from errormotion.methods.multilateration.sight import Sight
 
@@ -23,6 +25,8 @@ Array = NDArray[np.float64]
 LEAST = 4
 """Stations, and readings of each."""
 _PENALTY = 1e3
+_UNSEEN = 10.0
+"""Places of the volume that are not seen: one in a hundred counts like uncertainties larger by a tenth."""
 _TRIED, _GLOBAL, _LOCAL = 30, 80, 60
 """Evaluations for each coordinate that is searched: places at random, all over, from each start."""
 _STARTS = 3
@@ -34,6 +38,9 @@ _TOLERANCE = 1e-6
 
 def grid(layout: Layout) -> tuple[Array, Array]:
     """Return axis positions of the targets and places of the reflector there, both (m, 3), m."""
+    if layout.targets:
+        listed = np.array(layout.targets, np.float64)
+        return listed, listed + np.array(layout.reflector)
     axes = [np.linspace(a, b, k) if k > 1 else np.array([(a + b) / 2])
             for a, b, k in zip(layout.low, layout.high, layout.count, strict=True)]  # fmt: skip
     position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -49,6 +56,19 @@ def serpentine(count: tuple[int, int, int]) -> list[int]:
         for j in rows:
             line = [(i * ny + j) * nz + k for k in range(nz)]
             order += line if len(order) // nz % 2 == 0 else line[::-1]
+    return order
+
+
+def route(layout: Layout) -> list[int]:
+    """Return the targets in the order of a tour: of a grid row by row, else always to the nearest that is left."""
+    if not layout.targets:
+        return serpentine(layout.count)
+    position = grid(layout)[0]
+    left = list(range(len(position)))
+    order = [left.pop(int(np.argmin(position.sum(axis=1))))]
+    while left:
+        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at once
+        order.append(left.pop(int(np.argmin(away))))
     return order
 
 
@@ -77,6 +97,8 @@ def optimise(
     start: ArrayLike | None = None,
     minimise: Literal["largest", "mean"] = "largest",
     seed: int = 1,
+    worth: Callable[[Array], Array] | None = None,
+    thorough: bool = True,
 ) -> Array:
     """Find the places of the tracker that leave the targets least uncertain.
 
@@ -96,6 +118,10 @@ def optimise(
         Which uncertainty.
     seed : int
         Of the search; same seed, same answer.
+    worth : callable, optional
+        Uncertainties that count, m, from places (n, 3); without it those of the targets.
+    thorough : bool
+        Look all over the boxes; without it near the start only.
 
     Returns
     -------
@@ -129,18 +155,25 @@ def optimise(
         if lacking := _lacking(seen):
             return _PENALTY * (1.0 + lacking)
         try:
+            if worth is not None:
+                return weighed(worth(U), power)
             with np.errstate(all="ignore"):  # in what is said about a loose freedom, which nobody reads here
                 network = bound(u, U, noise=noise, seen=seen)
         except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
             return _PENALTY
         sigma = uncertainty(network.target_covariance)
-        if not np.isfinite(sigma).all():
+        return weighed(sigma, power) if np.isfinite(sigma).all() else _PENALTY
+
+    def weighed(sigma: Array, power: float | None) -> float:
+        known = np.isfinite(sigma)
+        unseen, sigma = _UNSEEN * float(np.mean(~known)), sigma[known]
+        if not len(sigma):
             return _PENALTY
         if minimise == "mean":
-            return float(np.log(sigma.mean()))
+            return float(np.log(sigma.mean())) + unseen
         largest = sigma.max()
         smooth = 0.0 if power is None else float(np.log(np.mean((sigma / largest) ** power)) / power)
-        return float(np.log(largest)) + smooth
+        return float(np.log(largest)) + smooth + unseen
 
     nlopt.srand(seed)
     rng = np.random.default_rng(seed)
@@ -169,14 +202,15 @@ def optimise(
     best = given[free]
     if free.size:
         # Good places are on the sides and at the corners of the boxes more often than inside.
-        share = rng.uniform(size=(_TRIED * free.size, free.size))
+        share = rng.uniform(size=(_TRIED * free.size if thorough else 0, free.size))
         share = np.where(rng.uniform(size=share.shape) < 0.5, np.round(share), share)
         tried = sorted((low[free] + share * (high - low)[free]).tolist(), key=lambda x: cost(np.array(x)))
-        starts = [best, search(nlopt.GN_CRS2_LM, best, _GLOBAL, _POWER), *(np.array(x) for x in tried[:_STARTS])]
+        everywhere = [search(nlopt.GN_CRS2_LM, best, _GLOBAL, _POWER)] if thorough else []
+        starts = [best, *everywhere, *(np.array(x) for x in tried[:_STARTS])]
         starts = [search(nlopt.LN_SBPLX, x, _LOCAL, _POWER) for x in starts]
         best = min([best, *starts], key=cost)
         # The largest of many uncertainties has edges along which a search creeps: begun anew it goes on.
-        for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * _ROUNDS:
+        for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * (_ROUNDS if thorough else 1):
             best = search(algorithm, best, _LOCAL)
     if cost(best) >= _PENALTY:
         raise MethodError(

@@ -256,16 +256,20 @@ def first_order(error: str) -> int:
     return 2 if freedom < 3 and freedom != axis else 1
 
 
-def _candidates(model: Chain, position: Array, max_order: int) -> tuple[list[Term], list[int]]:
-    """Return all terms (squareness, displacements, then rotations), and the number of positions of each axis."""
-    levels = [len(np.unique(np.round(column, 6))) for column in position.T]
+def unknowns(model: Chain, max_order: int) -> list[Term]:
+    """Return all terms: squareness, displacements, then rotations."""
     terms = [Term(name, -1) for name in model.machine.error_names[18:]]
     motions = model.machine.error_names[:18]
     for rotations in (False, True):
         for name in motions:
             if (DOF.index(name[:2]) >= 3) == rotations:
                 terms += [Term(name, order) for order in range(first_order(name), max(max_order, 2) + 1)]
-    return terms, levels
+    return terms
+
+
+def _candidates(model: Chain, position: Array, max_order: int) -> tuple[list[Term], list[int]]:
+    """Return all terms, and the number of positions of each axis."""
+    return unknowns(model, max_order), [len(np.unique(np.round(column, 6))) for column in position.T]
 
 
 def _normal_equations(

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from errormotion.datasets.units import Length, Quantity, Temperature
 from errormotion.methods.multilateration.acquisition import Measuring
+from errormotion.methods.multilateration.box import Place
 from errormotion.methods.multilateration.refraction import CO2, HELIUM_NEON
 from errormotion.methods.multilateration.sight import Planning
 from errormotion.plugins import PluginSettings
@@ -17,7 +18,6 @@ Percent = Annotated[float, Quantity("a relative humidity", "%", "50 %")]
 Relative = Annotated[float, Quantity("a relative length", "m/m", "0.3 um/m")]
 Coefficient = Annotated[float, Quantity("a coefficient of expansion", "1/K", "11.5 um/m/K")]
 TemperatureStep = Annotated[float, Quantity("a difference of temperature", "K", "0.2 K")]
-Place = tuple[Length, Length, Length]
 
 
 class Air(PluginSettings):
@@ -59,6 +59,9 @@ class Layout(PluginSettings):
     low: Place = Field(default=(-0.2, -0.2, 0.0), description="corner of the box of targets, commanded axis positions")
     high: Place = Field(default=(0.2, 0.2, 0.3), description="opposite corner")
     count: tuple[int, int, int] = Field(default=(5, 5, 4), description="targets along X, Y and Z")
+    targets: tuple[Place, ...] = Field(
+        default=(), description="axis positions of the targets in place of a grid, as a plan chooses them"
+    )
     reflector: Place = Field(default=(0.0, 0.0, 0.0), description="where the reflector is with all axes at zero")
     stations: tuple[Place, ...] = Field(
         default=((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
@@ -10,25 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Angle, Length
+from errormotion.methods.multilateration.box import Box
+from errormotion.methods.multilateration.choosing import Choosing
 from errormotion.plugins import PluginSettings
 
 Array = NDArray[np.float64]
-Place = tuple[Length, Length, Length]
 
 _MARGIN = 1e-9
-
-
-class Box(PluginSettings):
-    """A box along the axes; of no extent in a direction where both corners agree."""
-
-    low: Place = Field(description="corner with the smallest coordinates")
-    high: Place = Field(description="corner with the largest coordinates")
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        if any(a > b for a, b in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"expected low <= high in every coordinate; found {self.low} and {self.high}; swap them")
-        return self
 
 
 class Planning(PluginSettings):
@@ -55,6 +44,12 @@ class Planning(PluginSettings):
     minimise: Literal["largest", "mean"] = Field(
         default="largest", description="which of the targets' uncertainties: the largest one, or their mean"
     )
+    targets: Choosing | None = Field(
+        default=None, description="choose the targets as well; without: those of the layout"
+    )
+    write: Path | None = Field(
+        default=None, description="file for the best layout, as settings of a campaign (TOML); none is replaced"
+    )
 
     @model_validator(mode="after")
     def _looks_somewhere(self) -> Self:
@@ -79,12 +74,15 @@ class Sight:
         Largest angle between that and the beam, rad.
     nearest : float
         Least distance, m.
+    middle : ndarray (3,) or None
+        Where reflectors turned towards a station look from; None: the mean of the targets.
     """
 
     obstacles: Array
     axis: Array | None
     acceptance: float
     nearest: float
+    middle: Array | None = None
 
     @classmethod
     def of(cls, planning: Planning) -> Sight:
@@ -103,7 +101,7 @@ class Sight:
         distance = np.linalg.norm(back, axis=-1)
         axis = self.axis
         if axis is None:
-            axis = (U - u.mean(axis=0))[:, None]
+            axis = (U - (u.mean(axis=0) if self.middle is None else self.middle))[:, None]
             axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _MARGIN)
         along = np.sum(back * axis, axis=-1)
         accepted = along >= np.cos(self.acceptance) * distance - _MARGIN
