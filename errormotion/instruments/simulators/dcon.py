@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import ProtocolError
 from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.thermometers import Inputs, Unplugging
 from errormotion.instruments.thermometer.dcon import LINE_END, checksum, decode, encode, format_temperatures
 from errormotion.instruments.transports import Address
-
-DEFAULT_SENSORS = "frame,ambient,spindle_front,spindle_rear,column"
-NOISE = 0.02  # degC, one sigma
 
 
 class SimulatedDcon(SimulatedDevice):
     """A module whose inputs are temperature sensors of the machine.
 
-    Further parameters of the address: ``sensors`` (names of the twin's sensors, joined by commas), ``open`` (number of
-    an input whose sensor is open, from 0), ``unit`` (1), ``checksum`` (0 or 1).
+    Further parameters of the address: ``sensors``, ``open``, ``noise`` and ``unplugged_for`` (see
+    `simulators.thermometers`), ``unit`` (1), ``checksum`` (0 or 1).
     """
 
-    faults: tuple[str, ...] = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
+    faults: tuple[str, ...] = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "unplugged")
 
     def __init__(self, address: Address) -> None:
         self._unit = f"{int(address.number('unit', 1)):02X}"
         self._checksum = bool(address.number("checksum", 0))
-        self._open = int(address.number("open", -1))
+        self._unplugging = Unplugging(address)
         if self._checksum:
             self.faults = (*self.faults, "checksum")
         super().__init__(address, line_end=LINE_END, default_name="thermometer")
-        names = self.world.machine.temperature_sensors
-        wanted = address.params.get("sensors", DEFAULT_SENSORS).split(",")
-        unknown = [name for name in wanted if name not in names]
-        if unknown:
+        try:
+            self._inputs = Inputs(self.world.machine, address)
+        except BaseException:
             self.close()
-            raise InstrumentError(f"The machine has the sensors {', '.join(names)}; found {', '.join(unknown)}")
-        self._inputs = [names.index(name) for name in wanted]
+            raise
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request."""
@@ -56,10 +52,11 @@ class SimulatedDcon(SimulatedDevice):
         return f"?{self._unit}"
 
     def _temperatures(self) -> list[float]:
-        if self.fault.hits("out_of_range", self._answers):
-            return [float("nan")] * len(self._inputs)
-        truth = self.world.machine.temperatures([self.world.time])[0, self._inputs]
-        readings = [float(t) for t in truth + NOISE * self._rng.standard_normal(truth.size)]
-        if 0 <= self._open < len(readings):
-            readings[self._open] = float("nan")
-        return readings
+        readings = self._inputs.temperatures(self.world.time, self._rng)
+        far = self.fault.hits("out_of_range", self._answers)
+        return [float("nan") if far or i in self._inputs.open else t for i, t in enumerate(readings)]
+
+    def _on_data(self, data: bytes) -> None:
+        if self._unplugging.keeps_from(self._answers, self._server):
+            return
+        super()._on_data(data)

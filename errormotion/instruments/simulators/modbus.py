@@ -29,7 +29,8 @@ class SimulatedModbus(SimulatedDevice):
     by commas), ``open`` and ``shorted`` (numbers of inputs, from 0), ``unit`` (1), ``code`` (of the exception reply).
 
     Further faults: ``exception`` (a reply that refuses), ``unit`` (the answer of another device), ``short`` (the
-    answer breaks off), ``unplugged`` (see `simulators.thermometers`).
+    answer breaks off), ``unplugged`` (see `simulators.thermometers`; old
+    connections are dead then).
     """
 
     faults: tuple[str, ...] = (
@@ -76,7 +77,7 @@ class SimulatedModbus(SimulatedDevice):
         super().reply(data)
 
     def _on_data(self, data: bytes) -> None:
-        if self._unplugging.swallows(self._answers, self._server.hang_up):
+        if self._unplugging.keeps_from(self._answers, self._server):
             return
         if self._device is not None:
             self._device.ask(data)

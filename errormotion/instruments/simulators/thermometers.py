@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import Server, TcpServer
 from errormotion.twin import VirtualMachine
 
 DEFAULT_SENSORS = "frame,ambient,spindle_front,spindle_rear,column"
 NOISE = 0.02  # degC, one sigma
-UNPLUGGED = "unplugged"
 
 
 class Inputs:
@@ -59,26 +60,45 @@ def _numbers(address: Address, key: str, n: int) -> frozenset[int]:
 class Unplugging:
     """``fault=unplugged``: from answer ``fault_at`` on the thermometer is without power for ``unplugged_for`` seconds.
 
-    Meanwhile it is silent. When it is back it knows nothing of the connections that it had: what comes over one of
-    them is answered by hanging up. By default it stays away.
+    Meanwhile it is silent; without ``unplugged_for`` it stays away.
+
+    Parameters
+    ----------
+    address : Address
+    kinds : sequence of str
+        Faults that begin and end so.
     """
 
-    def __init__(self, address: Address) -> None:
-        self._wanted = address.params.get("fault") == UNPLUGGED
+    def __init__(self, address: Address, kinds: Sequence[str] = ("unplugged",)) -> None:
+        self._wanted = address.params.get("fault") in kinds
         self._at = int(address.number("fault_at", 0))
-        self._length = address.number("unplugged_for", float("inf"))
-        self._since: float | None = None
-        self._back = False
+        self._length = address.number("unplugged_for", math.inf)
+        self._since = math.nan
 
-    def swallows(self, answers: int, hang_up: Callable[[], None]) -> bool:
-        """Whether what comes in now gets no answer; ``answers`` have been given so far."""
-        if not self._wanted or self._back or answers < self._at:
+    def begins(self, answers: int) -> bool:
+        """Whether it begins now, when ``answers`` have been given; True only once."""
+        if not self._wanted or answers < self._at:
             return False
-        now = time.monotonic()
-        if self._since is None:
-            self._since = now
-        if now < self._since + self._length:
-            return True
-        self._back = True
-        hang_up()
+        self._wanted, self._since = False, time.monotonic()
         return True
+
+    def now(self) -> bool:
+        """Whether it is unplugged."""
+        return time.monotonic() < self._since + self._length
+
+    def returns(self) -> bool:
+        """Whether it is back since it was asked last; True only once."""
+        if self._since != self._since or self.now():
+            return False
+        self._since = math.nan
+        return True
+
+    def keeps_from(self, answers: int, server: Server) -> bool:
+        """Whether what comes in now gets no answer; back again, the device knows nothing of an old connection."""
+        self.begins(answers)
+        if self.now():
+            return True
+        if self.returns() and isinstance(server, TcpServer):
+            server.hang_up()
+            return True
+        return False

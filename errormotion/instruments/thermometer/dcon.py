@@ -11,10 +11,11 @@ from typing import ClassVar
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.driver import Driver
-from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.thermometer.sensors import GOOD, OPEN, Thermometer, ThermometerSettings
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
 OPEN_SENSOR = 9999.0  # degC: this and more, either sign, is no temperature but an open or overrun input
@@ -79,21 +80,17 @@ def format_temperatures(temperatures: list[float]) -> str:
 # ---------------------------------------------------------------------- driver
 
 
-class DconSettings(PluginSettings):
+class DconSettings(ThermometerSettings):
     """Settings of a DCON thermometer."""
 
-    channels: tuple[str, ...] = Field(
-        default=("frame", "ambient", "spindle_front", "spindle_rear", "column"),
-        description="what the inputs measure, from the first one on",
-        min_length=1,
-    )
     unit: int = Field(default=1, description="address of the module on its line", ge=0, le=255)
     checksum: bool = Field(default=False, description="whether the module is set to use checksums")
     baudrate: int = Field(default=9600, description="of a serial line", gt=0)
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
+    retry: Time = Field(default=1.0, description="least time between two attempts to connect again", ge=0)
 
 
-class DconTemperature(Driver):
+class DconTemperature(Thermometer):
     """A DCON thermocouple module: ``#AA`` asks for all inputs.
 
     Parameters
@@ -103,11 +100,6 @@ class DconTemperature(Driver):
     settings : DconSettings, optional
     record : Path, optional
         Recording of the session.
-
-    Attributes
-    ----------
-    open_sensors : tuple of str
-        Channels that had no value in the last reading.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -119,12 +111,6 @@ class DconTemperature(Driver):
     )
     Settings: ClassVar[type[DconSettings]] = DconSettings
     settings: DconSettings
-    open_sensors: tuple[str, ...] = ()
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of what is measured."""
-        return self.settings.channels
 
     def identify(self) -> Identity:
         """Ask the module for its name and firmware."""
@@ -142,24 +128,15 @@ class DconTemperature(Driver):
         """Use other settings from now on; the module's own are made with the maker's tool."""
         self.settings = settings
 
-    def read(self) -> dict[str, float]:
-        """Return the temperatures now, degC by channel; NaN for an open sensor, which ``open_sensors`` then names.
-
-        Raises
-        ------
-        ProtocolError
-            The answer is none, or holds fewer values than there are channels.
-        InstrumentTimeoutError
-            Silence.
-        """
+    def _measure(self) -> dict[str, tuple[float, str]]:
         values = parse_temperatures(">" + self._ask(f"#{self._unit}", ">"))
         if len(values) < len(self.channels):
             raise ProtocolError(
                 f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(values)}"
             )
-        reading = dict(zip(self.channels, values, strict=False))
-        self.open_sensors = tuple(name for name, value in reading.items() if value != value)
-        return reading
+        return {
+            name: (value, OPEN if value != value else GOOD) for name, value in zip(self.channels, values, strict=False)
+        }
 
     @property
     def _unit(self) -> str:
@@ -168,8 +145,14 @@ class DconTemperature(Driver):
     def _ask(self, request: str, expected: str) -> str:
         """Send a request and return the answer behind the start that was expected."""
         with_checksum = self.settings.checksum
-        self.transport.write(encode(request, with_checksum=with_checksum))
-        answer = decode(self.transport.read_until(LINE_END, limit=512), with_checksum=with_checksum)
+        line = self.transport
+        forget_input(line)
+        line.write(encode(request, with_checksum=with_checksum))
+        try:
+            answer = decode(line.read_until(LINE_END, limit=512), with_checksum=with_checksum)
+        except InstrumentTimeoutError:
+            give_up_silent(line)
+            raise
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
         if not answer.startswith(expected):
@@ -177,11 +160,12 @@ class DconTemperature(Driver):
         return answer.removeprefix(expected)
 
     def _connect(self) -> Transport:
-        return open_transport(
+        return open_reconnecting(
             self.address,
             simulator=self.info.simulator,
-            recorder=self._record,
+            record=self._record,
             timeout=self.settings.timeout,
+            retry=self.settings.retry,
             baudrate=self.settings.baudrate,
         )
 

@@ -112,7 +112,7 @@ def parse_address(url: str) -> Address:
     except ValueError as error:
         raise InstrumentError(f"The address '{url}' cannot be read: {error}; such as {_EXAMPLES}") from None
     serial = scheme in ("serial", "modbus+rtu")
-    path = parts.path if serial else parts.path.strip("/")
+    path = parts.path if serial else parts.path.removeprefix("/") if scheme == CAN else parts.path.strip("/")
     if scheme == "modbus+tcp" and port is None:
         port = MODBUS_PORT
     needed = {"tcp": parts.hostname and port is not None, "can": parts.hostname and path, "http": parts.hostname}

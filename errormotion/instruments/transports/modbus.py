@@ -27,7 +27,7 @@ from errormotion.instruments.transports.modbus_codec import (
     encode_request,
     missing,
 )
-from errormotion.instruments.transports.reconnecting import ReconnectingTransport, forget_input, open_reconnecting
+from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
 QUIET = 0.05  # s without a byte: what was under way is over
@@ -103,7 +103,7 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
-            self._let_go()
+            give_up_silent(self._line)
             raise
 
     def _frame(self, end: float) -> bytes:
@@ -126,11 +126,6 @@ class ModbusLine(Transport):
         with suppress(InstrumentError):
             while came < LONGEST:
                 came += len(self._line.read(LONGEST, timeout=QUIET))
-
-    def _let_go(self) -> None:
-        """After silence: a TCP connection may be a dead one, and a late answer of no use; so begin with a new one."""
-        if isinstance(self._line, ReconnectingTransport) and self._line.holds_back:
-            self._line.lose(f"{self.url} was silent")
 
     def _send(self, data: bytes) -> None:
         self._line.write(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,6 +16,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from errormotion.instruments.transports.modbus_codec import Framing
 
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 CHUNK = 4096
 
 

@@ -136,6 +136,12 @@ def forget_input(line: Transport) -> bytes:
     return old
 
 
+def give_up_silent(line: Transport) -> None:
+    """After silence: a TCP connection may be a dead one, and a late answer of no use; so begin with a new one."""
+    if isinstance(line, ReconnectingTransport) and line.holds_back:
+        line.lose(f"{line.url} was silent")
+
+
 def open_reconnecting(
     url: str | Address,
     *,
