@@ -1,0 +1,131 @@
+"""The wire of the bridge: JSON lines. Pure functions between bytes and values; see `bridge` for what goes over it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from errormotion.errors import InstrumentError, ProtocolError
+
+LINE_END = b"\n"
+MODES = ("manual", "mdi", "automatic", "")
+
+
+@dataclass(frozen=True)
+class Beat:
+    """A sign that an order lasts."""
+
+    number: int
+    time: float
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How an order, or a question, ended: with a result, or refused with a text."""
+
+    number: Any
+    ok: bool
+    result: Any = None
+    error: str = ""
+
+
+def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
+    """Return a request as bytes; InstrumentError where it holds NaN or infinity."""
+    try:
+        return json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
+    except ValueError:
+        raise InstrumentError(f"Expected finite numbers; found {dict(arguments)}") from None
+
+
+def decode(line: bytes) -> Answer | Beat:
+    """Return what a line says.
+
+    Raises
+    ------
+    ProtocolError
+        It is neither an answer nor a beat.
+    """
+    try:
+        message = json.loads(line)
+        if "beat" in message:
+            return Beat(message["id"], float(message["time"]))
+        if message["ok"] is True:
+            return Answer(message["id"], True, message["result"])
+        if message["ok"] is False:
+            return Answer(message["id"], False, error=str(message["error"]))
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise ProtocolError(f"Expected an answer of the bridge in JSON; found {line[:200]!r}")
+
+
+def decode_state(result: Any) -> dict[str, Any]:
+    """Return a state whose unknown numbers are NaN.
+
+    Raises
+    ------
+    ProtocolError
+        A value is missing, or is of another kind than it has to be.
+    """
+    try:
+        state = dict(result)
+        if state["mode"] not in MODES:
+            raise ValueError(f"mode {state['mode']!r}")
+        return {
+            "time": _known(state, "time"),
+            "position": _place(state["position"]),
+            "commanded_position": _place(state["commanded_position"]),
+            "spindle_speed": _number(state["spindle_speed"]),
+            "spindle_load": _number(state["spindle_load"]),
+            "feed": _number(state["feed"]),
+            "mode": state["mode"],
+            "program": str(state["program"]),
+            "running": _switch(state, "running"),
+            "homed": _switch(state, "homed"),
+            "enabled": _switch(state, "enabled"),
+            "estop": _switch(state, "estop"),
+            "alarms": [str(text) for text in state["alarms"]],
+        }
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProtocolError(f"Expected the state of LinuxCNC; found {str(result)[:200]} ({error!r})") from None
+
+
+def decode_touch(result: Any) -> dict[str, Any]:
+    """Return ``tripped``, ``position`` (m, or None) and ``time`` of a touch; ProtocolError where they are not there."""
+    try:
+        tripped = _switch(result, "tripped")
+        position = _place(result["position"]) if tripped else None
+        if position is not None and not all(math.isfinite(x) for x in position):
+            raise ValueError("a touch at an unknown place")
+        return {"tripped": tripped, "position": position, "time": _known(result, "time")}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProtocolError(f"Expected the result of a touch; found {str(result)[:200]} ({error!r})") from None
+
+
+def _number(value: Any) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return float(value)
+
+
+def _known(values: Mapping[str, Any], name: str) -> float:
+    value = _number(values[name])
+    if not math.isfinite(value):
+        raise ValueError(f"{name} is {value}")
+    return value
+
+
+def _place(value: Any) -> list[float]:
+    if not isinstance(value, list) or len(value) != 3:
+        raise TypeError(f"{value!r} is no place")
+    return [_number(x) for x in value]
+
+
+def _switch(values: Mapping[str, Any], name: str) -> bool:
+    if not isinstance(values[name], bool):
+        raise TypeError(f"{name} is {values[name]!r}")
+    return bool(values[name])

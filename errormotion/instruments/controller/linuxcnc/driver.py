@@ -1,0 +1,303 @@
+"""Driver of a machine under LinuxCNC, through the bridge that runs beside it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, ClassVar
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.controller.linuxcnc import codec
+from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSettings
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport, open_transport
+from errormotion.plugins import Identity, InstrumentInfo
+
+ATTEMPTS = 2  # at a question; an order is given once
+
+
+class LinuxCNC(Driver):
+    """A machine under LinuxCNC.
+
+    Places are those of the machine's own coordinates (G53) in m, whatever offsets of work and tool are in force.
+
+    What moves the machine is asked for once. If the connection breaks or falls silent meanwhile, that is an
+    InstrumentError, the bridge has LinuxCNC abort, and nothing is repeated; the next call connects anew. `stop` may be
+    called from another thread.
+
+    Parameters
+    ----------
+    address : str
+        ``tcp://127.0.0.1:5007``, ``sim://gantry/linuxcnc?seed=3``, ``replay://file``.
+    settings : LinuxCNCSettings, optional
+    record : Path, optional
+        Recording of the session. A recorded session does not connect anew.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="linuxcnc",
+        kind="controller",
+        summary="Machines under LinuxCNC 2.9, through a bridge beside it: state, moves, probing, spindle, NC programs",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.linuxcnc:SimulatedLinuxCNC",
+    )
+    Settings: ClassVar[type[LinuxCNCSettings]] = LinuxCNCSettings
+    settings: LinuxCNCSettings
+
+    def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
+        super().__init__(address, settings, record=record)
+        self._talk = threading.Lock()
+        self._number = 0
+        self._unawaited: set[int] = set()
+        self._lost = False
+
+    # ------------------------------------------------------------------ questions
+
+    def identify(self) -> Identity:
+        """Ask the bridge which machine this is."""
+        facts = self._ask("identify")
+        try:
+            return Identity(
+                manufacturer=str(facts["manufacturer"]),
+                model=str(facts["model"]),
+                serial_number=str(facts["serial_number"]),
+                firmware=str(facts["firmware"]),
+                simulated=self.transport.simulated,
+                details={"address": self.address, "travel": facts["travel"]},
+            )
+        except (KeyError, TypeError):
+            raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+
+    def configure(self, settings: LinuxCNCSettings) -> None:
+        """Use other settings from now on."""
+        self.settings = settings
+
+    def read(self) -> dict[str, Any]:
+        """Return the state now."""
+        return self.state()
+
+    def state(self) -> dict[str, Any]:
+        """Return what the machine does.
+
+        ``time`` (s since the bridge began; of the virtual world where simulated), ``position`` (X, Y, Z as measured,
+        m), ``commanded_position`` (m), ``spindle_speed`` (1/min; as measured, where HAL has an encoder),
+        ``spindle_load`` (1 = rated; NaN unless the bridge was told its HAL pin), ``feed`` (m/s), ``mode``
+        (``manual``, ``mdi``, ``automatic``), ``program`` (name of the file, or empty), ``running``, ``homed``,
+        ``enabled``, ``estop``, ``alarms`` (LinuxCNC's error texts since the last order or `reset`).
+        """
+        return codec.decode_state(self._ask("state"))
+
+    # ------------------------------------------------------------------ orders
+
+    def reset(self) -> None:
+        """Release the e-stop and forget the alarms; then `enable`."""
+        self._order("reset")
+
+    def enable(self) -> None:
+        """Switch the machine on.
+
+        Raises
+        ------
+        InstrumentError
+            E-stop, or it stays off.
+        """
+        self._order("enable")
+
+    def estop(self) -> None:
+        """Press LinuxCNC's e-stop. Not what makes a machine safe: that is the button."""
+        self._order("estop")
+
+    def home(self) -> None:
+        """Home all axes; return when they are."""
+        self._order("home")
+
+    def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
+        """Move in a straight line; return when the machine is there.
+
+        Parameters
+        ----------
+        position : (3,)
+            X, Y, Z, m.
+        feed : float, optional
+            m/s; in rapid where not given. LinuxCNC slows down what is too fast for its axes.
+
+        Returns
+        -------
+        dict
+            ``duration``, s.
+
+        Raises
+        ------
+        InstrumentError
+            Not homed, off or in e-stop, out of travel; stopped, an error of LinuxCNC or a broken connection on the
+            way. The message has LinuxCNC's own words.
+        """
+        place = [float(x) for x in position]
+        return dict(self._order("move_to", position=place, feed=None if feed is None else float(feed)))
+
+    def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
+        """Move in a straight line until the probe trips; return when the machine rests.
+
+        LinuxCNC latches the place in the servo cycle in which it sees the probe, so up to a cycle of travel, 1 ms x
+        feed, behind the contact; and as much later as the probe's signal takes (`LinuxCNCSettings.trip_delay`).
+
+        Parameters
+        ----------
+        target : (3,)
+            X, Y, Z, m.
+        feed : float
+            m/s.
+
+        Returns
+        -------
+        dict
+            ``tripped``; ``position`` where it did, m, or None; ``time`` on the machine's clock, s. Without a trip the
+            machine stands at the target.
+
+        Raises
+        ------
+        InstrumentError
+            The probe is tripped before it moves; and what `move_to` raises.
+        """
+        goal = [float(x) for x in target]
+        start = self.state()["commanded_position"] if self.settings.trip_delay else goal
+        touch = codec.decode_touch(self._order("probe", target=goal, feed=float(feed)))
+        length = math.dist(goal, start)
+        if touch["tripped"] and length > 0:
+            back = self.settings.trip_delay * float(feed) / length
+            touch["position"] = [x - back * (g - s) for x, g, s in zip(touch["position"], goal, start, strict=True)]
+        return touch
+
+    def spindle(self, speed: float) -> None:
+        """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it. Returns at once."""
+        self._order("spindle", speed=float(speed))
+
+    def stop(self, spindle: bool = False) -> None:
+        """Abort all motion. LinuxCNC's abort stops the spindle, whatever ``spindle`` says.
+
+        From another thread it ends the call that waits there, with an InstrumentError.
+        """
+        if self._talk.acquire(blocking=False):
+            self._talk.release()
+            self._order("stop", spindle=bool(spindle))
+            return
+        self._number += 1
+        self._unawaited.add(self._number)
+        self.transport.write(codec.encode_request(self._number, "stop", {"spindle": bool(spindle)}))
+
+    def elapse(self, seconds: float) -> None:
+        """Let time pass; `stop` ends it with an InstrumentError. In simulation nobody waits, unless a program runs."""
+        self._order("elapse", seconds=float(seconds))
+
+    def run_program(self, text: str) -> dict[str, Any]:
+        """Run an NC program; return when it has begun. ``state()["running"]`` tells how long it runs, `finish` waits.
+
+        The program ends with the connection: LinuxCNC aborts when the driver is closed.
+
+        Returns
+        -------
+        dict
+            ``program``, the name of its file, and ``longest_lead_in``, 0 s.
+        """
+        return dict(self._order("run_program", text=str(text)))
+
+    def finish(self) -> dict[str, Any]:
+        """Wait for the end of the program.
+
+        Returns
+        -------
+        dict
+            ``duration`` of the program, s.
+
+        Raises
+        ------
+        InstrumentError
+            It ended early: the message has LinuxCNC's words.
+        """
+        return dict(self._order("finish"))
+
+    # ------------------------------------------------------------------ the wire
+
+    def _ask(self, op: str) -> Any:
+        """Ask a question, a second time over a new connection if the first one is lost."""
+        for attempt in range(ATTEMPTS):
+            try:
+                return self._order(op)
+            except InstrumentError:
+                again = self._lost and attempt + 1 < ATTEMPTS and self._may_connect_anew
+                if not again:
+                    raise
+        raise InstrumentError(f"{self.address} gives no answer to {op}")
+
+    @property
+    def _may_connect_anew(self) -> bool:
+        return self._record is None and not self.address.startswith("replay://")
+
+    def _order(self, op: str, **arguments: Any) -> Any:
+        """Send a request, once, and wait for its answer."""
+        with self._talk:
+            line = self.transport
+            if self._lost and self._may_connect_anew:
+                line = self._connect_anew()
+            self._number += 1
+            request = codec.encode_request(self._number, op, arguments)
+            try:
+                line.write(request)
+                answer = self._await(line, self._number)
+            except InstrumentError as error:
+                self._cut(line)
+                raise type(error)(f"{error}. LinuxCNC was asked to {op.replace('_', ' ')} meanwhile") from None
+            except BaseException:  # an interrupted wait: the bridge aborts what nobody waits for
+                self._cut(line)
+                raise
+        if not answer.ok:
+            raise InstrumentError(f"{self.address} does not {op.replace('_', ' ')}: {answer.error}")
+        return answer.result
+
+    def _await(self, line: Transport, number: int) -> codec.Answer:
+        while True:
+            try:
+                message = codec.decode(line.read_until(codec.LINE_END, timeout=self.settings.timeout))
+            except InstrumentTimeoutError:
+                raise InstrumentTimeoutError(
+                    f"{self.address}: LinuxCNC's bridge is silent for {self.settings.timeout:g} s"
+                ) from None
+            if message.number in self._unawaited:
+                self._unawaited.discard(message.number)
+                continue
+            if message.number != number:
+                raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
+            if isinstance(message, codec.Answer):
+                return message
+
+    def _cut(self, line: Transport) -> None:
+        """Have the bridge abort, where it still hears that, and give the connection up: the next call opens another."""
+        self._lost = True
+        self._number += 1
+        with suppress(InstrumentError):
+            line.write(codec.encode_request(self._number, "stop", {}))
+
+    def _connect_anew(self) -> Transport:
+        """Open another connection, then close the lost one: a simulated machine ends with its last connection."""
+        self._transport, lost = self._connect(), self._transport
+        self._lost = False
+        self._unawaited.clear()
+        if lost is not None:
+            with suppress(InstrumentError):
+                lost.close()
+        return self._transport
+
+    def _connect(self) -> Transport:
+        return open_transport(
+            self.address,
+            simulator=self.info.simulator,
+            recorder=self._record,
+            timeout=self.settings.timeout,
+        )
+
+    def _begin(self) -> None:
+        self._number, self._lost = 0, False
+        self._unawaited.clear()
+        self.identify()

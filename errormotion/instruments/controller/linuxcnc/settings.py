@@ -1,0 +1,20 @@
+"""Settings of a machine under LinuxCNC."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.plugins import PluginSettings
+
+
+class LinuxCNCSettings(PluginSettings):
+    """Settings of ``linuxcnc``."""
+
+    timeout: Time = Field(default=6.0, description="how long LinuxCNC may be silent, also while it moves", gt=0)
+    trip_delay: Time = Field(
+        default=0.0,
+        description="from the contact until LinuxCNC latches the place; a touch is put back by as much travel",
+        ge=0,
+        le=0.1,
+    )

@@ -1,0 +1,168 @@
+"""The files with which LinuxCNC runs a virtual machine without hardware: its INI file and the balls in HAL.
+
+The probe is made in the servo thread, behind the joints: for each ball the distance of the measured position from a
+centre (``sum2``, ``hypot``) is compared with a reach (``comp``), and any of them trips the probe (``or2``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+PINS = "ball"
+SERVO_PERIOD = 1e-3  # s
+ACCELERATION = 3000.0  # mm/s^2
+SLACK = 1e-3  # mm, so that the ends of travel can be reached
+FAR = 1e9  # mm
+
+_AXIS = """
+[AXIS_{axis}]
+MIN_LIMIT = {low:.6f}
+MAX_LIMIT = {high:.6f}
+MAX_VELOCITY = {speed:.6f}
+MAX_ACCELERATION = {acceleration:g}
+
+[JOINT_{joint}]
+TYPE = LINEAR
+MIN_LIMIT = {low:.6f}
+MAX_LIMIT = {high:.6f}
+MAX_VELOCITY = {speed:.6f}
+MAX_ACCELERATION = {acceleration:g}
+FERROR = {ferror:g}
+MIN_FERROR = {ferror:g}
+HOME = 0
+HOME_OFFSET = 0
+HOME_SEARCH_VEL = 0
+HOME_LATCH_VEL = 0
+HOME_SEQUENCE = 0
+"""
+
+_INI = """# Written by errormotion: a machine without hardware.
+[EMC]
+VERSION = 1.1
+MACHINE = {machine}
+DEBUG = 0
+NML_FILE = {folder}/linuxcnc.nml
+
+[DISPLAY]
+DISPLAY = {folder}/bridge.py {arguments}
+
+[TASK]
+TASK = milltask
+CYCLE_TIME = 0.005
+
+[RS274NGC]
+PARAMETER_FILE = linuxcnc.var
+
+[EMCMOT]
+EMCMOT = motmod
+COMM_TIMEOUT = 5.0
+SERVO_PERIOD = {servo:.0f}
+
+[EMCIO]
+EMCIO = io
+CYCLE_TIME = 0.05
+TOOL_TABLE = linuxcnc.tbl
+
+[HAL]
+HALFILE = LIB:basic_sim.tcl -no_use_hal_manualtoolchange -no_simulated_home -no_make_ddts
+HALFILE = balls.hal
+
+[KINS]
+KINEMATICS = trivkins coordinates=XYZ
+JOINTS = 3
+
+[TRAJ]
+COORDINATES = XYZ
+LINEAR_UNITS = {unit}
+ANGULAR_UNITS = degree
+DEFAULT_LINEAR_VELOCITY = {speed:.6f}
+MAX_LINEAR_VELOCITY = {fastest:.6f}
+MAX_LINEAR_ACCELERATION = {acceleration:g}
+
+[SPINDLE_0]
+MAX_FORWARD_VELOCITY = {top_speed:g}
+MAX_REVERSE_VELOCITY = {top_speed:g}
+"""
+
+
+def ini_text(
+    machine: str,
+    travel: Mapping[str, tuple[float, float]],
+    rapid: float,
+    top_speed: float,
+    *,
+    arguments: str,
+    inch: bool = False,
+) -> str:
+    """Return an INI file for axes X, Y, Z with travels in m, a rapid feed in m/s and a top speed in 1/min.
+
+    ``{folder}`` stands for the folder that it will be in.
+    """
+    unit = 1000.0 / 25.4 if inch else 1000.0
+    scale = 1 / 25.4 if inch else 1.0
+    text = _INI.format(
+        machine=machine,
+        folder="{folder}",
+        arguments=arguments,
+        servo=SERVO_PERIOD * 1e9,
+        unit="inch" if inch else "mm",
+        speed=unit * rapid,
+        fastest=2 * unit * rapid,
+        acceleration=2 * scale * ACCELERATION,
+        top_speed=top_speed,
+    )
+    for joint, (axis, (low, high)) in enumerate(travel.items()):
+        text += _AXIS.format(
+            axis=axis,
+            joint=joint,
+            low=unit * low - scale * SLACK,
+            high=unit * high + scale * SLACK,
+            speed=unit * rapid,
+            acceleration=scale * ACCELERATION,
+            ferror=5 * scale,
+        )
+    return text
+
+
+def hal_text(balls: int) -> str:
+    """Return a HAL file with a probe that trips on any of so many balls, all of them far away to begin with."""
+    names = [f"{PINS}{i}" for i in range(balls)]
+    sums = ",".join(f"{name}.{axis}" for name in names for axis in "xyz")
+    lines = [
+        f"loadrt sum2 names={sums}",
+        f"loadrt hypot names={','.join(f'{name}.distance' for name in names)}",
+        f"loadrt comp names={','.join(f'{name}.trip' for name in names)}",
+        f"loadrt or2 names={','.join(f'{name}.any' for name in names)}",
+        "setp rpm_rps.gain 0.0166666666667",
+    ]
+    before = ""
+    for name in names:
+        for joint, axis in enumerate("xyz"):
+            lines += [
+                f"addf {name}.{axis} servo-thread",
+                f"net J{joint}:pos-fb => {name}.{axis}.in0",
+                f"net {name}:{axis} {name}.{axis}.out => {name}.distance.in{joint}",
+                f"setp {name}.{axis}.offset {FAR:g}",
+            ]
+        lines += [
+            f"addf {name}.distance servo-thread",
+            f"addf {name}.trip servo-thread",
+            f"addf {name}.any servo-thread",
+            f"net {name}:distance {name}.distance.out => {name}.trip.in0",
+            f"setp {name}.trip.in1 0",
+            f"net {name}:trip {name}.trip.out => {name}.any.in0",
+        ]
+        if before:
+            lines.append(f"net {before}:any => {name}.any.in1")
+        lines.append(f"net {name}:any {name}.any.out")
+        before = name
+    lines.append(f"net {before}:any => motion.probe-input")
+    return "\n".join(lines) + "\n"
+
+
+def pin_values(ball: int, centre: tuple[float, float, float], reach: float, *, inch: bool = False) -> dict[str, float]:
+    """Return the HAL pins of a ball: where the tip is when it is at the centre, and how far off it trips, m."""
+    unit = 1000.0 / 25.4 if inch else 1000.0
+    name = f"{PINS}{ball}"
+    offsets = {f"{name}.{axis}.offset": -unit * x for axis, x in zip("xyz", centre, strict=True)}
+    return {**offsets, f"{name}.trip.in1": unit * reach}
