@@ -48,8 +48,8 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     noise, count = settings.touch_noise or NOISE, int(method.progress(settings))
     if count < 2:
         raise MethodError(
-            f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at intervals "
-            f"of {settings.interval:g} s."
+            f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at "
+            f"intervals of {settings.interval:g} s."
         )
     seen = planned_touches(settings, count, noise)
     found = fit(seen, motion, interpolate=False)
@@ -86,12 +86,12 @@ def planned_touches(settings: Settings, cycles: int, noise: float) -> Observatio
     """Return the touches of cycles in which nothing moves, one cycle an interval."""
     normal = touching.normals(settings)
     reach = np.array([ball.radius for ball in settings.balls]) + (settings.tip_radius or TIP_RADIUS)
-    place = np.array([ball.centre for ball in settings.balls])[:, None] + reach[:, None, None] * normal
+    place = np.array([ball.centre for ball in settings.balls], float)[:, None] + reach[:, None, None] * normal
     b, m, _ = place.shape
     weight = np.zeros((cycles, b, m, m))
     weight[..., range(m), range(m)] = noise**-2
-    time = settings.interval * np.arange(cycles)
-    every = np.broadcast_to(time[:, None, None], (cycles, b, m))
+    time = np.asarray(settings.interval * np.arange(cycles))
+    every = np.array(np.broadcast_to(time[:, None, None], (cycles, b, m)))
     return Observations(np.tile(place, (cycles, 1, 1, 1)), weight, every, time, touched=True)
 
 
@@ -109,7 +109,7 @@ def _loss(
     C = published.covariance(
         measured.cofactor[0, four], measured.cofactor[1:2, four], motion.point, measured.centre[0, four]
     )
-    return np.sqrt(np.diagonal(C[0]) / np.diagonal(covariance[1]))
+    return np.asarray(np.sqrt(np.diagonal(C[0]) / np.diagonal(covariance[1])))
 
 
 def _factors(shared: Array) -> Array:
@@ -126,8 +126,8 @@ def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, n
     said = ", ".join(f"{DOF[k]} {format_quantity(float(u[k]), 'um' if k < 3 else 'arcsec', 3)}" for k in motion.seen)
     touches = settings.touches * len(settings.balls)
     notes = [
-        f"With {touches} touches a cycle and {format_quantity(noise, 'um', 2)} noise of each, the standard uncertainties "
-        f"relative to the cold cycle are {said}. Half of the variance is the cold cycle's, which is probed once."
+        f"With {touches} touches a cycle and {format_quantity(noise, 'um', 2)} noise of each, the standard "
+        f"uncertainties relative to the cold cycle are {said}. Half of the variance is the cold cycle's, which is probed once."
     ]
     if unseen := [DOF[k] for k in range(6) if k not in motion.seen]:
         notes.append(
