@@ -15,6 +15,11 @@ ADDRESS = "sim://cframe/mtconnect?seed=3"
 QUICK = MTConnectSettings(timeout=0.3)
 
 
+def read_often(agent: MTConnect) -> None:
+    for _ in range(4):
+        agent.read()
+
+
 def test_a_state_is_what_the_machine_does() -> None:
     with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3") as control:
         assert agent.identify().model == "cframe"
@@ -155,8 +160,7 @@ def test_a_stream_goes_on_where_the_last_one_ended() -> None:
 def test_each_fault_becomes_a_typed_error(fault: str, error: type[InstrumentError], at: int) -> None:
     agent = MTConnect(f"{ADDRESS}&fault={fault}&fault_at={at}", QUICK)
     with pytest.raises(error), agent:
-        for _ in range(4):
-            agent.read()
+        read_often(agent)
 
 
 @pytest.mark.parametrize(("fault", "error"), [("silence", InstrumentTimeoutError), ("disconnect", InstrumentError)])
