@@ -14,7 +14,7 @@ that are compensated share it (`Compensated.jacobian`).
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,7 +30,7 @@ from errormotion.datasets.folders import folders_beside
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
-from errormotion.datasets.tilt_support import TiltSupport
+from errormotion.datasets.tilt_support import Hole, TiltSupport
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import inclination_rotation, tilt_vector
 
@@ -66,7 +66,14 @@ ROWS = (
     Row("mid_range_uncertainty", (), "m", 0.0, _FREE[1], "standard uncertainty of that; NaN where unknown"),
     Row("reading_low", (), "m", *_DEPTH, "lowest calibrated reading"),
     Row("reading_high", (), "m", *_DEPTH, "highest calibrated reading"),
-    Row("support_gap", (), "1", 0.0, 20.0, "widest empty circle between calibrated tilts that counts as surrounded"),
+    Row(
+        "support_gap",
+        (),
+        "1",
+        0.0,
+        20.0,
+        "widest empty circle between calibrated tilts that counts as surrounded",
+    ),
     Row("support_margin", (), "1", 0.0, 20.0, "how far from joined calibrated tilts a tilt may lie"),
     Row("inclination", ("setting",), "rad", -1.5, 1.5, "of each setting that was fitted"),
     Row("rotation", ("setting",), "rad", -6.3, 6.3, "of each setting that was fitted"),
@@ -93,6 +100,8 @@ ATTRIBUTES = {
     "mirror": "1: even in q2, the plane of triangulation is a plane of symmetry; 0: not",
     "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software",
 }
+_ALL_AROUND = 359.0
+"""Width of a hole along the rotation from which on it goes all around, deg."""
 _SIZES = {"axis": 2, "limit": 2}
 _MAY_BE_UNKNOWN = ("mid_range_found", "mid_range_uncertainty")
 
@@ -351,6 +360,22 @@ def tilt_text(q: Array) -> str:
     """Return a tilt vector (2,) as people say it."""
     alpha, beta = inclination_rotation(q)
     return f"inclination {np.degrees(alpha):.1f} deg at rotation {np.degrees(beta):.1f} deg"
+
+
+def hole_texts(holes: Sequence[Hole]) -> list[str]:
+    """Return holes as people say them; those between the same inclinations, as symmetry makes them, in one."""
+    texts: dict[str, list[str]] = {}
+    for hole in holes:
+        low, high = np.degrees(hole.inclination)
+        begin, end = np.degrees(hole.rotation)
+        where = "" if end - begin > _ALL_AROUND else f"{begin:.0f} to {end % 360:.0f}"
+        texts.setdefault(f"inclination {low:.0f} to {high:.0f} deg", []).append(where)
+    told = []
+    for inclination, found in texts.items():
+        *first, last = found
+        rotations = f"{', '.join(first)} and {last}" if first else last
+        told.append(f"{inclination} at " + (f"rotation {rotations} deg" if last else "every rotation"))
+    return told
 
 
 def violations(ds: xr.Dataset) -> list[str]:

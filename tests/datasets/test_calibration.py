@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errormotion import datasets
-from errormotion.datasets.calibration import SCHEMA, InclinationCalibration, build, violations
+from errormotion.datasets.calibration import SCHEMA, InclinationCalibration, build, hole_texts, violations
 from errormotion.datasets.tilt_support import TiltSupport
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
@@ -139,7 +139,10 @@ def test_near_right_angles_the_rows_are_close_enough_everywhere(holed: Inclinati
 def test_holes_are_found_without_being_used(holed: InclinationCalibration, good: InclinationCalibration) -> None:
     holes = holed.support.holes()
     assert len(holes) == 4  # one in each quarter
-    assert not holed.supported(holes).any()
+    assert not holed.supported(np.array([hole.middle for hole in holes])).any()
+    assert hole_texts(holes) == [
+        "inclination 15 to 45 deg at rotation 10 to 90, 90 to 170, 190 to 270 and 270 to 350 deg"
+    ]
     assert len(good.support.holes()) == 0
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from errormotion.datasets import provenance, validate
-from errormotion.datasets.calibration import InclinationCalibration, build, half_tilt, terms, tilt_text
+from errormotion.datasets.calibration import InclinationCalibration, build, half_tilt, hole_texts, terms
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction import inclination_lines, inclination_surface
@@ -43,6 +43,9 @@ _FEWEST = 4
 _FEW = 50
 """Different tilts below which the intervals are rough."""
 _NAMED = 6
+_SPOILS = 3.5
+"""Steps of inclination that a hole may have before the intervals beside it suffer: they hold in 70 to 90 % of cases."""
+_ALL_AROUND = np.radians(359.0)
 _DRAWS = 1000
 _SEVERAL = 3.0
 """Standard uncertainties that a mid range may be off the stated one without a word."""
@@ -241,10 +244,24 @@ def _notes(
     different = len(np.unique(np.round(calibration.settings, 6), axis=0))
     if different < _FEW:
         yield f"{different} different tilts: fewer than {_FEW} tell only roughly what lies between them."
-    holes = calibration.support.holes()
-    if len(holes):
-        named = [tilt_text(hole) for hole in holes[:_NAMED]]
-        yield f"Holes between the settings, in which nothing is compensated: about {_list(named, len(holes))}."
+    yield from _holes(calibration)
+
+
+def _holes(calibration: InclinationCalibration) -> Iterator[str]:
+    holes, step = calibration.support.holes(), calibration.support.step
+    if not holes:
+        return
+    told = hole_texts(holes)
+    yield (
+        f"Holes between the settings, whose usual step is {np.degrees(step):.3g} deg of inclination; tilts in them are "
+        f"refused: {_list(told[:_NAMED], len(told))}."
+    )
+    widest = max((np.ptp(hole.inclination) for hole in holes if np.ptp(hole.rotation) > _ALL_AROUND), default=0.0)
+    if widest > _SPOILS * step:
+        yield (
+            f"A hole of {np.degrees(widest):.0f} deg at every rotation spoils what is told beside it too: the "
+            "intervals hold less often than they say. Measure settings in it."
+        )
 
 
 def _list(named: list[str], count: int) -> str:
