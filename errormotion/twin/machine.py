@@ -144,6 +144,10 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
         self.start(events)
         self.command(Event(time, spindle_speed=0.0))
 
+    def forget(self, events: Sequence[Event], time: float) -> None:
+        """Take events from a time on, s, out of the schedule, wherever they are in it."""
+        self.start([each for each in self._events if each.time < time or each not in events])
+
     @property
     def _events(self) -> tuple[Event, ...]:
         return self.state.schedule.events

@@ -154,7 +154,7 @@ class ProbeMeasurements:
         twist, turn = self.state.twist_and_turn(times)
 
         def error(places: Array) -> Array:
-            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(places)) + self.geometry.twist(places)[:, :3])
+            return np.asarray(twist[:, :3] + np.cross(turn, self._carried(places)) + self.geometry.displacement(places))
 
         return error
 

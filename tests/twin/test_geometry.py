@@ -65,3 +65,12 @@ def test_along_the_last_axis_before_the_tool_the_volume_shows_that_axis_alone(ei
 def test_an_unknown_axis_names_the_known_ones(machine):
     with pytest.raises(BenchError, match="X, Y, Z"):
         machine.truth_axis("A", [0.0])
+
+
+def test_the_quick_way_to_the_displacement_is_the_model_itself(either):
+    low, high = np.array([either.travel[axis] for axis in "XYZ"]).T
+    places = low + np.random.default_rng(0).uniform(size=(40, 3)) * (high - low)
+    # sums of some 10 um in another order: 1e-16 of that, some times
+    np.testing.assert_allclose(
+        either.geometry.displacement(places), either.geometry.twist(places)[:, :3], rtol=0, atol=1e-19
+    )

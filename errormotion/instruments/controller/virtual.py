@@ -205,7 +205,9 @@ class VirtualController(Driver):
         Parameters
         ----------
         text : str
-            ISO 6983: G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M30 or M2, and comments.
+            ISO 6983: G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M3 S (1/min) and M5, M30 or
+            M2, and comments. Besides, G31, a move that ends where the probe trips, and DPRNT[...], which prints where
+            that was (#5061 to #5063, mm).
 
         Returns
         -------

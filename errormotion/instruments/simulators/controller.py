@@ -51,13 +51,11 @@ class SimulatedController(SimulatedDevice):
             self.world.raise_alarm("servo alarm (simulated)")
         if self.fault.kind == "estop" and self._answers == self.fault.at:
             self.world.press_estop()
-
-    def _stuck(self) -> Literal["open", "closed"] | None:
-        """Return how the probe is broken at this request."""
-        since = self._answers - self.fault.at
-        if since < 0 or (self.fault.length and since >= self.fault.length):
-            return None
-        return {"no_trip": "open", "tripped": "closed"}.get(self.fault.kind)  # type: ignore[return-value]
+        if self.fault.kind in ("no_trip", "tripped"):
+            since = self._answers - self.fault.at
+            broken = since >= 0 and not (self.fault.length and since >= self.fault.length)
+            how: Literal["open", "closed"] = "open" if self.fault.kind == "no_trip" else "closed"
+            self.world.stuck = how if broken else None
 
     def _obey(self, op: str, arguments: Mapping[str, Any]) -> Any:
         world = self.world
@@ -81,7 +79,7 @@ class SimulatedController(SimulatedDevice):
             case "move_to":
                 return {"duration": world.move_to(**arguments)}
             case "probe":
-                return world.probe(**arguments, stuck=self._stuck())
+                return world.probe(**arguments)
             case "spindle":
                 world.spindle(**arguments)
             case "stop":

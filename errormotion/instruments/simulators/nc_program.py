@@ -1,17 +1,22 @@
-"""The control's interpreter of NC programs: a part of ISO 6983, every other word refused with the line it stands in."""
+"""The control's interpreter of NC programs: a part of ISO 6983, every other word refused with the line it stands in.
+
+Beside it understands what macros of widespread controls need to probe: a skip move (G31) and the lines that they print.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
-from errormotion.errors import InstrumentError
+from errormotion.errors import ErrormotionError, InstrumentError
 from errormotion.twin.paths import Path
 
 UNDERSTOOD = (
-    "% , (comments), ; comments, N, G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M2, M30"
+    "% , (comments), ; comments, N, G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, G31, "
+    "M3 S (/min), M5, POPEN, DPRNT[...] with #5061 to #5063, PCLOS, M2, M30"
 )
 MM, MINUTE = 1000.0, 60.0  # per m; s
 
@@ -26,9 +31,36 @@ _REFUSED = {
 _WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only thing there is, in units, places and feeds
 _ROUNDING = 1e-9  # m
 
+_PRINT = re.compile(r"(?:N\d+\s*)?DPRNT\s*\[(.*)\]")
+_PRINTED = re.compile(r"#(\d+)\s*\[\s*\d(\d)\s*\]")
+_PORT = re.compile(r"(?:N\d+\s*)?(POPEN|PCLOS)")
+_SKIPPED = {"5061": 0, "5062": 1, "5063": 2}  # where the last skip move has ended
+
+Array = np.ndarray[Any, Any]
+
+
+class Peripherals(Protocol):
+    """What a program orders beside its path, at times (s) since its begin; an order may be refused."""
+
+    def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
+        """See whether something is in the way of a straight move (m, m/s)."""
+
+    def skip(self, start: Array, goal: Array, feed: float, time: float) -> Array:
+        """Return where a straight move ends that the probe stops (m, m/s): there, or at its goal."""
+
+    def spindle(self, speed: float, time: float) -> None:
+        """Turn the spindle, 1/min."""
+
+    def print(self, line: str, time: float) -> None:
+        """Send a line."""
+
 
 def interpret(
-    text: str, start: tuple[float, float, float], travel: Mapping[str, tuple[float, float]], rapid: float
+    text: str,
+    start: tuple[float, float, float],
+    travel: Mapping[str, tuple[float, float]],
+    rapid: float,
+    peripherals: Peripherals | None = None,
 ) -> Path:
     """Return the path of a program, begun at time 0.
 
@@ -44,6 +76,8 @@ def interpret(
         Axis to (lowest, highest) position, m.
     rapid : float
         Feed of G0, and the greatest of G1, m/s.
+    peripherals : Peripherals, optional
+        Spindle, probe and printer; without them a program that needs one is refused.
 
     Raises
     ------
@@ -51,11 +85,15 @@ def interpret(
         A word that is not understood, a place out of travel, a move without feed, a program without end; with the
         number of the line.
     """
-    control = _Control(start, travel, rapid)
+    control = _Control(start, travel, rapid, peripherals)
     for number, line in enumerate(text.splitlines(), 1):
+        plain = _COMMENT.sub(" ", line).partition(";")[0].strip().upper()
         try:
-            control.obey(_words(line))
-        except InstrumentError as error:
+            if printed := _PRINT.fullmatch(plain):
+                control.print(printed[1])
+            elif not _PORT.fullmatch(plain):
+                control.obey(_words(plain))
+        except ErrormotionError as error:
             raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}") from None
         if control.ended:
             return control.path()
@@ -68,9 +106,8 @@ def title(text: str) -> str:
     return ((found[1] or found[2] or "").strip() if found else "") or "program"
 
 
-def _words(line: str) -> list[tuple[str, float]]:
-    """Return letters and numbers of a line without its comments."""
-    plain = _COMMENT.sub(" ", line).partition(";")[0].strip().upper()
+def _words(plain: str) -> list[tuple[str, float]]:
+    """Return letters and numbers of a line."""
     if plain == "%":
         return []
     words, place = [], 0
@@ -87,9 +124,16 @@ class _Control:
     """What the control keeps from line to line."""
 
     def __init__(
-        self, start: tuple[float, float, float], travel: Mapping[str, tuple[float, float]], rapid: float
+        self,
+        start: tuple[float, float, float],
+        travel: Mapping[str, tuple[float, float]],
+        rapid: float,
+        peripherals: Peripherals | None,
     ) -> None:
         self.ended = False
+        self._peripherals = peripherals
+        self._skipped: Array | None = None
+        self._turning = False
         self._travel = travel
         self._rapid = rapid
         self._move = ""  # G0 or G1, once one of them was said
@@ -111,14 +155,48 @@ class _Control:
             raise InstrumentError("the same letter twice in one line")
         for code in codes:
             self._set(code, codes)
-        if unknown := set(values) - set("XYZFP"):
+        if unknown := set(values) - set("XYZFPS"):
             raise InstrumentError(f"'{min(unknown)}' is not understood; understood are {UNDERSTOOD}")
+        self._turn(codes, values.pop("S", None))
         if "G4" in codes:
             self._dwell(values)
         elif "P" in values:
             raise InstrumentError("P (s) belongs to a dwell, G4")
         else:
-            self._advance(values)
+            self._advance(values, skipping="G31" in codes)
+
+    def print(self, template: str) -> None:
+        """Print a line: places of the last skip move in mm, a star as a space, and everything else as it stands."""
+        printer = self._needed("a printer")
+
+        def value(found: re.Match[str]) -> str:
+            if found[1] not in _SKIPPED:
+                raise InstrumentError(f"#{found[1]} is not understood; printed are {', #'.join(['', *_SKIPPED])[2:]}")
+            if self._skipped is None:
+                raise InstrumentError("no skip move, G31, has ended yet")
+            return f"{self._skipped[_SKIPPED[found[1]]] * MM:.{int(found[2])}f}"
+
+        printer.print(_PRINTED.sub(value, template).replace("*", " "), self._times[-1])
+
+    def _needed(self, what: str) -> Peripherals:
+        if self._peripherals is None:
+            raise InstrumentError(f"nothing is connected here that could be {what}")
+        return self._peripherals
+
+    def _turn(self, codes: list[str], speed: float | None) -> None:
+        """Turn the spindle, stop it, or change its speed."""
+        if "M3" in codes and "M5" in codes:
+            raise InstrumentError("M3 and M5 in one line")
+        if "M3" in codes and speed is None:
+            raise InstrumentError("expected the spindle's speed as M3 S8000, /min")
+        if "M5" in codes:
+            self._turning = False
+            self._needed("a spindle").spindle(0.0, self._times[-1])
+        elif "M3" in codes or (speed is not None and self._turning):
+            self._turning = True
+            self._needed("a spindle").spindle(float(speed or 0.0), self._times[-1])
+        elif speed is not None:
+            raise InstrumentError("a speed S, but the spindle does not turn; M3 belongs to it")
 
     def _set(self, code: str, codes: list[str]) -> None:
         if code in _REFUSED:
@@ -129,7 +207,7 @@ class _Control:
             self._move = code
         elif code in ("M2", "M30"):
             self.ended = True
-        elif code not in (*_WITHOUT_EFFECT, "G4"):
+        elif code not in (*_WITHOUT_EFFECT, "G4", "G31", "M3", "M5"):
             raise InstrumentError(f"'{code}' is not understood; understood are {UNDERSTOOD}")
 
     def _dwell(self, values: Mapping[str, float]) -> None:
@@ -137,8 +215,8 @@ class _Control:
             raise InstrumentError("expected a dwell as G4 P2.5, P in s, and nothing beside it")
         self._append(values["P"], self._places[-1], fast=False)
 
-    def _advance(self, values: Mapping[str, float]) -> None:
-        """Set the feed, and move where a place is given."""
+    def _advance(self, values: Mapping[str, float], *, skipping: bool) -> None:
+        """Set the feed, and move where a place is given; a skip move up to where the probe trips."""
         if "F" in values:
             self._feed = values["F"] / MM / MINUTE
             if not 0 < self._feed <= self._rapid + _ROUNDING:
@@ -151,12 +229,18 @@ class _Control:
                 goal[number] = self._within(axis, values[axis])
         if not set(values) & set("XYZ"):
             return
-        if not self._move:
+        move = "G31" if skipping else self._move
+        if not move:
             raise InstrumentError("a place, but neither G0 nor G1 has been said")
-        feed = self._rapid if self._move == "G0" else self._feed
+        feed = self._rapid if move == "G0" else self._feed
         if feed is None:
-            raise InstrumentError("a move with G1, but no feed F has been said")
-        self._append(float(np.linalg.norm(goal - self._places[-1])) / feed, goal, fast=self._move == "G0")
+            raise InstrumentError(f"a move with {move}, but no feed F has been said")
+        now = self._places[-1], goal, feed, self._times[-1]
+        if skipping:
+            goal = self._skipped = self._needed("a probe").skip(*now)
+        elif self._peripherals is not None:
+            self._peripherals.pass_by(*now)
+        self._append(float(np.linalg.norm(goal - self._places[-1])) / feed, goal, fast=move == "G0")
 
     def _within(self, axis: str, value: float) -> float:
         low, high = self._travel[axis]
@@ -164,7 +248,7 @@ class _Control:
             raise InstrumentError(f"{axis} travels from {low * MM:g} to {high * MM:g} mm; found {value:g}")
         return value / MM
 
-    def _append(self, seconds: float, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]], *, fast: bool) -> None:
+    def _append(self, seconds: float, place: Array, *, fast: bool) -> None:
         if seconds > 0:
             self._times.append(self._times[-1] + seconds)
             self._places.append(place)

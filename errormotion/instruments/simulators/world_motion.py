@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from errormotion.errors import InstrumentError
+from errormotion.errors import ErrormotionError, InstrumentError
 from errormotion.instruments.simulators.nc_program import interpret, title
 from errormotion.instruments.simulators.world_clock import SampleClock
-from errormotion.twin import StepProgram
+from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 
 if TYPE_CHECKING:
@@ -47,6 +47,10 @@ class Motion(SampleClock):
         Why nothing moves.
     estop : bool
         Whether the emergency stop is pressed.
+    stuck : {"open", "closed"} or None
+        A fault of the probe: it never trips, or always.
+    printed : list of (float, str)
+        Lines that NC programs have printed and will print, and when, s.
     """
 
     seed: int
@@ -61,7 +65,10 @@ class Motion(SampleClock):
         self.balls: Balls = self.machine.balls
         self.alarms: list[str] = []
         self.estop = False
+        self.stuck: Literal["open", "closed"] | None = None
+        self.printed: list[tuple[float, str]] = []
         self._programs = 0
+        self._program_events: list[Event] = []
         self._warm_up: float | None = None  # time at which it began
 
     # ------------------------------------------------------------------ orders
@@ -92,10 +99,17 @@ class Motion(SampleClock):
         """Run an NC program, see `nc_program`; the motion begins a short and unknown time from now."""
         with self._change:
             self._refuse_to_move()
-            place = self.path.place(self.time)
-            path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid)
-            self.motion, self.path = None, path.beginning(self._begin_of_motion())
-            self.program = title(text)
+            place, begin = self.path.place(self.time), self._begin_of_motion()
+            errands = Errands(self, begin)
+            try:
+                path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, errands)
+            except ErrormotionError:
+                errands.undo()
+                self._programs -= 1
+                raise
+            self.motion, self.path = None, path.beginning(begin)
+            self.program, self._program_events = title(text), errands.events
+            self.printed += errands.printed
             if self._warm_up is None:
                 self._warm_up = self.path.warm_up()
             return self.path
@@ -110,17 +124,15 @@ class Motion(SampleClock):
             self._refuse_to_move()
             goal, feed = self._within_travel(position), self._possible_feed(feed)
             begin, start = self._next_instant(), np.array(self.position())
-            if self.tool == "probe":
-                place, way = self.machine.contact(start, goal, begin, feed, balls=self.balls, leaving=True)
-                if place is not None:
-                    self._go(start, place, begin, feed)
-                    self.raise_alarm(f"the probe has tripped during a move, {way * 1e3:.3f} mm on its way")
-                    self._refuse_in_alarm()
+            place = self.obstacle(start, goal, begin, feed)
+            if place is not None:
+                self._go(start, place, begin, feed)
+                way = float(np.linalg.norm(place - start))
+                self.raise_alarm(f"the probe has tripped during a move, {way * 1e3:.3f} mm on its way")
+                self._refuse_in_alarm()
             return self._go(start, goal, begin, feed)
 
-    def probe(
-        self, target: Sequence[float], feed: float, stuck: Literal["open", "closed"] | None = None
-    ) -> dict[str, Any]:
+    def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move the touch probe in a straight line until it trips, or to the target; the time passes at once.
 
         Parameters
@@ -129,8 +141,6 @@ class Motion(SampleClock):
             Commanded place of the tip, m.
         feed : float
             m/s.
-        stuck : {"open", "closed"}, optional
-            A fault of the probe: it never trips, or always.
 
         Returns
         -------
@@ -149,19 +159,30 @@ class Motion(SampleClock):
             begin, start = self.time, np.array(self.position())
             if speed := self.commanded_speed(begin):
                 raise InstrumentError(f"The spindle turns at {speed:g} /min; stop it before the machine probes")
-            free = stuck == "open" or self.machine.released(start, begin, balls=self.balls)
-            if stuck == "closed" or not free:
+            if self.stuck == "closed" or not (
+                self.stuck == "open" or self.machine.released(start, begin, balls=self.balls)
+            ):
                 raise InstrumentError("The probe is tripped before it moves; move it off what it touches, or mend it")
             self.tool = "probe"
-            place = None
-            if stuck != "open":
-                place, _ = self.machine.contact(start, goal, begin, feed, balls=self.balls)
+            place = self.trip(start, goal, begin, feed)
             self._go(start, goal if place is None else place, begin, feed)
             return {
                 "tripped": place is not None,
                 "position": None if place is None else [float(x) for x in place],
                 "time": self.time,
             }
+
+    def trip(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
+        """Return where the probe trips on a straight way, m; None: never. The start where it is tripped there."""
+        if self.stuck:
+            return start if self.stuck == "closed" else None
+        return self.machine.contact(start, goal, time, feed, balls=self.balls)[0]
+
+    def obstacle(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
+        """Return where a probe in the spindle runs into a ball that it does not move off, m."""
+        if self.tool != "probe":
+            return None
+        return self.machine.contact(start, goal, time, feed, balls=self.balls, leaving=True)[0]
 
     def stop(self) -> None:
         """Abort all motion: the axes stand from now on. The spindle stays as it is."""
@@ -171,6 +192,8 @@ class Motion(SampleClock):
                 self.motion, self.path = None, Path.resting(self._sphere(now))  # the sphere is out of sight
             elif now < self.path.end:
                 self.path = self.path.cut(now)
+                self.machine.forget(self._program_events, now)
+                self.printed = [(time, line) for time, line in self.printed if time <= now]
                 if self._warm_up is not None and self._warm_up > now:
                     self._warm_up = None
             self.program = ""
@@ -279,3 +302,43 @@ class Motion(SampleClock):
         with self._change:
             begin = self._warm_up
         return np.zeros_like(times) if begin is None else np.maximum(times - begin, 0.0)
+
+
+class Errands:
+    """What an NC program orders beside its path; see `nc_program.Peripherals`."""
+
+    def __init__(self, world: Motion, begin: float) -> None:
+        self._world, self._begin = world, begin
+        self._tool = world.tool
+        self.events: list[Event] = []
+        self.printed: list[tuple[float, str]] = []
+
+    def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
+        """Refuse a move on which the probe would run into a ball."""
+        if self._world.obstacle(start, goal, self._begin + time, feed) is not None:
+            raise InstrumentError("the probe would trip on this way")
+
+    def skip(self, start: Array, goal: Array, feed: float, time: float) -> Array:
+        """Return where the probe stops a move."""
+        if speed := self._world.commanded_speed(self._begin + time):
+            raise InstrumentError(f"the spindle turns at {speed:g} /min; M5 first")
+        self._world.tool = "probe"
+        place = self._world.trip(start, goal, self._begin + time, feed)
+        return goal if place is None else place
+
+    def spindle(self, speed: float, time: float) -> None:
+        """Turn the spindle."""
+        event = Event(self._begin + time, spindle_speed=speed)
+        self._world.machine.command(event)
+        self.events.append(event)
+        if speed and self._world.tool == "probe":
+            self._world.tool = "bar"
+
+    def print(self, line: str, time: float) -> None:
+        """Print a line when the program is there."""
+        self.printed.append((self._begin + time, line))
+
+    def undo(self) -> None:
+        """Take back what an aborted program has ordered."""
+        self._world.machine.forget(self.events, self._begin)
+        self._world.tool = self._tool
