@@ -26,6 +26,7 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 _HEAD = 7  # bytes of an MBAP header
+_LONGEST = 254  # bytes behind its length
 
 
 def crc16(data: bytes) -> bytes:
@@ -65,8 +66,11 @@ def missing(framing: Framing, data: bytes) -> int:
     """Return how many bytes an answer that begins so still lacks, as far as its beginning tells."""
     if framing == "rtu":
         size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
+    elif len(data) < _HEAD - 1:
+        size = _HEAD + 2
     else:
-        size = 9 if len(data) < 6 else 6 + int.from_bytes(data[4:6], "big")
+        protocol, length = struct.unpack(">HH", data[2:6])
+        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: nothing is worth waiting for
     return max(size - len(data), 0)
 
 

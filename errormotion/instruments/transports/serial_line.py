@@ -1,4 +1,4 @@
-"""A serial line, 8N1."""
+"""A serial line, 8N1 where the address says nothing else."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ DEFAULT_BAUDRATE = 9600
 
 
 class SerialTransport(Transport):
-    """A serial line: 8 data bits, no parity, one stop bit."""
+    """A serial line: 8 data bits, no parity, one stop bit; or as ``parity=E``, ``parity=O``, ``stopbits=2`` say."""
 
     holds_back = False
 
     def __init__(self, address: Address, *, timeout: float = 1.0, baudrate: int | None = None) -> None:
         super().__init__(address.url, timeout)
         speed = int(address.number("baudrate", baudrate or DEFAULT_BAUDRATE))
+        parity, stop_bits = address.params.get("parity", "N"), address.whole("stopbits", 1, 2)
         self._port: serial.Serial | None = None
         try:
-            self._port = serial.Serial(address.path, speed, timeout=timeout, write_timeout=timeout)
+            self._port = serial.Serial(
+                address.path, speed, parity=parity, stopbits=stop_bits, timeout=timeout, write_timeout=timeout
+            )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise InstrumentError(f"The serial line {self.url} cannot be opened at {speed} baud: {error}") from None
 
