@@ -12,6 +12,7 @@ from errormotion.report import (
     budget,
     multilateration_axes,
     multilateration_figures,
+    multilateration_plan,
     multilateration_quality,
     provenance,
 )
@@ -23,6 +24,8 @@ from errormotion.report.text import DASH, finite, fixed, integer, significant
 __all__ = ["is_multilateration", "part"]
 
 _OWN = "noise of the target's own readings"
+_TRACKER = "stations"
+_WORDS = {_TRACKER: "stations, by the tracker's noise", "repeatability": "repeatability of the machine"}
 _UNKNOWN = "not determined at any target"
 _NOT_SEEN = (
     "Distances say how targets lie to one another and not where the whole of them is. Six rigid freedoms are therefore "
@@ -52,8 +55,10 @@ def part(source: Source, key: str) -> Part:
         multilateration_figures.layout(net, f"{key}-layout"),
         multilateration_quality.planned(errors, net) if planned else multilateration_quality.stations(net),
     ]
+    predicted = multilateration_plan.blocks(errors, f"{key}-map")
     sections = [
         *([Section("volume", "Errors of the volume", volume)] if volume else []),
+        *([Section("map", "Predicted uncertainty", predicted)] if predicted else []),
         Section("unseen", "What is not seen", [Text(_NOT_SEEN, "warning"), Text(_ROTATIONS)]),
         Section("stations", "Stations", stations),
         Section("uncertainty", "Uncertainty", _uncertainty(errors, net, key)),
@@ -152,14 +157,40 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     if "influence" not in errors or not np.isfinite(sigma).any():
         return [*found, Text("The result does not say where its uncertainty comes from.", "note")]
     worst = int(np.nanargmax(sigma))
-    table = budget.table(errors.isel(target=worst), f"at {net.targets[worst]}, the least certain target")
+    table = budget.table(_parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the least certain target")
     own = budget.readable("independent")
-    rows = [[_OWN if row[0] == own else row[0], *row[1:]] for row in table.rows]
+    rows = [[_WORDS.get(str(row[0]), _OWN if row[0] == own else row[0]), *row[1:]] for row in table.rows]
     found.append(replace(table, rows=rows))
     shared = _shared(errors)
     if shared:
         found.append(Text(f"Of the variance of that target, {shared} is shared with other targets.", "plain"))
     return found
+
+
+def _parted(place: xr.Dataset) -> xr.Dataset:
+    """Return a result at one target with its own readings' covariance divided by cause, as ``scatter_share`` says.
+
+    What is independent from target to target is the tracker's noise and the machine's repeatability in one; at one
+    target the second is a group like others.
+    """
+    shares = place.get("scatter_share")
+    if shares is None or shares.dims != ("cause",) or shares.size < 2:
+        return place
+    C = np.asarray(place["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
+    F = np.asarray(place["influence"].transpose("source", "dof").values, float)
+    values, vectors = np.linalg.eigh(C - F[:, :3].T @ F[:, :3])
+    rows, groups = [], []
+    for cause, share in zip(shares["cause"].values, shares.values, strict=True):
+        if str(cause) == _TRACKER:
+            continue
+        for value, vector in zip(values, vectors.T, strict=True):
+            rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
+            groups.append(str(cause))
+    names = [*place["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
+    told = [*place["source_group"].values.tolist(), *groups]
+    without = place.drop_dims("source")
+    parted = without.assign_coords(source=names, source_group=("source", told))
+    return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
 
 
 def _shared(errors: xr.Dataset) -> str:
@@ -174,7 +205,7 @@ def _shared(errors: xr.Dataset) -> str:
 
 
 def _remarks(errors: xr.Dataset) -> list[Block]:
-    return [Text(note, "warning") for note in remarks(errors)]
+    return [Text(note, "warning") for note in remarks(errors) if "\n" not in note]  # a map in letters: drawn above
 
 
 def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
@@ -186,7 +217,8 @@ def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
         ("condition of what can be determined", significant(scalar(errors, "condition"), 3)),
         ("turns of the alternating scheme, beside ours", integer(scalar(errors, "alternating_iterations"))),
         ("what it had left to go / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
-        ("repeatability from returns / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
+        ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
+        ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
     ]
     rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]
     found = [*_remarks(errors), *multilateration_quality.left_out(net)]

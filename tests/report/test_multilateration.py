@@ -2,6 +2,7 @@
 
 import re
 from functools import cache
+from html import unescape
 from xml.etree import ElementTree
 
 import numpy as np
@@ -258,3 +259,45 @@ def test_thinned_targets_are_distinct_and_hold_the_worst():
     kept = thinned(np.arange(1000), 50, always=777)
     assert 777 in kept
     assert len(set(kept.tolist())) == kept.size <= 51
+
+
+def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
+    place = np.stack(np.meshgrid([0.0, 0.1], [0.0, 0.2], [0.0, 0.1, 0.2], indexing="ij"), -1).reshape(-1, 3)
+    sigma = UM * np.stack([np.linspace(1, 3, 12), np.linspace(0.5, 1, 12)])
+    planned = bare(
+        target_uncertainty=(("target",), np.full(12, UM)),
+        map_position=(("place", "direction"), place),
+        map_uncertainty=(("setup", "place"), sigma),
+        chosen=(("place",), np.arange(12) % 4 == 0),
+        gain=((), 3.0),
+    )
+    html = page(planned.assign(chosen=planned["chosen"].astype(np.int8)), tmp_path)
+    text = words(html)
+    assert "Predicted uncertainty" in html
+    assert "The gain in what was minimised is 3.00" in text
+    assert "as set 3.00 2.00 1.00" in text
+    assert "best, Z = 100 mm" in text
+    assert "3 100.0 0.0 200.0" in text  # the ninth of the places
+    (tmp_path / "other").mkdir()
+    assert "Predicted uncertainty" not in page(bare(), tmp_path / "other")
+
+
+def test_repeatability_of_the_machine_is_a_line_of_the_budget(tmp_path):
+    machine = VirtualMachine("cframe", seed=3)
+    raw = machine.raw_multilateration(machine.target_grid((4, 4, 3)), seed=1, repeatability=2 * UM)
+    errors = Multilateration().identify(raw, Multilateration.Settings(repeatability="2 um", parametric=False))
+    html = page(errors, tmp_path)
+    table = html[html.index("Uncertainty budget") :]
+    cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", table[: table.index("</table>")], flags=re.S)
+    text = [unescape(re.sub(r"<[^>]+>", "", cell)).strip() for cell in cells]
+    names = {
+        "machine": "repeatability of the machine",
+        "tracker": "stations, by the tracker's noise",
+        "own": "noise of the target's own readings",
+        "all": "combined, k = 1",
+    }
+    rows = {key: np.array(text[text.index(name) + 1 :][:3], float) for key, name in names.items()}
+    # Figures of three digits.
+    parts = np.sqrt(rows["machine"] ** 2 + rows["tracker"] ** 2 + rows["own"] ** 2)
+    np.testing.assert_allclose(parts, rows["all"], rtol=0.01)
+    assert (rows["machine"] > 3 * rows["own"]).all()

@@ -31,9 +31,9 @@ class SimulatedEmScon(SimulatedDevice):
     """A tracker that follows the reflector at the machine's tool.
 
     Further parameters of the address: those of `tracker_scene.TrackerScene`; ``tracker`` (``AT901`` or ``AT4xx``),
-    ``noise`` (m, of one distance, 0.2e-6), ``angle_noise`` (rad, 3e-6), ``dead_path`` (m; else it is drawn: up to 10
-    mm whenever an interferometer takes up its reflector, up to 0.1 mm once for absolute distances), ``initialised``
-    (1), ``result`` (1 or 2: which packet a single measurement is).
+    ``noise`` (m, of one distance, 0.5e-6 as the driver states), ``angle_noise`` (rad, 3e-6), ``dead_path`` (m; else it
+    is drawn: up to 10 mm whenever an interferometer takes up its reflector, up to 0.1 mm once for absolute distances),
+    ``initialised`` (1), ``result`` (1 or 2: which packet a single measurement is).
 
     Between the answers come status changes, levels and reflector positions, as from the real one.
 
@@ -56,7 +56,7 @@ class SimulatedEmScon(SimulatedDevice):
         self.scene = TrackerScene(self.world, address, self._rng)
         self._absolute = address.params.get("tracker", "AT901") == "AT4xx"
         self._model = MODELS[address.params.get("tracker", "AT901")]
-        self._noise = address.number("noise", 0.2e-6)
+        self._noise = address.number("noise", 0.5e-6)
         self._angle_noise = address.number("angle_noise", 3e-6)
         self._given_dead_path = address.number("dead_path", math.nan)
         self._result = codec.SINGLE2 if address.number("result", 1) == 2 else codec.SINGLE

@@ -19,6 +19,7 @@ from pydantic import Field
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration import layout
+from errormotion.methods.multilateration.scales import Scales
 from errormotion.plugins import PluginSettings
 
 if TYPE_CHECKING:
@@ -61,6 +62,9 @@ class Measuring(PluginSettings):
     repeats: int = Field(default=1, ge=0, description="times that a poor set-up is repeated")
     arrival: Length = Field(default=1e-4, gt=0, description="how near the control has to be to a target")
     timeout: Time = Field(default=120.0, gt=0, description="time limit of a move")
+    scale_sensors: tuple[str, str, str] | None = Field(
+        default=None, description="sensors of the thermometer on the scales of X, Y and Z; without: not recorded"
+    )
 
 
 def measure_stations(
@@ -174,6 +178,7 @@ class Stand:
             raise MethodError(f"expected numbers of stations from 1 to {len(self.station)}; found {strange}")
         self.sequence = [k - 1 for k in wanted]
         self.air_told: bool | None = None  # not known before the first set-up
+        self.scales = Scales(bench, measuring.scale_sensors)
 
     def place(self, number: int) -> None:
         """Have the tracker at a station, and the reflector at the first target."""
@@ -230,6 +235,7 @@ class Stand:
         found: dict[int, dict[int, tuple[float, Any]]] = {}  # by dead path, then by target
         reasons: dict[int, str] = {}
         queue, last = deque(self.order), 0
+        self.scales.poll()
         while queue:
             i = queue.popleft()
             self.move(i)
@@ -242,6 +248,7 @@ class Stand:
                 queue.extend(k for k in self.order if k in found[last])
             found.setdefault(count, {})[i] = (self.now(), reading)
             last = count
+        self.scales.poll()
         kept = max(found.values(), key=len, default={})
         invalid = Counter(reasons.get(i, LOST) for i in self.order if i not in kept)
         return self._dataset(number, kept, invalid, start)
@@ -265,6 +272,7 @@ class Stand:
             "station_nominal": (("station", "direction"), self.station[number : number + 1], m),
             "reflector": (("target", "direction"), self.target - self.position, m),
             "displacement_noise": ((), self.noise(), m),
+            **self.scales.taken(),
         }
         attrs: dict[str, Any] = {
             "schema": SCHEMA,

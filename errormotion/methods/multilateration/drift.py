@@ -96,7 +96,7 @@ def estimate_drift(
     notes : list of str
         Added to.
     certain : bool
-        The noise is; otherwise what the returns scatter is believed where it is more.
+        The noise is, unless the returns contradict it; otherwise what they scatter is believed where it is more.
     """
     n, m = displacement.shape
     rate, correction = np.full((n, 4), np.nan), np.zeros((n, m))
@@ -111,7 +111,9 @@ def estimate_drift(
         since = np.where(known, time[j] - middle, 0.0)
         terms = np.concatenate([np.ones((m, 1)), e[j]], axis=1) * since[:, None]
         returns[j] = (terms, *_within(groups, displacement[j], terms, noise[j]))
-    scatter = (1.0, 0) if certain else _scatter([(d, A) for _, d, A in returns.values()])
+    scatter = _scatter([(d, A) for _, d, A in returns.values()])
+    if certain and scatter[0] * scatter[1] <= stats.chi2.ppf(1 - FALSE_ALARM, max(scatter[1], 1)):
+        scatter = (1.0, 0)
     square, freedom, pairs = 0.0, 0, 0
     for j, (terms, d, A) in returns.items():
         pairs += len(d)
@@ -120,7 +122,7 @@ def estimate_drift(
         left = d
         if order:
             solution, *_ = np.linalg.lstsq(A[:, :order], d)
-            C = np.asarray(np.linalg.inv(A[:, :order].T @ A[:, :order]), dtype=float)
+            C = scatter[0] * np.asarray(np.linalg.inv(A[:, :order].T @ A[:, :order]), dtype=float)
             rate[j, :order] = solution
             correction[j] = terms[:, :order] @ solution
             left = d - A[:, :order] @ solution

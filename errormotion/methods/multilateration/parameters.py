@@ -32,6 +32,7 @@ from errormotion.kinematics.twists import cross_matrix
 Array = NDArray[np.float64]
 
 AXES = ("X", "Y", "Z")
+ALIKE = "not told from "
 UNSEEN = 1e-6
 """A term of which less than this share is its own is not told from the others."""
 FALSE_ALARM = 1e-3
@@ -339,7 +340,7 @@ def _like(terms: list[Term], taken: list[int], weight: Array) -> str:
     for i, share in zip(taken, weight, strict=True):
         if i < len(terms):
             parts[terms[i].error] = parts.get(terms[i].error, 0.0) + abs(float(share))
-    return f"not told from {' and '.join(name for name, part in parts.items() if part > 1e-3) or 'a shift'}"
+    return f"{ALIKE}{' and '.join(name for name, part in parts.items() if part > 1e-3) or 'a shift'}"
 
 
 @dataclass(frozen=True)

@@ -64,9 +64,9 @@ class Layout(PluginSettings):
     )
     reflector: Place = Field(default=(0.0, 0.0, 0.0), description="where the reflector is with all axes at zero")
     stations: tuple[Place, ...] = Field(
-        default=((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5)),
+        default=((-0.5, -0.4, -0.1), (0.5, -0.4, 0.4), (0.5, 0.4, -0.1), (-0.5, 0.4, 0.6)),
         min_length=4,
-        description="places of the tracker",
+        description="places of the tracker: around the volume, below and above it by turns",
     )
     displacement_noise: Length = Field(default=0.5e-6, gt=0, description="standard deviation of one reading")
 

@@ -80,7 +80,7 @@ def _size(term: Term, displacement: float, rotation: float) -> float:
     if term.order < 0:
         return rotation
     higher = term.order - first_order(term.error) + 1
-    return (rotation if term.error[1] in "ABC" else displacement) / higher**_FALLOFF
+    return float((rotation if term.error[1] in "ABC" else displacement) / higher**_FALLOFF)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.parameters import AXES, Chain, Parametric, Term
+from errormotion.methods.multilateration.parameters import ALIKE, AXES, Chain, Parametric, Term
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -26,24 +26,29 @@ _DOFS = 6
 def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as variables of an error dataset.
 
-    ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen; ``EC0Y`` ...
+    ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen, with the reason
+    as attribute ``unseen``; the attribute ``includes`` names errors that are not told from this one; ``EC0Y`` ...
     and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and what `volumetric_errors`
     needs.
     """
     extras: dict[str, xr.DataArray] = {}
     chain = axes.chain
+    includes = _includes(axes.unseen)
     for k, axis in enumerate(AXES):
         dim = f"{axis}_position"
         q = np.linspace(chain.low[k], chain.high[k], CURVE_POINTS)
         coords = {dim: (dim, q, {"units": "m"})}
         for error in chain.machine.error_names[6 * k : 6 * k + 6]:
             unit = _unit(error)
-            attrs = {"units": unit, "order": axes.orders.get(error, 0), "unseen": axes.unseen.get(error, "")}
+            attrs = {
+                "units": unit, "order": axes.orders.get(error, 0), "unseen": axes.unseen.get(error, ""),
+                "includes": includes.get(error, ""),
+            }  # fmt: skip
             value, u = axes.curve(error, q)
             extras[error] = xr.DataArray(value, coords, dim, attrs=attrs)
             extras[f"{error}_u"] = xr.DataArray(u, coords, dim, attrs={"units": unit})
     for error, (number, uncertainty) in axes.squareness().items():
-        attrs = {"units": "rad", "unseen": axes.unseen.get(error, "")}
+        attrs = {"units": "rad", "unseen": axes.unseen.get(error, ""), "includes": includes.get(error, "")}
         extras[error] = xr.DataArray(number, attrs=attrs)
         extras[f"{error}_u"] = xr.DataArray(uncertainty, attrs={"units": "rad"})
     terms = {
@@ -68,6 +73,16 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     extras["axes_sigma0"] = xr.DataArray(axes.sigma0, attrs={"units": "1"})
     extras["axes_freedom"] = xr.DataArray(axes.freedom)
     return extras
+
+
+def _includes(unseen: Mapping[str, str]) -> dict[str, str]:
+    """Return for each error what of others is in it, since at the reflector they do the same."""
+    found: dict[str, list[str]] = {}
+    for error, why in unseen.items():
+        if why.startswith(ALIKE):
+            for name in why.removeprefix(ALIKE).split(" and "):
+                found.setdefault(name, []).append(error)
+    return {name: f"what {' and '.join(others)} do at the reflector" for name, others in found.items()}
 
 
 def axes_of(errors: xr.Dataset) -> Parametric:

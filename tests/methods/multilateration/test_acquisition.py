@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.errors import MethodError
+from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.multilateration import layout
 from errormotion.methods.multilateration.acquisition import Measuring, latest, measure_stations
 from errormotion.methods.multilateration.settings import Settings
@@ -322,3 +322,54 @@ def test_absolute_distances_need_no_renewal():
     raw = measured(bench)[0]
     assert np.isfinite(raw["displacement"].values).all()
     assert len(bench.machine_.path) == 4 * (20 + 1)  # no target came twice
+
+
+class Warm(Bench):
+    """A bench with a thermometer; the scales become warmer by 0.01 K with every reading."""
+
+    def __init__(self, failing=()):
+        super().__init__()
+        self.count, self.failing = 0, failing
+
+    def has_kind(self, kind):
+        return kind == "thermometer" or super().has_kind(kind)
+
+    def of_kind(self, kind):
+        return self if kind == "thermometer" else super().of_kind(kind)
+
+    def read(self):
+        self.count += 1
+        if self.count in self.failing:
+            raise InstrumentError("no answer")
+        return {"x": 20.0 + 0.01 * self.count, "y": 21.0, "z": np.nan, "ambient": 19.0}
+
+
+def test_temperatures_of_the_scales_are_recorded_at_the_beginning_and_end_of_a_set_up():
+    sensors = QUICK.model_copy(update={"scale_sensors": ("x", "y", "z")})
+    raw = joined(measured(Warm(failing=(4, 5)), sensors))
+    datasets.validate(raw)
+    found = raw["scale_temperature"].values
+    # One reading tells the names; two for each set-up; both of the second fail but for one.
+    np.testing.assert_allclose(found[:, 0], [20.025, np.nan, 20.065, 20.085], equal_nan=True)
+    assert (found[:, 1][np.isfinite(found[:, 0])] == 21.0).all()
+    assert np.isnan(found[:, 2]).all()
+    assert "scale_temperature" not in joined(measured(Warm()))
+
+
+def test_sensors_that_are_not_there_are_refused_before_anything_moves():
+    sensors = QUICK.model_copy(update={"scale_sensors": ("x", "y", "scale of Z")})
+    bench = Warm()
+    with pytest.raises(MethodError, match=r"no scale of Z; expected names from x, y, z, ambient"):
+        measured(bench, sensors)
+    assert not bench.machine_.path
+    with pytest.raises(MethodError, match=r"kind 'thermometer' on the bench; there is none"):
+        measured(Bench(), sensors)
+
+
+def test_the_targets_of_a_plan_are_visited_by_a_tour_and_returned_to():
+    chosen = ((0.0, 0.0, 0.0), (0.1, 0.1, 0.2), (0.0, 0.1, 0.0), (0.1, 0.0, 0.2), (-0.1, 0.0, 0.1), (0.1, 0.1, 0.0))
+    bench = Bench()
+    chunk = next(measure_stations(bench, settings(targets=chosen), {}, None, QUICK))
+    assert chunk.sizes["target"] == len(chosen) + QUICK.returns
+    np.testing.assert_allclose(chunk["target_nominal"].values[: len(chosen)], np.array(chosen) + REFLECTOR)
+    assert set(map(tuple, np.round(bench.machine_.path, 6))) == set(chosen)

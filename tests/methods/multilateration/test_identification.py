@@ -61,6 +61,9 @@ def test_the_result_is_an_error_dataset_with_all_that_a_report_needs(raw, errors
     assert list(errors.em.budget()["group"].values) == ["stations", "independent"]
     assert int(errors["iterations"]) < 10
     assert "ECY: not told from EXY" in notes(errors)
+    assert errors["ECY"].attrs["unseen"] == "not told from EXY"
+    assert "ECY" in errors["EXY"].attrs["includes"]
+    assert errors["EYX"].attrs["includes"] == ""
 
 
 def test_the_datum_has_no_motion_of_the_whole(raw, errors):
@@ -230,6 +233,78 @@ def test_repeatability_of_the_machine_is_noise_where_set_ups_follow_one_another(
         assert np.mean(np.abs(vectors(found) - truth) < 1.96 * spread(found)) > 0.88
     assert "times as much as stated" in notes(raised)
     assert "times as much as stated" not in notes(stated)
+    assert raised["scatter_share"]["cause"].values.tolist() == ["stations", "unexplained scatter"]
+    share = stated["scatter_share"].sel(cause="repeatability")
+    assert float(share) == pytest.approx(4 / 4.25)  # 2 um beside the tracker's 0.5 um
+
+
+def _returning(machine, seed, true, returns=6, **told):
+    q = machine.target_grid((4, 4, 3))
+    q = np.concatenate([q, q[:: 48 // returns][:returns]])
+    raw = machine.raw_multilateration(q, seed=seed, repeatability=true)
+    left = Multilateration().identify(raw, Settings(parametric=False, **told))
+    return left, vectors(left) - vectors(machine.truth_multilateration(q))
+
+
+def test_returns_tell_the_repeatability_and_the_intervals_hold():
+    held, squares, found = [], [], []
+    for seed in range(40):
+        errors, left = _returning(VirtualMachine("cframe", seed=seed), seed, 2e-6)
+        held.append(np.mean(np.abs(left) < 1.96 * spread(errors)))
+        found.append((float(errors["repeatability"]) - 2e-6) / float(errors["repeatability_u"]))
+        e, C = left[7], errors["covariance"].values[7, :3, :3]
+        squares.append(e @ np.linalg.solve(C, e))
+        assert errors["repeatability"].attrs["source"] == "returns and residuals"
+    # 40 set-ups of 162 coordinates that share stations: 0.5 % of coverage.
+    assert 0.93 < np.mean(held) < 0.97
+    low, high = stats.chi2.ppf([1e-3, 1 - 1e-3], 120)
+    assert low < sum(squares) < high
+    # Known from some 60 freedoms: nearly normal.
+    assert abs(np.mean(found)) < 4 / np.sqrt(40)
+    assert np.std(found) == pytest.approx(1.0, abs=0.35)
+
+
+def test_repeatability_is_a_group_of_the_budget(machine):
+    errors, _ = _returning(machine, 11, 2e-6)
+    budget = errors.em.budget()
+    assert {"stations", "repeatability", "independent"} <= set(budget["group"].values)
+    ratio = budget.sel(group="repeatability").values[:, :3] / budget.sel(group="stations").values[:, :3]
+    # The same way through the stations: as the standard deviations, 2 um to 0.5 um, known to a tenth.
+    np.testing.assert_allclose(ratio, ratio[0, 0])
+    assert ratio[0, 0] == pytest.approx(4.0, rel=0.3)
+    total = np.sqrt((budget.values**2).sum(axis=0))[:, :3]
+    np.testing.assert_allclose(total, spread(errors), rtol=1e-6)
+    assert "The machine comes back to within" in notes(errors)
+
+
+def test_a_stated_repeatability_is_weighed_against_returns_by_its_uncertainty(machine):
+    alone, _ = _returning(machine, 12, 2e-6)
+    vague, _ = _returning(machine, 12, 2e-6, repeatability="3 um", repeatability_uncertainty="3 um")
+    sharp, _ = _returning(machine, 12, 2e-6, repeatability="3 um", repeatability_uncertainty="10 nm")
+    exact, _ = _returning(machine, 12, 2e-6, repeatability="3 um")
+    assert float(vague["repeatability"]) == pytest.approx(float(alone["repeatability"]), rel=0.05)
+    assert float(sharp["repeatability"]) == pytest.approx(3e-6, rel=0.02)
+    assert float(exact["repeatability"]) == 3e-6
+    assert "settings and returns" in vague["repeatability"].attrs["source"]
+    wrong, _ = _returning(machine, 12, 2e-6, repeatability="0.1 um")
+    assert "the settings state 0.1 um" in notes(wrong)
+
+
+def test_where_all_stations_read_at_once_repeatability_moves_the_target_itself(machine):
+    q = machine.target_grid((4, 4, 3))
+    q = np.concatenate([q, q[::4]])
+    truth, d = vectors(machine.truth_multilateration(q)), []
+    raw = machine.raw_multilateration(q, seed=13)
+    rng = np.random.default_rng(1)
+    U = machine.tracker_places()
+    moved = 2e-6 * rng.normal(size=(len(q), 3))
+    way = machine.reflector_places(q) - U[:, None]
+    d = np.einsum("jta,ta->jt", way / np.linalg.norm(way, axis=2)[..., None], moved)
+    raw["displacement"] = (raw["displacement"] + d).assign_attrs(units="m")
+    found = Multilateration().identify(raw, Settings(together=True, parametric=False))
+    # 12 returns, 36 coordinates: known to 12 %.
+    assert float(found["repeatability"]) == pytest.approx(2e-6, rel=0.4)
+    assert 0.9 < np.mean(np.abs(vectors(found) - truth) < 1.96 * spread(found)) < 0.99
 
 
 def test_the_published_scheme_can_be_set_beside(raw, errors):
