@@ -5,8 +5,9 @@ stand less the error of the tip there, so that the machine trips in its servo th
 The world's clock goes on with the real time that the machine moves, and jumps with ``elapse``.
 
 Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
-``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (3 s; how long LinuxCNC stays up when the last driver has
-gone), ``wait`` (60 s; for another simulated LinuxCNC on this computer to end).
+``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; how long LinuxCNC stays up when the last driver has
+gone; 0 = not at all. It ends with the process anyway), ``wait`` (60 s; for another simulated LinuxCNC on this computer
+to end).
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from errormotion.instruments.simulators.linuxcnc_process import LinuxCNCProcess
 from errormotion.instruments.simulators.virtual_world import VirtualWorld
 from errormotion.instruments.transports import Address, Transport, open_transport
 
-LINGER = 3.0  # s
+LINGER = 10.0  # s
 WAIT = 60.0  # s
-FIRST = 10.0  # s without a client until LinuxCNC ends itself, at least
+FIRST = 5.0  # s that LinuxCNC waits for its first driver, at least
 OWN = "simulator"
 """What the numbers of requests begin with that the driver knows nothing of."""
 ANSWER = 10.0  # s
@@ -66,6 +67,20 @@ class Control:
         )
         files = {"linuxcnc.ini": ini, "balls.hal": hal_text(len(self.world.balls))}
         return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", WAIT))
+
+    def join(self, world: VirtualWorld) -> None:
+        """Count a device in, and begin anew with another world."""
+        with self.lock:
+            self.users += 1
+            if self.world is not world:
+                self.world, self._seen, self._moving, self._speed = world, None, False, 0.0
+
+    def leave(self, linger: float) -> None:
+        """Count a device out; without lingering LinuxCNC ends with the last one."""
+        with self.lock:
+            self.users -= 1
+            if linger <= 0 and self.users == 0:
+                self.process.end()
 
     def follow(self, time: float, moving: bool) -> None:
         """Let the world's clock go on by the time that the machine has moved since the last call."""
@@ -109,38 +124,46 @@ class Control:
         return pins
 
 
-_controls: dict[VirtualWorld, Control] = {}
+Key = tuple[str, int, bool, str, float]
+
+_controls: dict[Key, Control] = {}
 _lock = threading.Lock()
 
 
-def _control(world: VirtualWorld, address: Address) -> tuple[Control, bool]:
-    """Return the running LinuxCNC of a world, and whether it was started now.
+def _control(world: VirtualWorld, address: Address) -> Control:
+    """Return the running LinuxCNC of a world; one that lingers after a world of the same kind is taken over.
 
     Raises
     ------
     InstrumentError
         LinuxCNC is not installed, does not start, or runs for another world.
     """
+    warm, ready = world.machine.sensors_on_for > 0, address.number("ready", 1)
+    key = (world.name, world.seed, warm, address.params.get("unit", "mm"), ready)
     with _lock:
-        control = _controls.get(world)
-        new = control is None or not control.process.running
-        if new:
+        control = _controls.get(key)
+        if control is None or not control.process.running:
             _end_unused()
-            control = _controls[world] = Control(world, address)
-        assert control is not None
-        control.users += 1
-        return control, new
+            control = _controls[key] = Control(world, address)
+        control.join(world)
+        return control
 
 
 def _end_unused() -> None:
-    for other, control in list(_controls.items()):
+    for key, control in list(_controls.items()):
         if control.users and control.process.running:
             raise InstrumentError(
-                f"LinuxCNC runs for {other.name} with seed {other.seed} in this process, and a computer has room for "
-                "one; close that driver first"
+                f"LinuxCNC runs for {key[0]} with seed {key[1]} in this process, and a computer has room for one; "
+                "close that driver first, or give both addresses the same seed and parameters"
             )
         control.process.end()
-        del _controls[other]
+        del _controls[key]
+
+
+def end() -> None:
+    """End a LinuxCNC that lingers."""
+    with _lock:
+        _end_unused()
 
 
 class SimulatedLinuxCNC(SimulatedDevice):
@@ -156,17 +179,16 @@ class SimulatedLinuxCNC(SimulatedDevice):
         super().__init__(address, line_end=b"\n", default_name="linuxcnc")
         self._linger = address.number("linger", LINGER)
         try:
-            self._control, new = _control(self.world, address)
+            self._control = _control(self.world, address)
         except BaseException:
             super().close()
             raise
         try:
             self._bridge: Transport = open_transport(f"tcp://127.0.0.1:{self._control.process.port}", timeout=ANSWER)
-            if new and self._control.ready:
-                for op in ("reset", "enable", "home"):
-                    self._wait_for(op)
+            if self._control.users == 1 and self._control.ready:
+                self._make_ready()
         except BaseException:
-            self._leave()
+            self._control.leave(self._linger)
             super().close()
             raise
         self._pump = threading.Thread(target=self._carry_back, name=f"sim-{self.name}-bridge", daemon=True)
@@ -179,14 +201,8 @@ class SimulatedLinuxCNC(SimulatedDevice):
         self._closed = True
         self._pump.join()
         self._bridge.close()
-        self._leave()
+        self._control.leave(self._linger)
         super().close()
-
-    def _leave(self) -> None:
-        with _lock:
-            self._control.users -= 1
-            if self._linger <= 0 and self._control.users == 0:
-                self._control.process.end()
 
     # ------------------------------------------------------------------ to the bridge
 
@@ -222,7 +238,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         if op == "elapse" and not state["running"]:
             self._jump(request)
             return
-        if op != "elapse":
+        if op != "elapse" and not state["running"]:
             self._set_balls(op, start, request)
         self._forward(request)
 
@@ -253,15 +269,23 @@ class SimulatedLinuxCNC(SimulatedDevice):
 
     # ------------------------------------------------------------------ from the bridge
 
-    def _wait_for(self, op: str) -> None:
-        """Have an order carried out before the driver comes."""
-        self._forward({"id": OWN, "op": op})
+    def _make_ready(self) -> None:
+        """Leave e-stop, switch on, home, and have the spindle stand, before the driver comes."""
+        self._wait_for("reset")
+        self._wait_for("enable")
+        if not self._wait_for("state")["homed"]:
+            self._wait_for("home")
+        self._wait_for("spindle", speed=0.0)
+
+    def _wait_for(self, op: str, **arguments: Any) -> Any:
+        self._forward({"id": OWN, "op": op, **arguments})
         while True:
             message = json.loads(self._bridge.read_until(b"\n"))
             if "beat" not in message:
                 break
         if not message["ok"]:
             raise InstrumentError(f"The simulated LinuxCNC does not {op}: {message['error']}")
+        return message["result"]
 
     def _carry_back(self) -> None:
         buffer = b""

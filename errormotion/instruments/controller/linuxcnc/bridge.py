@@ -39,7 +39,8 @@ REACHED = 1e-6  # m: an order that ends closer than this has reached its goal
 LONGEST = 1 << 24  # bytes of a request
 UNREAD = 1 << 20  # bytes of answers
 AXES = "XYZ"
-UNITS = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
+OTHERS = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
+OURS = "G21 G90 G94"  # mm, absolute, mm/min
 
 
 class RefusedError(Exception):
@@ -122,7 +123,7 @@ class Bridge:
             while line := await reader.readline():
                 await self._take(client, line)
         except ValueError:
-            client.send(_failure(None, f"a request of more than {LONGEST} bytes"))
+            client.send(self._failure(None, f"a request of more than {LONGEST} bytes"))
         except OSError:
             pass
         finally:
@@ -138,16 +139,16 @@ class Bridge:
             number, op = request.pop("id"), request.pop("op")
             work = self._work.get(op)
         except Exception as error:  # noqa: BLE001 - whatever comes in is no reason to die
-            client.send(_failure(number, f"this is no request: {error!r}"))
+            client.send(self._failure(number, f"this is no request: {error!r}"))
             return
         if work is None:
-            client.send(_failure(number, f"no such operation: {op}"))
+            client.send(self._failure(number, f"no such operation: {op}"))
         elif op in self._quick:
             client.send(await self._answer(number, partial(work, **request)))
         elif op in self._waits:
             self._in_background(client, self._wait(client, number, partial(work, client, **request)))
         elif busy := self.job or self.program:
-            client.send(_failure(number, f"the machine is busy: {busy.what}"))
+            client.send(self._failure(number, f"the machine is busy: {busy.what}"))
         else:
             self.job = Job(client, op.replace("_", " "))
             self._in_background(client, self._order(client, number, partial(work, **request)))
@@ -187,9 +188,12 @@ class Bridge:
         try:
             return {"id": number, "ok": True, "result": await work(), "time": self.time}
         except RefusedError as error:
-            return {**_failure(number, str(error)), "time": self.time}
+            return self._failure(number, str(error))
         except Exception as error:  # noqa: BLE001 - wrong arguments, an error of LinuxCNC's module
-            return {**_failure(number, f"{type(error).__name__}: {error}"), "time": self.time}
+            return self._failure(number, f"{type(error).__name__}: {error}")
+
+    def _failure(self, number: Any, text: str) -> dict[str, Any]:
+        return {"id": number, "ok": False, "error": text, "time": self.time}
 
     # ------------------------------------------------------------------ what LinuxCNC says
 
@@ -337,7 +341,7 @@ class Bridge:
         self._demand()
         goal, words = self._goal(position), _speed(feed)
         began = self.time
-        await self._mdi(f"G21 G90 G94 G53 {words} {_axis_words(goal)}")
+        await self._mdi(f"G53 {words} {_axis_words(goal)}")
         await self._require_arrival(goal)
         return {"duration": self.time - began}
 
@@ -351,7 +355,7 @@ class Bridge:
             raise RefusedError("the probe stands at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
-        await self._mdi(f"G21 G90 G94 {words} {_axis_words(self._in_work_frame(goal))}")
+        await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
         if self.stat.probe_tripped:
             return {"tripped": True, "position": self._metres(self.stat.probed_position), "time": self.time}
         await self._require_arrival(goal)
@@ -464,15 +468,19 @@ class Bridge:
                 raise RefusedError(f"LinuxCNC does not change its mode{await self._texts()}")
 
     async def _mdi(self, line: str) -> None:
-        """Have one line carried out to its end, and the modes of units and distance be as before."""
-        before = [word for code, word in UNITS.items() if code in self.stat.gcodes]
+        """Have one line carried out to its end in mm and mm/min, and the modes be as before."""
         await self._mode(self.cnc.MODE_MDI)
+        before = [word for code, word in OTHERS.items() if code in self.stat.gcodes]
+        if before:  # on a line of its own: a feed beside it would be read in the units before
+            await self._line(OURS)
+        await self._line(line)
+        if before and self.stat.state != self.cnc.RCS_ERROR:
+            await self._line(" ".join(before))
+
+    async def _line(self, line: str) -> None:
         self.command.mdi(line)
         while not await self._ended(self.job):
             await asyncio.sleep(POLL)
-        if before and self.stat.state != self.cnc.RCS_ERROR:
-            self.command.mdi(" ".join(before))
-            await self._settle(" ".join(before))
 
     async def _ended(self, job: Job | None) -> bool:
         """Whether LinuxCNC has done what it was told last; RefusedError where it was kept from it."""
@@ -531,10 +539,6 @@ class Bridge:
         if abort and (ended or client is None):
             with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
                 self.command.abort()
-
-
-def _failure(number: Any, text: str) -> dict[str, Any]:
-    return {"id": number, "ok": False, "error": text}
 
 
 def _number(value: Any, what: str, least: float = -math.inf) -> float:

@@ -15,8 +15,6 @@ from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo
 
-ATTEMPTS = 2  # at a question; an order is given once
-
 
 class LinuxCNC(Driver):
     """A machine under LinuxCNC.
@@ -221,15 +219,15 @@ class LinuxCNC(Driver):
     # ------------------------------------------------------------------ the wire
 
     def _ask(self, op: str) -> Any:
-        """Ask a question, a second time over a new connection if the first one is lost."""
-        for attempt in range(ATTEMPTS):
-            try:
-                return self._order(op)
-            except InstrumentError:
-                again = self._lost and attempt + 1 < ATTEMPTS and self._may_connect_anew
-                if not again:
-                    raise
-        raise InstrumentError(f"{self.address} gives no answer to {op}")
+        """Ask a question, and once more over a new connection if it breaks."""
+        try:
+            return self._order(op)
+        except InstrumentTimeoutError:
+            raise
+        except InstrumentError:
+            if not (self._lost and self._may_connect_anew):
+                raise
+            return self._order(op)
 
     @property
     def _may_connect_anew(self) -> bool:

@@ -11,7 +11,7 @@ from errormotion.plugins import PluginSettings
 class LinuxCNCSettings(PluginSettings):
     """Settings of ``linuxcnc``."""
 
-    timeout: Time = Field(default=6.0, description="how long LinuxCNC may be silent, also while it moves", gt=0)
+    timeout: Time = Field(default=3.0, description="how long LinuxCNC may be silent, also while it moves", gt=0)
     trip_delay: Time = Field(
         default=0.0,
         description="from the contact until LinuxCNC latches the place; a touch is put back by as much travel",
