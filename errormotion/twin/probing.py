@@ -296,9 +296,9 @@ class ProbeMeasurements:
         times = np.atleast_1d(np.asarray(t, dtype=float))
         readings = self.temperatures(times)
         for sensor in range(readings.shape[1]):
+            key = kernels.stream_key(self.seed, _THERMOMETER, seed, sensor)
             for i, bits in enumerate(times.view(np.int64)):
-                key = kernels.stream_key(self.seed, _THERMOMETER, seed, sensor, int(bits))
-                readings[i, sensor] += noise * kernels.normal(key, 0)
+                readings[i, sensor] += noise * kernels.normal(key, bits)
         return readings
 
     def raw_normal_vector(
