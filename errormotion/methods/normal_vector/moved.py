@@ -29,6 +29,8 @@ FALSE_ALARM = 1e-3
 MOST_ROUNDS = 60
 SURE = 12.0
 """Less gain of another ball, in chi-square, than this below the best: it may be the one that moved."""
+SIMPLER = 0.95
+"""A single wrong touch that explains at least this share of what a move does is the simpler explanation."""
 _MANY = 30
 _WEAK = 1e-6
 
@@ -140,8 +142,9 @@ def _suspect(seen: Observations, found: Rigid, stated: bool, smallest_move: floa
     level = _Level(found, seen, H, inverse, stated)
     move = _move(information, u, smallest_move, level)
     touch = _touches(level) if seen.touched else _centres(information, u, level)
-    candidates = [entry for entry in (move, touch) if entry is not None and entry[0] < np.log(FALSE_ALARM)]
-    return min(candidates, key=lambda entry: entry[0])[1] if candidates else None
+    if move is not None and (touch is None or touch[0] < SIMPLER * move[0]):
+        return move[1]
+    return None if touch is None else touch[1]
 
 
 class _Level:
@@ -150,7 +153,8 @@ class _Level:
     def __init__(self, found: Rigid, seen: Observations, H: Array, inverse: Array, stated: bool) -> None:
         w = np.diagonal(seen.weight, axis1=2, axis2=3)
         leverage = w * np.einsum("kbmp,kpq,kbmq->kbm", H, inverse, H, optimize=True)
-        own = np.maximum(1 - leverage, _WEAK)
+        # The reach of a touch is the mean of its cycles: its own share in that is one more leverage.
+        own = np.maximum((1 - leverage) * (1 - w / np.maximum(w.sum(axis=0), 1e-300)), _WEAK)
         self.judged = (w > 0) & (own > 1e-3)
         self.square = np.where(self.judged, w * np.nan_to_num(found.residual) ** 2 / own, 0.0)
         self.chi2, self.freedom, self.stated = found.chi2, found.freedom, stated
@@ -158,13 +162,16 @@ class _Level:
         if found.freedom > _MANY:
             self.robust = float(np.median(self.square[self.judged])) / stats.chi2.ppf(0.5, 1)
 
+    def scale(self, gain: Array, unknowns: int) -> Array:
+        """Return the variance of a number of weight 1 that is left when so much is gained."""
+        rest = self.freedom - unknowns
+        scale = np.maximum(self.chi2 - gain, 0.0) / rest if rest > 0 else np.full_like(gain, self.chi2)
+        return np.asarray(np.maximum(np.minimum(scale, self.robust), 1.0 if self.stated else 1e-30))
+
     def log_chance(self, gain: Array, unknowns: int, tries: int) -> Array:
         """Return the logarithm of the chance that sound data gain so much in any of so many tries."""
         rest = self.freedom - unknowns
-        scale = np.maximum(self.chi2 - gain, 0.0) / rest if rest > 0 else np.full_like(gain, self.chi2)
-        scale = np.minimum(scale, self.robust)
-        scale = np.maximum(scale, 1.0 if self.stated else 1e-30)
-        ratio = gain / scale
+        ratio = gain / self.scale(gain, unknowns)
         if self.stated or rest > 200:
             chance = stats.chi2.logsf(ratio, unknowns)
         else:
@@ -173,7 +180,7 @@ class _Level:
 
 
 def _move(information: Array, u: Array, smallest: float, level: _Level) -> tuple[float, Move] | None:
-    """Return the most improbable move and the logarithm of its chance."""
+    """Return the move that gains most, in units of the noise, and the gain; None where it may be luck."""
     k, b = u.shape[:2]
     before_I, before_u = np.cumsum(information, axis=0)[:-1], np.cumsum(u, axis=0)[:-1]
     after_I, after_u = information.sum(axis=0) - before_I, u.sum(axis=0) - before_u
@@ -187,29 +194,32 @@ def _move(information: Array, u: Array, smallest: float, level: _Level) -> tuple
     gain = np.where(alive, gain, 0.0)
     chance = level.log_chance(gain, 3, (k - 1) * b)
     at, ball = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    least = float(np.max(gain) * (1 - 1e-12))
-    scale = least / max(-2 * float(chance[at, ball]), 1e-30)
-    others = tuple(i for i in range(b) if i != ball and gain[:, i].max() > gain[at, ball] - SURE * scale)
-    return float(chance[at, ball]), Move(int(ball), int(at) + 1, shift[at, ball], others)
+    if chance[at, ball] >= np.log(FALSE_ALARM):
+        return None
+    ratio = gain / level.scale(gain, 3)[at, ball]
+    others = tuple(i for i in range(b) if i != ball and ratio[:, i].max() > ratio[at, ball] - SURE)
+    return float(gain[at, ball]), Move(int(ball), int(at) + 1, shift[at, ball], others)
 
 
 def _touches(level: _Level) -> tuple[float, Flags] | None:
-    """Return the touches, at most one of a cycle, that are too improbable, and the logarithm of the least chance."""
-    chance = level.log_chance(level.square, 1, int(level.judged.sum()))
-    return _worst(chance)
+    """Return the touches that are too improbable, at most one of a cycle and of a reach, and the most gain.
+
+    A wrong touch spoils the motion of its cycle, and the reach of its direction in all others: it is the worst in both.
+    """
+    return _worst(level.log_chance(level.square, 1, int(level.judged.sum())), level.square)
 
 
 def _centres(information: Array, u: Array, level: _Level) -> tuple[float, Flags] | None:
     """Return the centres, at most one of a cycle, that are too improbable."""
-    chance = level.log_chance(_solved(information, u)[1], 3, int(level.judged[..., 0].sum()))
-    return _worst(np.repeat(chance[..., None], 3, axis=2))
+    gain = _solved(information, u)[1]
+    chance = level.log_chance(gain, 3, int(level.judged[..., 0].sum()))
+    return _worst(*(np.repeat(part[..., None], 3, axis=2) for part in (chance, gain)))
 
 
-def _worst(chance: Array) -> tuple[float, Flags] | None:
-    flat = chance.reshape(len(chance), -1)
-    least = flat.min(axis=1, keepdims=True)
-    found = (flat <= least) & (least < np.log(FALSE_ALARM))
-    return (float(least.min()), found.reshape(chance.shape)) if found.any() else None
+def _worst(chance: Array, gain: Array) -> tuple[float, Flags] | None:
+    least = np.minimum(chance.min(axis=(1, 2), keepdims=True), chance.min(axis=0))
+    found = (chance <= least) & (chance < np.log(FALSE_ALARM))
+    return (float(gain[found].max()), found) if found.any() else None
 
 
 def _solved(information: Array, u: Array) -> tuple[Array, Array]:

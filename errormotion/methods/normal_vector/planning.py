@@ -127,7 +127,8 @@ def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, n
     touches = settings.touches * len(settings.balls)
     notes = [
         f"With {touches} touches a cycle and {format_quantity(noise, 'um', 2)} noise of each, the standard "
-        f"uncertainties relative to the cold cycle are {said}. Half of the variance is the cold cycle's, which is probed once."
+        f"uncertainties relative to the cold cycle are {said}. Half of the variance is "
+        "the cold cycle's, which is probed once."
     ]
     if unseen := [DOF[k] for k in range(6) if k not in motion.seen]:
         notes.append(
