@@ -13,7 +13,7 @@ import re
 import time
 from pathlib import Path
 
-from validation import beam_direction, crossbeam_scan, multilateration, spindle_drift
+from validation import beam_direction, crossbeam_scan, multilateration, normal_vector, spindle_drift
 
 from errormotion import __version__
 
@@ -23,6 +23,7 @@ PARTS = {
     "crossbeam_scan": crossbeam_scan,
     "beam_direction": beam_direction,
     "multilateration": multilateration,
+    "normal_vector": normal_vector,
 }
 INTRODUCTION = """\
 # Validation

@@ -141,15 +141,16 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
         )
     time = mean_time(seen) if interpolate else seen.cycle_time
     to_knots = knot_weights(time, seen.time, interpolate)
-    twist, anchor = np.zeros((k, 6)), _anchors(seen.place, seen) if seen.touched else None
+    twist, anchor = np.zeros((k, 6)), spheres(seen)[0] if seen.touched else None
     for _ in range(MOST_STEPS):
         before = twist
         twist, solved, parts = _step(seen, motion, to_knots, twist, anchor)
         change = np.abs(twist - before).max()
         if change < SETTLED:
             break
-        if seen.touched:
-            anchor = _anchors(seen.place + _errors(motion, to_knots, twist, seen.place), seen)
+        if anchor is not None:
+            true = seen.place + motion.error(at_times(to_knots, twist), motion.lever(seen.place))
+            anchor = _spheres(true, seen.valid, anchor)[0]
     else:
         raise MethodError(
             f"The fit has not settled after {MOST_STEPS} steps (last change {change:.2g} m or rad). Are the balls in "
@@ -160,7 +161,7 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
 
 def determined(seen: Observations, motion: Motion) -> NDArray[np.bool_]:
     """Return which cycles determine the motion by themselves, (k,)."""
-    normal = _directions(seen.place, _anchors(seen.place, seen)) if seen.touched else _axes(seen.place)
+    normal = _directions(seen.place, spheres(seen)[0]) if seen.touched else _axes(seen.place)
     H = motion.design(motion.lever(seen.place), normal)
     valid = seen.valid
     places = seen.place[valid]
@@ -196,10 +197,6 @@ def knot_weights(time: Array, at: Array, interpolate: bool) -> Array:
     return weights
 
 
-def _errors(motion: Motion, to_knots: Array, twist: Array, place: Array) -> Array:
-    return motion.error(at_times(to_knots, twist), motion.lever(place))
-
-
 def at_times(to_knots: Array, twist: Array) -> Array:
     """Return the twists at the times that the weights (k, b, m, 3) belong to, (k, b, m, 6)."""
     edge = np.zeros((1, 6))
@@ -209,18 +206,25 @@ def at_times(to_knots: Array, twist: Array) -> Array:
 
 def spheres(seen: Observations) -> tuple[Array, Array]:
     """Return centres (b, 3) and radii (b,) of spheres through the touches of each ball, m, as if nothing drifted."""
-    return _spheres(seen.place, seen)
+    return _spheres(seen.place, seen.valid)
 
 
-def _anchors(place: Array, seen: Observations) -> Array:
-    return _spheres(place, seen)[0]
+def _spheres(place: Array, valid: NDArray[np.bool_], about: Array | None = None) -> tuple[Array, Array]:
+    """Return the spheres through the mean place of each ball's touches in each direction.
 
-
-def _spheres(place: Array, seen: Observations) -> tuple[Array, Array]:
-    """Return the spheres through the mean places of each ball's touches."""
-    valid = seen.valid
+    ``about`` (b, 3), m, are their centres nearly: then directions and distances are averaged apart. A mean of places
+    lies within the sphere that they are on.
+    """
     count = valid.sum(axis=0)
-    mean = np.where(valid[..., None], place, 0.0).sum(axis=0) / np.maximum(count, 1)[..., None]
+    each = np.maximum(count, 1)[..., None]
+    if about is None:
+        mean = np.where(valid[..., None], place, 0.0).sum(axis=0) / each
+    else:
+        away = np.where(valid[..., None], place - about[:, None], 0.0)
+        length = np.linalg.norm(away, axis=-1, keepdims=True)
+        direction = (away / np.where(length > 0, length, 1.0)).sum(axis=0)
+        direction /= np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 0.5)
+        mean = about[:, None] + length.sum(axis=0) / each * direction
     found = []
     for i, points in enumerate(mean):
         try:
