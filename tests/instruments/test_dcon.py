@@ -1,6 +1,7 @@
 """DCON thermometers: codec, driver, wire."""
 
 import math
+import time
 from pathlib import Path
 
 import pytest
@@ -157,3 +158,32 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
         readings = [thermometer.read() for _ in range(3)]
     with DconTemperature(f"replay://{path}") as thermometer:
         assert [thermometer.read() for _ in range(3)] == readings
+
+
+def test_flags_and_places_tell_what_and_where_a_sensor_is() -> None:
+    settings = DconSettings.model_validate({"places": {"frame": ("0.1 m", "20 mm", 0.0)}})
+    with DconTemperature(f"{ADDRESS}&open=1,3", settings) as thermometer:
+        assert set(thermometer.flags.values()) == {"not read"}
+        thermometer.read()
+        assert list(thermometer.flags.values()) == ["", "open", "", "open", ""]
+        assert thermometer.places["frame"] == (0.1, 0.02, 0.0)
+        assert thermometer.places["column"] is None
+
+
+@pytest.mark.parametrize("wire", ["tcp", "pty"])
+def test_a_module_that_was_unplugged_is_heard_again_by_itself(wire: str) -> None:
+    settings = DconSettings(timeout=0.7, retry=0.05)
+    address = f"{ADDRESS}&wire={wire}&fault=unplugged&fault_at=3&unplugged_for=1.6"
+    with DconTemperature(address, settings) as thermometer:
+        before = thermometer.read()
+        gaps, end = 0, time.monotonic() + 20
+        while time.monotonic() < end:
+            try:
+                after = thermometer.read()
+                break
+            except InstrumentError:
+                assert set(thermometer.flags.values()) == {"no answer"}
+                gaps += 1
+                time.sleep(0.02)
+        assert gaps >= 2
+        assert after == pytest.approx(before, abs=0.2)  # ten sigma of 0.02 K

@@ -29,7 +29,8 @@ from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.modbus_codec import ModbusRefusal
 
 LOGGER = "sim://cframe/logger?seed=3&map=logger-16"
-QUICK = ModbusSettings(map="logger-16", timeout=0.3, retry=0.05, retries=0)
+# long enough for the pauses of a garbage collection (0.3 s on a slow computer), during which no simulator answers
+QUICK = ModbusSettings(map="logger-16", timeout=0.7, retry=0.05, retries=0)
 TWO = ("air", "bed")
 
 
@@ -243,12 +244,12 @@ def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> No
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("silence", InstrumentTimeoutError, "unit 1 is silent for 0.3 s"),
+        ("silence", InstrumentTimeoutError, "unit 1 is silent for 0.7 s"),
         ("drop", InstrumentTimeoutError, "unit 1 is silent"),
         ("unplugged", InstrumentTimeoutError, "unit 1 is silent"),
         ("exception&code=6", ModbusRefusal, r"exception 6 \(server device busy\)"),
         ("garbage", ProtocolError, "(?i)expected"),
-        ("short", ProtocolError, "bytes more within 0.3 s"),
+        ("short", ProtocolError, "bytes more within 0.7 s"),
         ("unit", ProtocolError, "answer of unit 1; found one of unit 3"),
     ],
 )
@@ -286,7 +287,7 @@ def test_answers_in_pieces_are_whole() -> None:
 
 @pytest.mark.parametrize("wire", ["framing=tcp", "framing=rtu", "wire=pty"])
 def test_a_thermometer_that_was_unplugged_is_heard_again_by_itself(wire: str) -> None:
-    address = f"{LOGGER}&{wire}&fault=unplugged&fault_at=2&unplugged_for=1.2"
+    address = f"{LOGGER}&{wire}&fault=unplugged&fault_at=2&unplugged_for=1.6"
     with ModbusTemperature(address, QUICK) as thermometer:
         before = thermometer.read()
         gaps = 0

@@ -133,14 +133,14 @@ class SimulatedCanopen:
         if self._away.begins(number):
             if self.fault.kind == "bus_off":
                 server.send_bus_off()
-            server.stop(quiet=True)
+            server.fall_silent()
         if self._away.now():
             return None
         if self._away.returns():
             server.boot()
         self._answers += 1
         if self.fault.kind == "stopped" and number >= self.fault.at:
-            server.stop(quiet=False)
+            server.stop()
             return None
         if (self.fault.kind == "silence" and number >= self.fault.at) or self.fault.hits("drop", number):
             return None

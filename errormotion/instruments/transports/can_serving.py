@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 
 import can
 import canopen
+from canopen.nmt import NMT_STATES
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError
 
@@ -76,21 +78,26 @@ class CanopenServer:
         self._node.add_read_callback(self._read)
         self._network.add_node(self._node)
         self._heartbeat = heartbeat
+        self._quiet = False
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name=f"sim-can-{node}", daemon=True)
         self.boot()
+        if heartbeat > 0:
+            self._thread.start()
 
     def boot(self) -> None:
-        """Say hello on the bus, and begin the heartbeat."""
-        nmt = self._node.nmt
-        nmt.send_command(129)
-        nmt.send_command(1)
-        nmt.start_heartbeat(round(1e3 * self._heartbeat))
+        """Say hello on the bus, and go to the state OPERATIONAL."""
+        self._node.nmt.send_command(129)
+        self._node.nmt.send_command(1)
+        self._quiet = False
 
-    def stop(self, *, quiet: bool) -> None:
-        """Go to the state STOPPED; ``quiet``: and say nothing about it."""
-        if quiet:
-            self._node.nmt.stop_heartbeat()
-        else:
-            self._node.nmt.send_command(2)
+    def stop(self) -> None:
+        """Go to the state STOPPED."""
+        self._node.nmt.send_command(2)
+
+    def fall_silent(self) -> None:
+        """Send no heartbeat any more, until the next boot."""
+        self._quiet = True
 
     def send_bus_off(self) -> None:
         """Have every controller on the bus report that it is bus-off."""
@@ -100,8 +107,18 @@ class CanopenServer:
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
-        self._node.nmt.stop_heartbeat()
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
         self._network.disconnect()
+
+    def _beat(self) -> None:
+        """Send heartbeats; the library's own thread for it cannot be waited for."""
+        codes = {name: code for code, name in NMT_STATES.items()}
+        while not self._ended.wait(self._heartbeat):
+            if not self._quiet:
+                with suppress(can.CanError):
+                    self._network.send_message(0x700 + self._node.id, bytes((codes[self._node.nmt.state],)))
 
     def _read(self, index: int, subindex: int, od: Any) -> Any:  # noqa: ARG002 - the library's signature
         return self._value(index, subindex)

@@ -1,0 +1,40 @@
+"""The conformance kit on thermometers as they are met: by map, by wire, by bus."""
+
+from errormotion.instruments.thermometer.can_temperature import CanTemperature
+from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
+from errormotion.testing import InstrumentConformance, InstrumentSubject
+
+
+class TestAdam(InstrumentConformance):
+    """Modbus TCP; nobody at a port."""
+
+    subject = InstrumentSubject(
+        ModbusTemperature,
+        "sim://cframe/adam?seed=3&map=adam-6018&thermocouples=K",
+        settings={"map": "adam-6018", "thermocouples": ("K",)},
+        name="adam",
+        dead_address="modbus+tcp://127.0.0.1:9?unit=1",
+    )
+
+
+class TestLogger(InstrumentConformance):
+    """RTU on a pty, with an open sensor; no such line."""
+
+    subject = InstrumentSubject(
+        ModbusTemperature,
+        "sim://cframe/logger?seed=3&map=logger-16&wire=pty&open=1",
+        settings={"map": "logger-16"},
+        name="logger",
+        dead_address="modbus+rtu:///dev/no_such_line?unit=1",
+    )
+
+
+class TestNode(InstrumentConformance):
+    """A sensor open and one shorted; nobody on the bus."""
+
+    subject = InstrumentSubject(
+        CanTemperature,
+        "sim://cframe/node?seed=3&open=0&shorted=1",
+        name="node",
+        dead_address="can://virtual/nobody?node=5",
+    )
