@@ -22,6 +22,8 @@ plugins_app = typer.Typer(no_args_is_help=True, help="What instruments and metho
 bench_app = typer.Typer(no_args_is_help=True, help="Check a bench file, or the bench itself.", rich_markup_mode=None)
 app.add_typer(plugins_app, name="plugins")
 app.add_typer(bench_app, name="bench")
+model_app = typer.Typer(no_args_is_help=True, help="Thermal models: errors from temperatures.", rich_markup_mode=None)
+app.add_typer(model_app, name="model")
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: what the campaign says.")]
@@ -287,3 +289,45 @@ def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], jso
 
     if not probing.probe(file, json_):
         raise typer.Exit(ERROR)
+
+
+@model_app.command("fit")
+@guarded
+def model_fit(
+    campaigns: Annotated[list[Path], typer.Argument(help="Errors over time with temperatures: NetCDF or run folders.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model to write, .nc; it must not exist.")],
+    set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
+    json_: Json = False,
+) -> None:
+    """Make a thermal model of the errors of warm-ups."""
+    from errormotion.cli import modelling
+
+    modelling.make(campaigns, out, set_ or [], settings, json_)
+
+
+@model_app.command("predict")
+@guarded
+def model_predict(
+    model: Annotated[Path, typer.Argument(help="A thermal model.")],
+    data: Annotated[Path, typer.Argument(help="Temperatures over time: NetCDF, Zarr, or a run folder.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The errors to write, .nc; it must not exist.")],
+    json_: Json = False,
+) -> None:
+    """Predict errors from temperatures and working parameters."""
+    from errormotion.cli import modelling
+
+    modelling.foresee(model, data, out, json_)
+
+
+@model_app.command("check")
+@guarded
+def model_check(
+    model: Annotated[Path, typer.Argument(help="A thermal model.")],
+    errors: Annotated[Path, typer.Argument(help="Measured errors that it was not made of: NetCDF or a run folder.")],
+    json_: Json = False,
+) -> None:
+    """Compare what a model predicts with what was measured."""
+    from errormotion.cli import modelling
+
+    modelling.examine(model, errors, json_)

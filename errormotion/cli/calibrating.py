@@ -41,10 +41,9 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
     if as_json:
         show_json({"ok": True, "calibration": str(out), **answer})
         return
-    settings_count, left_out = answer["settings"], answer["settings_left_out"]
-    show(f"{out}: calibration from {answer['readings']} readings at {settings_count} settings")
+    show(f"{out}: calibration from {answer['readings']} readings at {answer['settings']} settings")
     even = ", the same on both sides of the plane of triangulation" if answer["mirror"] else ""
-    show(f"  order {answer['order']}{even}; left out: {answer['readings_left_out']} readings, {left_out} settings")
+    show(f"  order {answer['order']}{even}; left out: {_left_out(answer)}")
     low, high = answer["remaining_error_um_interval"]
     show(
         f"  error at {answer['depth_mm']:.3g} mm from mid range: up to {answer['largest_error_um']:.3g} um; "
@@ -77,6 +76,11 @@ def told(calibration: InclinationCalibration) -> dict[str, Any]:
         **{f"mid_range_{name}_mm": value for name, value in found.items()},
         "notes": [note for note in str(ds.attrs.get("notes", "")).split("\n") if note],
     }
+
+
+def _left_out(answer: dict[str, Any]) -> str:
+    counts = {what: answer[f"{what}s_left_out"] for what in ("reading", "setting")}
+    return ", ".join(f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items())
 
 
 def _found(answer: dict[str, Any]) -> str:

@@ -1,0 +1,125 @@
+"""What the errors are linear in: temperatures, now or some time ago, and first-order answers to what heats.
+
+All features are linear in the inputs and 0 in the reference state, so that the model has no constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.compensation.thermal_model.record import Inputs
+from errormotion.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column of the model.
+
+    Attributes
+    ----------
+    source : str
+        Name of a temperature sensor, or of a working parameter.
+    parameter : bool
+        Whether it is a working parameter.
+    power : int
+        Of the working parameter: friction grows with the speed and with its square.
+    lag : float
+        How long ago, s.
+    time_constant : float
+        Of the first-order answer, s; 0: the value itself.
+    """
+
+    source: str
+    parameter: bool = False
+    power: int = 1
+    lag: float = 0.0
+    time_constant: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        text = self.source if self.power == 1 else f"{self.source}^{self.power}"
+        text += f", {self.lag / 60:g} min ago" if self.lag else ""
+        return text + (f", time constant {self.time_constant / 60:g} min" if self.time_constant else "")
+
+
+def lagged(sensors: Sequence[str], lags: Sequence[float]) -> tuple[Feature, ...]:
+    """Return temperatures now and some time ago."""
+    return tuple(Feature(sensor, lag=lag) for sensor in sensors for lag in (0.0, *lags))
+
+
+def dynamics(sensors: Sequence[str], time_constants: Sequence[float], parameters: Sequence[str]) -> tuple[Feature, ...]:
+    """Return temperatures, and first-order answers to them and to working parameters with their squares."""
+    temperatures = [Feature(s, time_constant=tau) for s in sensors for tau in (0.0, *time_constants)]
+    answers = [
+        Feature(name, True, power, time_constant=tau)
+        for name in parameters
+        for power in (1, 2)
+        for tau in time_constants
+    ]
+    return (*temperatures, *answers)
+
+
+def matrix(inputs: Inputs, features: Sequence[Feature]) -> Array:
+    """Return the value of each feature at each time, shape (n, feature).
+
+    A value that is not known is NaN where it would count now; in the past it is bridged by its neighbours.
+
+    Raises
+    ------
+    DatasetError
+        An input that a feature needs is not there.
+    """
+    return (
+        np.column_stack([_column(inputs, feature) for feature in features])
+        if features
+        else np.empty((inputs.time.size, 0))
+    )
+
+
+def _column(inputs: Inputs, feature: Feature) -> Array:
+    held: dict[str, Array] = inputs.parameter if feature.parameter else inputs.temperature
+    if feature.source not in held:
+        names = ", ".join(held) or "none"
+        what = "the working parameter" if feature.parameter else "the temperature"
+        raise DatasetError(f"The model needs {what} '{feature.source}'; the data have {names}.")
+    values: Array = held[feature.source] ** feature.power
+    known = np.isfinite(values)
+    if not known.any():
+        return np.full(values.size, np.nan)
+    bridged = np.interp(inputs.time, inputs.time[known], values[known])
+    if feature.lag:
+        bridged = np.interp(inputs.time - feature.lag, inputs.time, bridged, left=0.0)
+    if feature.time_constant:
+        bridged = first_order(inputs.time, bridged, feature.time_constant, held=feature.parameter)
+    return np.where(known, bridged, np.nan)
+
+
+def first_order(time: Array, values: Array, time_constant: float, *, held: bool) -> Array:
+    """Return x of ``time_constant dx/dt = u - x`` from rest at the first time.
+
+    Parameters
+    ----------
+    time, values : (n,)
+        u is known at these times, s.
+    time_constant : float
+        s.
+    held : bool
+        Whether ``values[k]`` held all the time since the instant before; else u is linear in between.
+    """
+    out = np.zeros(values.size)
+    steps = np.diff(time) / time_constant
+    decay = np.exp(-steps)
+    for k in range(1, values.size):
+        if held:
+            out[k] = out[k - 1] * decay[k - 1] + values[k] * (1 - decay[k - 1])
+        else:  # the exact answer to a ramp from u0 to u1
+            ramp = (values[k] - values[k - 1]) / steps[k - 1]
+            out[k] = values[k] - ramp + (out[k - 1] - values[k - 1] + ramp) * decay[k - 1]
+    return out

@@ -1,0 +1,108 @@
+"""One campaign as a model sees it: inputs over time, and the errors where they are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.datasets.schemas import DOF
+from errormotion.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What is known of a machine over time.
+
+    Attributes
+    ----------
+    time : (n,)
+        s, increasing.
+    temperature : dict of str to (n,)
+        Change of each sensor since the first time at which it is known, K; NaN = unknown.
+    parameter : dict of str to (n,)
+        ``spindle_speed`` in 1000/min and ``feed`` in m/min, which acted since the time before; 0 before the first.
+        Only those that the data have; NaN = unknown.
+    """
+
+    time: Array
+    temperature: dict[str, Array]
+    parameter: dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One campaign with measured errors.
+
+    Attributes
+    ----------
+    inputs : Inputs
+    errors : (n, 6)
+        m and rad; NaN = not seen.
+    variance : (n, 6)
+        Of the errors.
+    """
+
+    inputs: Inputs
+    errors: Array
+    variance: Array
+
+
+#: name of a working parameter to its factor: numbers near 1 in the model
+PARAMETERS = {"spindle_speed": 1e-3, "feed": 60.0}
+
+
+def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
+    """Return the inputs in an error dataset, a raw dataset or the log of a monitor.
+
+    Raises
+    ------
+    DatasetError
+        There is no time, or no temperature, or the times do not increase.
+    """
+    if "time" not in ds.dims or "time" not in ds.coords:
+        raise DatasetError(f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}")
+    if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
+        raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Put a thermometer on the bench.")
+    time = np.asarray(ds["time"].values, dtype=float)
+    if time.size > 1 and not (np.diff(time) > 0).all():
+        raise DatasetError(f"{what}: expected times that increase; found some that do not")
+    values = np.asarray(ds["temperature"].transpose("time", "sensor").values, dtype=float)
+    names = [str(name) for name in ds["sensor"].values]
+    if len(set(names)) < len(names):
+        raise DatasetError(f"{what}: expected a name of its own for each sensor; found {', '.join(names)}")
+    temperature = {name: since_start(values[:, k]) for k, name in enumerate(names)}
+    parameter = {
+        name: np.asarray(ds[name].values, dtype=float) * factor
+        for name, factor in PARAMETERS.items()
+        if name in ds and ds[name].dims == ("time",)
+    }
+    return Inputs(time, temperature, parameter)
+
+
+def since_start(values: Array) -> Array:
+    """Return values less the first that is known; NaN stays."""
+    known = np.flatnonzero(np.isfinite(values))
+    return values - values[known[0]] if known.size else values
+
+
+def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
+    """Return a campaign from an error dataset over time.
+
+    Raises
+    ------
+    DatasetError
+        The dataset has other dimensions than time, or no temperatures.
+    """
+    inputs = read_inputs(ds, what)
+    if ds["EX"].dims != ("time",):
+        dims = ", ".join(map(str, ds["EX"].dims))
+        raise DatasetError(f"{what}: expected errors over time alone; found ({dims}). Select one place first.")
+    errors = np.column_stack([np.asarray(ds[name].values, dtype=float) for name in DOF])
+    covariance = ds["covariance"].transpose("time", "dof", "dof_").values
+    variance = np.diagonal(covariance, axis1=1, axis2=2).copy()
+    return Record(inputs, errors, variance)

@@ -1,0 +1,112 @@
+"""Weighted ridge regression over campaigns, and what is learnt by leaving one campaign out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.linear_model import Ridge
+from sklearn.model_selection import LeaveOneGroupOut
+
+from errormotion.compensation.thermal_model.features import Feature, matrix
+from errormotion.compensation.thermal_model.record import Record
+
+Array = NDArray[np.float64]
+
+STRENGTHS = 10.0 ** np.arange(-7.0, 1.0)
+"""Of the regularisation, as shares of the sum of weights; features have unit mean square."""
+
+BLOCKS = 4
+"""Into which a single campaign is cut for cross-validation."""
+
+
+class Columns:
+    """The features of all campaigns, each computed once.
+
+    Parameters
+    ----------
+    records : sequence of Record
+    """
+
+    def __init__(self, records: Sequence[Record]) -> None:
+        self.records = records
+        self._known: dict[Feature, Array] = {}
+
+    def of(self, features: Sequence[Feature]) -> tuple[Array, Array]:
+        """Return the features in units of their root mean square, (n, feature), and that unit, (feature,)."""
+        for feature in features:
+            if feature not in self._known:
+                self._known[feature] = np.vstack([matrix(r.inputs, [feature]) for r in self.records])[:, 0]
+        X = np.column_stack([self._known[feature] for feature in features])
+        scale = np.sqrt(np.nanmean(X**2, axis=0))
+        scale[~(scale > 0)] = 1.0
+        return X / scale, scale
+
+
+def groups(records: Sequence[Record]) -> NDArray[np.int64]:
+    """Return the number of the campaign of each row; a single campaign is cut into blocks in time."""
+    if len(records) > 1:
+        return np.repeat(np.arange(len(records)), [record.inputs.time.size for record in records])
+    n = records[0].inputs.time.size
+    return np.arange(n) * BLOCKS // n
+
+
+def target(records: Sequence[Record], freedom: int) -> tuple[Array, Array]:
+    """Return one error of all campaigns and its weights, mean 1, 0 where the error is unknown."""
+    y = np.concatenate([record.errors[:, freedom] for record in records])
+    variance = np.concatenate([record.variance[:, freedom] for record in records])
+    good = np.isfinite(y) & np.isfinite(variance)
+    if not good.any():
+        return y, np.zeros(y.size)
+    floor = np.median(variance[good & (variance > 0)]) if (variance[good] > 0).any() else 1.0
+    # The reference state itself has no variance: it must not outweigh everything else.
+    weight = np.where(good, 1 / np.maximum(variance, floor), 0.0)
+    return y, weight / weight[good].mean()
+
+
+def solve(X: Array, y: Array, weight: Array, strengths: Array) -> Array:
+    """Return the coefficients of weighted ridge regressions without constant, (strength, feature)."""
+    use = weight > 0
+    ridge = Ridge(alpha=strengths * float(weight[use].sum()), fit_intercept=False)
+    ridge.fit(X[use], np.tile(y[use, None], strengths.size), sample_weight=weight[use])
+    return np.atleast_2d(np.asarray(ridge.coef_, dtype=float))
+
+
+def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> Array:
+    """Return measured minus predicted of each row by models that have not seen its campaign, (n, strength)."""
+    known = (weight > 0) & np.isfinite(X).all(axis=1)
+    residual = np.full((y.size, STRENGTHS.size), np.nan)
+    rows = np.flatnonzero(known)
+    for train, test in LeaveOneGroupOut().split(X[rows], groups=group[rows]):
+        coefficient = solve(X[rows[train]], y[rows[train]], weight[rows[train]], STRENGTHS)
+        residual[rows[test]] = y[rows[test], None] - X[rows[test]] @ coefficient.T
+    return residual
+
+
+def mean_square(residual: Array, weight: Array) -> float:
+    """Return the weighted mean square of what is known; infinite where nothing is."""
+    known = np.isfinite(residual) & (weight > 0)
+    return float(np.average(residual[known] ** 2, weights=weight[known])) if known.any() else float("inf")
+
+
+def best_strength(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> tuple[float, float, Array]:
+    """Return the regularisation that predicts best, its mean square error, and its residuals."""
+    residual = left_out_residuals(X, y, weight, group)
+    scores = [mean_square(column, weight) for column in residual.T]
+    best = int(np.argmin(scores))
+    return float(STRENGTHS[best]), scores[best], residual[:, best]
+
+
+def effective_count(residual: Array, group: NDArray[np.int64]) -> float:
+    """Return how many independent values residuals are worth: neighbours in time are alike (AR(1))."""
+    total = 0.0
+    for number in np.unique(group):
+        values = residual[group == number]
+        values = values[np.isfinite(values)]
+        if values.size < 3 or not (values**2).sum() > 0:
+            total += float(bool(values.size))
+            continue
+        alike = float(np.clip((values[1:] * values[:-1]).sum() / (values**2).sum(), 0.0, 0.99))
+        total += max(1.0, values.size * (1 - alike) / (1 + alike))
+    return total

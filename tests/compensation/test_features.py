@@ -1,0 +1,79 @@
+"""Features are the answers that physics says."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.compensation.thermal_model.features import Feature, dynamics, first_order, lagged, matrix
+from errormotion.compensation.thermal_model.record import Inputs, read_inputs
+from errormotion.errors import DatasetError
+
+
+def test_a_step_that_is_held_is_answered_by_an_exponential() -> None:
+    time = np.array([0.0, 10.0, 25.0, 100.0, 1000.0])
+    answer = first_order(time, np.array([0.0, 1.0, 1.0, 1.0, 1.0]), 50.0, held=True)
+    np.testing.assert_allclose(answer, 1 - np.exp(-time / 50.0), rtol=1e-12)
+
+
+def test_a_ramp_is_answered_with_its_delay_whatever_the_steps() -> None:
+    time = np.array([0.0, 3.0, 40.0, 41.0, 900.0])
+    answer = first_order(time, 0.2 * time, 60.0, held=False)
+    np.testing.assert_allclose(answer, 0.2 * (time - 60.0 * (1 - np.exp(-time / 60.0))), rtol=1e-12)
+
+
+def test_a_lag_looks_back_and_finds_the_reference_state_before_the_start() -> None:
+    inputs = Inputs(np.array([0.0, 100.0, 200.0]), {"head": np.array([0.0, 1.0, 4.0])}, {})
+    found = matrix(inputs, lagged(["head"], (50.0,)))
+    np.testing.assert_allclose(found, [[0.0, 0.0], [1.0, 0.5], [4.0, 2.5]])
+
+
+def test_an_unknown_value_is_unknown_now_and_bridged_in_the_past() -> None:
+    inputs = Inputs(np.array([0.0, 100.0, 200.0]), {"head": np.array([0.0, np.nan, 4.0])}, {})
+    found = matrix(inputs, [Feature("head"), Feature("head", lag=100.0)])
+    assert np.isnan(found[1]).all()
+    np.testing.assert_allclose(found[2], [4.0, 2.0])
+
+
+def test_friction_grows_with_the_speed_and_its_square() -> None:
+    features = dynamics((), (600.0,), ("spindle_speed",))
+    assert [f.power for f in features] == [1, 2]
+    inputs = Inputs(np.array([0.0, 600.0]), {}, {"spindle_speed": np.array([0.0, 3.0])})
+    np.testing.assert_allclose(matrix(inputs, features)[1], np.array([3.0, 9.0]) * (1 - np.exp(-1)))
+
+
+def test_an_input_that_is_missing_is_named() -> None:
+    inputs = Inputs(np.zeros(1), {"bed": np.zeros(1)}, {})
+    with pytest.raises(DatasetError, match="needs the temperature 'head'; the data have bed"):
+        matrix(inputs, [Feature("head")])
+    with pytest.raises(DatasetError, match="needs the working parameter 'spindle_speed'; the data have none"):
+        matrix(inputs, [Feature("spindle_speed", True)])
+
+
+def data(**changes: object) -> xr.Dataset:
+    ds = xr.Dataset(
+        {"temperature": (("time", "sensor"), [[20.0, np.nan], [21.0, 30.0], [23.0, 31.0]])},
+        {"time": [0.0, 1.0, 2.0], "sensor": ["a", "b"]},
+    )
+    return ds.assign_coords(changes)
+
+
+def test_temperatures_count_from_the_first_that_is_known() -> None:
+    inputs = read_inputs(data(spindle_speed=("time", [0.0, 3000.0, np.nan]), feed=("time", [0.0, 0.05, 0.1])))
+    np.testing.assert_allclose(inputs.temperature["a"], [0.0, 1.0, 3.0])
+    np.testing.assert_allclose(inputs.temperature["b"], [np.nan, 0.0, 1.0])
+    np.testing.assert_allclose(inputs.parameter["spindle_speed"], [0.0, 3.0, np.nan])
+    np.testing.assert_allclose(inputs.parameter["feed"], [0.0, 3.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (data().drop_vars("temperature"), "expected temperature"),
+        (data(time=[0.0, 2.0, 1.0]), "expected times that increase"),
+        (data(sensor=["a", "a"]), "a name of its own for each sensor; found a, a"),
+        (data().isel(time=0), "expected temperatures over time; found the dims sensor"),
+    ],
+)
+def test_data_that_cannot_be_read_say_why(wrong: xr.Dataset, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        read_inputs(wrong)

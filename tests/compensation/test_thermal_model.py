@@ -1,0 +1,157 @@
+"""A thermal model predicts a warm-up that it has not seen, and says how well."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
+from errormotion.compensation.thermal_model.fitting import LEAST_SAMPLES
+from errormotion.compensation.thermal_model.model import ROWS
+from errormotion.datasets.schemas import DOF
+from errormotion.errors import DatasetError
+
+LAGGED = Settings(variant="lagged", lags=("10 min",))
+DYNAMICS = Settings(variant="dynamics", time_constants=("30 min",))
+
+
+@pytest.fixture(scope="module")
+def model(pair: list[xr.Dataset]) -> ThermalModel:
+    return fit(pair, LAGGED)
+
+
+@pytest.mark.parametrize("settings", [LAGGED, DYNAMICS], ids=["lagged", "dynamics"])
+def test_a_warm_up_with_another_speed_profile_is_predicted(
+    settings: Settings, pair: list[xr.Dataset], warm_up: Callable[..., xr.Dataset]
+) -> None:
+    """The largest errors by 80 % and more; what remains of the small ones is the noise of the measurement, 0.3 um."""
+    third = warm_up(3, 2)
+    found = check(fit(pair, settings), third)
+    assert (found.removed[[1, 2, 3, 4]] > 0.8).all()
+    size = np.sqrt((found.rms[:3] ** 2).sum()), np.sqrt((found.remaining[:3] ** 2).sum())
+    assert size[1] < 0.2 * size[0]
+    assert (found.held >= 0.9).all()
+    assert found.outside == 0
+
+
+def test_intervals_hold_over_machines(warm_up: Callable[..., xr.Dataset]) -> None:
+    """Eight machines, six errors, thirty times each; the misfit is one draw a machine, so one may fare badly."""
+    settings = Settings(variant="lagged", sensors=("head", "motor", "column_front"), lags=("10 min",))
+    held = [check(fit([warm_up(s, 0), warm_up(s, 1)], settings), warm_up(s, 2)).held for s in range(10, 18)]
+    assert np.mean(held) > 0.93
+    assert np.min(np.mean(held, axis=1)) > 0.85
+
+
+def test_the_prediction_is_an_error_dataset_with_sources(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+    predicted = model.predict(pair[0])
+    datasets.validate(predicted)
+    assert predicted.attrs["method"] == "thermal_model"
+    assert set(predicted["source_group"].values) == {"coefficients", "misfit"}
+    total = np.einsum("stj,stk->tjk", predicted["influence"].values, predicted["influence"].values)
+    np.testing.assert_allclose(predicted["covariance"].values, total)
+    for name in DOF:
+        assert float(predicted[name][0]) == 0.0
+
+
+def test_times_beyond_the_training_are_flagged(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+    hot = pair[0].copy(deep=True)
+    hot["temperature"] = hot["temperature"] + 5.0 * (hot["time"] > 7200.0)
+    predicted = model.predict(hot)
+    assert not predicted["outside"].sel(time=slice(0, 7200)).any()
+    assert predicted["outside"].sel(time=slice(7300, None)).all()
+    assert "beyond what the model was trained on" in json.loads(predicted.attrs["notes"])[0]
+
+
+def test_an_unknown_temperature_makes_an_unknown_error_and_is_counted(
+    model: ThermalModel, pair: list[xr.Dataset]
+) -> None:
+    torn = pair[0].copy(deep=True)
+    torn["temperature"].loc[{"time": torn["time"][4], "sensor": model.sensors[0]}] = np.nan
+    predicted = model.predict(torn)
+    assert np.isnan(predicted["EZ"][4])
+    assert int(np.isnan(predicted["EZ"]).sum()) == 1
+    assert "1 of 31 times without a prediction" in predicted.attrs["notes"]
+
+
+def test_a_saved_model_predicts_the_same(model: ThermalModel, pair: list[xr.Dataset], tmp_path: Path) -> None:
+    model.save(tmp_path / "m.nc")
+    again = ThermalModel.load(tmp_path / "m.nc")
+    assert again.features == model.features
+    xr.testing.assert_identical(again.predict(pair[1]), model.predict(pair[1]))
+    with pytest.raises(DatasetError, match="is there already"):
+        model.save(tmp_path / "m.nc")
+
+
+def test_an_error_that_nobody_saw_stays_unseen(pair: list[xr.Dataset]) -> None:
+    blind = [ds.copy(deep=True) for ds in pair]
+    for ds in blind:
+        ds["EC"] = ds["EC"] * np.nan
+        covariance = ds["covariance"].values.copy()
+        covariance[:, 5, :] = covariance[:, :, 5] = np.nan
+        ds["covariance"] = (ds["covariance"].dims, covariance)
+    predicted = fit(blind, LAGGED).predict(blind[0])
+    assert np.isnan(predicted["EC"]).all()
+    assert np.isfinite(predicted["EZ"]).all()
+
+
+def test_sensors_are_chosen_where_the_heat_is(pair: list[xr.Dataset]) -> None:
+    """A sensor of noise alone is not chosen."""
+    noisy = []
+    for number, ds in enumerate(pair):
+        noise = 20 + np.random.default_rng(number).normal(size=(ds.sizes["time"], 1))
+        fake = xr.DataArray(noise, dims=("time", "sensor"), coords={"sensor": ["dice"]})
+        whole = xr.concat([ds["temperature"].drop_vars("temperature", errors="ignore"), fake], dim="sensor")
+        plain = ds.drop_vars(["temperature", "sensor"])
+        noisy.append(plain.assign_coords(sensor=whole["sensor"], temperature=whole))
+    assert "dice" not in fit(noisy, LAGGED).sensors
+
+
+def test_one_campaign_alone_is_told(pair: list[xr.Dataset]) -> None:
+    assert fit(pair[:1], LAGGED).dataset.attrs["validated"] == "blocks in time of one campaign"
+
+
+def changed(ds: xr.Dataset, **attrs: object) -> xr.Dataset:
+    return ds.assign_attrs(attrs)
+
+
+def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset]) -> None:
+    first, second = pair
+    with pytest.raises(DatasetError, match="at least one campaign"):
+        fit([])
+    with pytest.raises(DatasetError, match="Campaign 2: expected machine"):
+        fit([first, changed(second, machine="Another")])
+    with pytest.raises(DatasetError, match=r"Campaign 2: expected the functional point .* Move the errors"):
+        fit([first, changed(second, functional_point=np.array([0.0, 0.0, 0.3]))])
+    with pytest.raises(DatasetError, match=f"at least {LEAST_SAMPLES} known values"):
+        fit([first.isel(time=slice(0, 4))])
+    with pytest.raises(DatasetError, match=r"sensors: expected names that all campaigns have .*; found nose"):
+        fit(pair, Settings(sensors=("nose",)))
+
+
+def test_a_check_needs_the_same_component(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+    with pytest.raises(DatasetError, match="Expected errors of component 'spindle'; found 'tool'"):
+        check(model, changed(pair[0], component="tool"))
+
+
+def test_a_file_that_is_no_model_is_refused(tmp_path: Path, pair: list[xr.Dataset], model: ThermalModel) -> None:
+    datasets.save(pair[0], tmp_path / "errors.nc")
+    with pytest.raises(
+        DatasetError, match=r"expected schema errormotion\.model\.thermal/1; found errormotion\.errors/1"
+    ):
+        ThermalModel.load(tmp_path / "errors.nc")
+    with pytest.raises(DatasetError, match="coefficient"):
+        ThermalModel(model.dataset.drop_vars("coefficient"))
+
+
+def test_the_page_of_schemas_has_the_table_of_the_model() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "schemas.md").read_text()
+    section = page.partition("\n## Thermal model")[2].partition("\n## ")[0]
+    told = [line for line in section.splitlines() if line.startswith("| `")]
+    assert [line.split("|")[1].strip(" `") for line in told] == [row.name for row in ROWS]
+    for line, row in zip(told, ROWS, strict=True):
+        assert row.meaning in line
+        assert ", ".join(row.dims) in line
