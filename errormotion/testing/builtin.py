@@ -46,9 +46,19 @@ def builtin_subjects(
         return (InstrumentSubject(cls, str(scan_file())),)
     if (group, plugin_id) == ("instruments", "mtconnect"):
         return (mtconnect(cls),)
+    if (group, plugin_id) == ("instruments", "controller_probe"):
+        return (controller_probe(cls),)
+    if (group, plugin_id) == ("instruments", "dprnt"):
+        return (InstrumentSubject(cls, "sim://cframe/printer", faults=()),)  # they show in lines, and nobody prints
     if (group, plugin_id) == ("instruments", "tracker_table"):
         return (InstrumentSubject(cls, str(length_table())),)
     return ()
+
+
+def controller_probe(cls: Any) -> InstrumentSubject:
+    """Return ``controller_probe``; what is wrong with machine or probe shows when it touches, not when it is read."""
+    machine = ("alarm", "estop", "no_trip", "tripped")
+    return InstrumentSubject(cls, "sim://cframe/controller", harmless=("split", *machine))
 
 
 def mtconnect(cls: Any) -> InstrumentSubject:

@@ -1,0 +1,310 @@
+"""A touch probe that a controller moves and hears: straight probing moves, G38.2 and its like."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from errormotion import plugins
+from errormotion.datasets.pretravel import PretravelMap
+from errormotion.datasets.units import Length, Time, Velocity
+from errormotion.errors import InstrumentError, PluginError
+from errormotion.instruments.touch_probe.settings import ProbeSettings, corrected, refuse_unmapped
+from errormotion.instruments.touch_probe.touching import (
+    NO_TRIP,
+    NOT_MADE,
+    NOWHERE,
+    TRIPPED,
+    Strategy,
+    StuckError,
+    Toucher,
+)
+from errormotion.plugins import Contact, Identity, InstrumentInfo, Touch
+
+_SAME = 1e-9  # m
+_ROUNDS_AT_MOST = 1e-6  # m
+
+
+class ControllerProbeSettings(ProbeSettings):
+    """Settings of a probe at a controller."""
+
+    controller: str = Field(default="virtual_controller", description="plugin of the controller at the address")
+    controller_settings: dict[str, Any] = Field(default_factory=dict, description="settings of that plugin")
+    approach_feed: Velocity = Field(default=2.0 / 60, description="between touches", gt=0)
+    search_feed: Velocity = Field(default=0.5 / 60, description="of the first contact", gt=0)
+    touch_feed: Velocity = Field(default=0.03 / 60, description="of the contacts that count", gt=0)
+    back_off: Length = Field(default=0.3e-3, description="way back between two contacts", gt=0)
+    repeats: int = Field(default=2, description="slow contacts of a touch; their mean counts", ge=1, le=20)
+    agreement: Length = Field(default=3e-6, description="by how much they may differ", gt=0)
+    free: Length = Field(default=0.2e-3, description="first part of a touch's way, where a trip is a false one", ge=0)
+    margin: Length = Field(
+        default=0.1e-3, description="between fast and slow contact, and between contact and straight way", gt=0
+    )
+    clearance: Length = Field(
+        default=30e-3, description="height above the starts of touches at which the tip goes from one to the next", ge=0
+    )
+    attempts: int = Field(default=1, description="how often a false trip, or a stuck probe, is tried again", ge=0, le=9)
+    settling: Time = Field(default=0.5, description="waiting time for a stuck probe", ge=0)
+
+    @property
+    def strategy(self) -> Strategy:
+        """How a touch is made."""
+        return Strategy(**{name: getattr(self, name) for name in Strategy.__dataclass_fields__})
+
+
+class ControllerProbe:
+    """A touch probe at a controller.
+
+    From touch to touch the tip rises by the clearance, goes across and down, on guard all the way: it stops where it
+    touches something. Nothing moves on after an error; the contacts that were made have been handed over by then.
+
+    Parameters
+    ----------
+    address : str
+        Of the controller; the probe opens a connection of its own.
+    settings : ControllerProbeSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    last : Contact or None
+        The last one.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="controller_probe",
+        kind="touch_probe",
+        summary="Touch probe that a controller moves and hears, with slow repeats and wrong triggers found",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+    )
+    Settings: ClassVar[type[ControllerProbeSettings]] = ControllerProbeSettings
+
+    def __init__(
+        self, address: str, settings: ControllerProbeSettings | None = None, *, record: Path | None = None
+    ) -> None:
+        self.address = address
+        self.settings = ControllerProbeSettings() if settings is None else settings
+        self.last: Contact | None = None
+        self._record = record
+        self._control: Any = None
+        self._map: PretravelMap | None = None
+        self._contacts = 0
+
+    # ------------------------------------------------------------------ opening and closing
+
+    def open(self) -> None:
+        """Connect to the controller and load the pre-travel map; idempotent.
+
+        Raises
+        ------
+        InstrumentError
+            Nobody there, or a controller that cannot probe.
+        DatasetError
+            The pre-travel map cannot be read.
+        """
+        if self._control is not None:
+            return
+        self._map = self.settings.pretravel_map()
+        try:
+            cls = plugins.get("instruments", self.settings.controller)
+            settings = cls.Settings(**self.settings.controller_settings)
+        except (PluginError, ValueError) as error:
+            raise InstrumentError(f"The controller '{self.settings.controller}' of the probe: {error}") from error
+        if not hasattr(cls, "probe"):
+            raise InstrumentError(f"The controller '{self.settings.controller}' cannot probe; take one that can")
+        control = cls(self.address, settings, record=self._record)
+        control.open()
+        self._control = control
+
+    def close(self) -> None:
+        """Disconnect; idempotent."""
+        control, self._control = self._control, None
+        if control is not None:
+            control.close()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+            return
+        with suppress(InstrumentError):  # what happened inside says more
+            self.close()
+
+    @property
+    def control(self) -> Any:
+        """The controller, opened; InstrumentError before ``open``."""
+        if self._control is None:
+            raise InstrumentError(
+                f"The controller_probe at {self.address} is not open: use it in a 'with' block, or call open() first"
+            )
+        return self._control
+
+    # ------------------------------------------------------------------ asking
+
+    @property
+    def tip_radius(self) -> float:
+        """Radius of the tip, m."""
+        return self.settings.tip_radius
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of one touch, m; NaN where unknown."""
+        return self.settings.touch_noise
+
+    @property
+    def pretravel(self) -> PretravelMap | None:
+        """The map that corrects contacts; None without one."""
+        return self._map
+
+    def identify(self) -> Identity:
+        """Tell whose probe it is."""
+        whose: Identity = self.control.identify()
+        return replace(
+            whose,
+            model=f"{whose.model} touch probe",
+            details={**whose.details, "controller": self.settings.controller, "tip_radius": self.tip_radius},
+        )
+
+    def configure(self, settings: ControllerProbeSettings) -> None:
+        """Use other settings from now on; those of the connection need a new one."""
+        self._map = settings.pretravel_map()
+        self.settings = settings
+
+    def read(self) -> dict[str, Any]:
+        """Return where the tip is and what came of the last touch.
+
+        ``position`` (m) and ``time`` (s) now, by the controller; ``contacts``, how many were good since the driver was
+        made; ``contact`` (m; NaN without one) and ``flag`` of the last touch.
+        """
+        state = self.control.state()
+        return {
+            "position": list(state["position"]),
+            "time": float(state["time"]),
+            "contacts": self._contacts,
+            "contact": list(self.last.position if self.last else NOWHERE),
+            "flag": self.last.flag if self.last else "",
+        }
+
+    # ------------------------------------------------------------------ touching
+
+    def measure(self, touches: Sequence[Touch]) -> Iterator[Contact]:
+        """Make touches one after another and yield what came of each, in order.
+
+        A contact is where the tip was when the probe tripped; with a pre-travel map where it was when it met the
+        surface, for touches along the normal. Where an item is not met at all the rest of its touches are ``not
+        made``; where that happens to two items running, it is the probe. A probe that is tripped at the start, and
+        stays so, gives its flag; then it is an error.
+
+        Raises
+        ------
+        InstrumentError
+            Touches from a side that the pre-travel map does not know, alarm, emergency stop, a lost connection,
+            something in the way, a probe that never trips or stays tripped. All motion has been stopped then, where
+            the controller still hears.
+        """
+        touches = list(touches)
+        refuse_unmapped(self._map, touches)
+        self._refuse_unfit()
+        missed: list[int] = []  # items that were not met, since the last contact
+        for number, touch in enumerate(touches):
+            if touch.item in missed:
+                yield self._kept(Contact(NOWHERE, float(self.control.state()["time"]), NOT_MADE))
+                continue
+            try:
+                contact = self._made(touches, number)
+            except InstrumentError as error:
+                self._stop()
+                what = f"Touch {number + 1} of {len(touches)} (item {touch.item}): {error}"
+                if isinstance(error, StuckError):
+                    yield self._kept(Contact(NOWHERE, self._time(), TRIPPED))
+                raise type(error)(what) from error
+            except BaseException:  # somebody interrupts: the machine must not be left moving
+                self._stop()
+                raise
+            missed = [*missed, touch.item] if contact.flag == NO_TRIP else []
+            yield self._kept(contact)
+            if len(missed) > 1:
+                self._stop()
+                raise InstrumentError(
+                    f"Touch {number + 1} of {len(touches)}: the probe did not trip on items {missed[0]} and "
+                    f"{missed[1]}, one after the other. Is it connected and switched on? Nothing moves on"
+                )
+        if touches:
+            self._leave(touches)
+
+    def _made(self, touches: Sequence[Touch], number: int) -> Contact:
+        touch = touches[number]
+        toucher = Toucher(self.control, self.settings.strategy)
+        for place in self._way(touches, number):
+            toucher.travel(place)
+        contact = toucher.touch(touch)
+        return corrected(self._map, touch, contact)
+
+    def _way(self, touches: Sequence[Touch], number: int) -> list[Any]:
+        """Return the places on the way to the start of a touch: up, across, down.
+
+        Within an item the tip rises above the starts of its touches, else above those of all.
+        """
+        here = np.array(self.control.state()["position"], dtype=float)
+        start = np.array(touches[number].start, dtype=float)
+        if np.abs(here - start).max() <= _ROUNDS_AT_MOST:
+            return []
+        before = touches[number - 1] if number else None
+        within = before is not None and before.item == touches[number].item
+        passed = [touch for touch in touches if not within or touch.item == touches[number].item]
+        height = max(float(here[2]), max(touch.start[2] for touch in passed) + self.settings.clearance)
+        places = [np.array([*here[:2], height]), np.array([*start[:2], height]), start]
+        return [
+            place for place, last in zip(places, [here, *places], strict=False) if np.abs(place - last).max() > _SAME
+        ]
+
+    def _leave(self, touches: Sequence[Touch]) -> None:
+        """Rise from the last touch."""
+        here = np.array(self.control.state()["position"], dtype=float)
+        height = max(touch.start[2] for touch in touches) + self.settings.clearance
+        if here[2] < height - _SAME:
+            Toucher(self.control, self.settings.strategy).travel(np.array([*here[:2], height]))
+
+    def _refuse_unfit(self) -> None:
+        state = self.control.state()
+        alarms = "; ".join(state["alarms"])
+        if state["estop"] or state["alarms"] or not state["enabled"] or state["homed"] is False:
+            what = (
+                "in emergency stop"
+                if state["estop"]
+                else f"in alarm: {alarms}"
+                if alarms
+                else "not homed"
+                if state["homed"] is False
+                else "not enabled"
+            )
+            raise InstrumentError(f"The machine at {self.address} is {what}; nothing moves")
+
+    def _kept(self, contact: Contact) -> Contact:
+        self.last = contact
+        self._contacts += not contact.flag
+        return contact
+
+    def _time(self) -> float:
+        try:
+            return float(self.control.state()["time"])
+        except InstrumentError:
+            return float("nan")
+
+    def _stop(self) -> None:
+        with suppress(InstrumentError):
+            self.control.stop()

@@ -1,0 +1,87 @@
+"""Lines that macros of FANUC controls print with DPRNT, one for each touch.
+
+``DPRNT[N12*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]`` prints ``N12 X   12.345 Y -  3.210 Z  100.000 T   45210``:
+mm, and milliseconds. Leading zeros are blanks or left out, the sign stands before the blanks (from memory, kept here).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from errormotion.errors import ProtocolError
+
+_NUMBER = r"[-+]?\s*(?:\d+\.?\d*|\.\d+)"
+PATTERN = (
+    r"(?:N\s*(?P<number>\d+)\s*|[A-MO-W]\w*\s+)?"
+    rf"X\s*(?P<x>{_NUMBER})\s*Y\s*(?P<y>{_NUMBER})\s*Z\s*(?P<z>{_NUMBER})\s*(?:T\s*(?P<time>{_NUMBER}))?"
+)
+"""What a line is, unless told otherwise: the number of the touch or a label, the place, the time."""
+
+_CONTROL = bytes(range(32)) + b"\x7f%"  # what POPEN and PCLOS send around the lines
+MM, MILLISECONDS = 1e-3, 1e-3
+
+
+@dataclass(frozen=True)
+class Line:
+    """One printed line: place (m), number of the touch (None where not printed), time (s; NaN where not printed)."""
+
+    position: tuple[float, float, float]
+    number: int | None = None
+    time: float = math.nan
+
+
+def text_of(raw: bytes) -> str:
+    """Return a line as text, without control characters; empty where nothing is left.
+
+    Raises
+    ------
+    ProtocolError
+        Bytes that are not ASCII.
+    """
+    try:
+        return raw.strip(_CONTROL).decode("ascii").strip()
+    except UnicodeDecodeError:
+        raise ProtocolError(f"Expected a line of text; found {raw[:60]!r}") from None
+
+
+def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time: float = MILLISECONDS) -> Line:
+    """Return what a line says.
+
+    Parameters
+    ----------
+    text : str
+    pattern : compiled pattern
+        Has the groups x, y, z, and perhaps number and time; the whole line must follow it.
+    length, time : float
+        What printed lengths and times are multiplied by to be m and s.
+
+    Raises
+    ------
+    ProtocolError
+        The line does not follow the pattern.
+    """
+    found = pattern.fullmatch(text.strip())
+    if found is None:
+        raise ProtocolError(f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'")
+    groups = found.groupdict()
+    try:
+        x, y, z = (_value(groups[name]) * length for name in "xyz")
+        number = int(groups["number"]) if groups.get("number") else None
+        seconds = _value(groups["time"]) * time if groups.get("time") else math.nan
+    except (TypeError, ValueError):
+        raise ProtocolError(f"Expected numbers X, Y, Z in the line; found '{text[:60]}'") from None
+    return Line((x, y, z), number, seconds)
+
+
+def _value(text: str) -> float:
+    return float("".join(text.split()))
+
+
+def format_line(line: Line, *, decimals: int = 3) -> str:
+    """Return a line as a control prints it: mm, milliseconds."""
+    number = "" if line.number is None else f"N{line.number} "
+    x, y, z = (f"{value / MM:.{decimals}f}" for value in line.position)
+    time = "" if math.isnan(line.time) else f" T{line.time / MILLISECONDS:.0f}"
+    return f"{number}X{x} Y{y} Z{z}{time}"

@@ -1,0 +1,199 @@
+"""Driver of contacts that a machine's own program prints; it listens only."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from errormotion.datasets.pretravel import PretravelMap
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.touch_probe.dprnt.codec import Line, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, place_of
+from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
+from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
+from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
+from errormotion.instruments.transports import Transport, open_transport
+from errormotion.plugins import Contact, Identity, InstrumentInfo, Touch
+
+_LINE_END = b"\n"
+_LONGEST = 1024
+_LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
+_TIMES = {"ms": 1e-3, "s": 1.0}
+
+log = logging.getLogger(__name__)
+
+
+class Dprnt(Driver):
+    """Lines that a macro prints, one for each touch, over a serial line or TCP.
+
+    Parameters
+    ----------
+    address : str
+        ``serial:///dev/ttyUSB0?baudrate=4800``, ``tcp://host:port``, ``sim://cframe/printer``, ``replay://file``.
+    settings : DprntSettings, optional
+    record : Path, optional
+        Recording of the session.
+
+    Attributes
+    ----------
+    last : Contact or None
+        The last one.
+    unreadable, repeated, missing : int
+        Lines that were none, lines printed twice, touches without a line; since the driver was made.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="dprnt",
+        kind="touch_probe",
+        summary="Contacts that the machine's own probing program prints with DPRNT, over a serial line or TCP",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.dprnt:SimulatedPrinter",
+    )
+    Settings: ClassVar[type[DprntSettings]] = DprntSettings
+    settings: DprntSettings
+
+    def __init__(self, address: str, settings: DprntSettings | None = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
+        self.last: Contact | None = None
+        self.unreadable = self.repeated = self.missing = 0
+        self._contacts = 0
+        self._map: PretravelMap | None = None
+        self._before: Line | None = None  # the last line
+        self._ahead: Line | None = None  # the first line of the next cycle, where one has come
+
+    @property
+    def tip_radius(self) -> float:
+        """Radius of the tip, m."""
+        return self.settings.tip_radius
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of one touch, m; NaN where unknown."""
+        return self.settings.touch_noise
+
+    @property
+    def pretravel(self) -> PretravelMap | None:
+        """The map that corrects contacts; None without one."""
+        return self._map
+
+    def identify(self) -> Identity:
+        """Tell what the settings say: a printer is not asked."""
+        return Identity(
+            manufacturer=self.settings.control,
+            model="DPRNT",
+            serial_number="not told",
+            simulated=self.transport.simulated,
+            details={"address": self.address, "tip_radius": self.tip_radius},
+        )
+
+    def configure(self, settings: DprntSettings) -> None:
+        """Use other settings from now on."""
+        self._map = settings.pretravel_map()
+        self.settings = settings
+
+    def read(self) -> dict[str, Any]:
+        """Return what came so far: ``contacts``, ``unreadable``, ``repeated``, ``missing``, and the last ``contact``.
+
+        The contact is X, Y, Z in m, NaN without one, with its ``time`` and ``flag``. Only `measure` takes lines.
+        """
+        _ = self.transport
+        return {
+            "contacts": self._contacts,
+            "unreadable": self.unreadable,
+            "repeated": self.repeated,
+            "missing": self.missing,
+            "contact": list(self.last.position if self.last else NOWHERE),
+            "time": self.last.time if self.last else float("nan"),
+            "flag": self.last.flag if self.last else "",
+        }
+
+    def measure(self, touches: Sequence[Touch]) -> Iterator[Contact]:
+        """Yield what the machine prints of each touch, in order, while its program makes them.
+
+        A touch whose line is missing, as those after it show, is ``not made``. Lines that came twice, or cannot be
+        read, are passed over and counted. Where the lines of the next cycle begin, the rest of this one is missing.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No line for too long; the message says at which touch.
+        ProtocolError
+            Too many lines that cannot be read.
+        InstrumentError
+            A place that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
+        """
+        touches = list(touches)
+        refuse_unmapped(self._map, touches)
+        due, unreadable = 0, self.unreadable
+        while due < len(touches):
+            where = f"Touch {due + 1} of {len(touches)} (item {touches[due].item})"
+            try:
+                line = self._next(self.settings.timeout if due else self.settings.start_timeout, unreadable)
+                place = place_of(line, touches, due, self._before, self.settings.first_number, self.settings.margin)
+            except InstrumentError as error:
+                raise type(error)(f"{where}: {error}") from error
+            if place == REPEATED:
+                self.repeated += 1
+                continue
+            if place < due:
+                self._ahead, place = line, len(touches)
+            else:
+                self._before = line
+            for _ in range(due, place):
+                self.missing += 1
+                yield self._kept(Contact(NOWHERE, float("nan"), NOT_MADE))
+            if place < len(touches):
+                touch = touches[place]
+                contact = contact_of(line, touch, self.settings.free, self.settings.at_target)
+                yield self._kept(corrected(self._map, touch, contact))
+            due = place + 1
+
+    def _next(self, timeout: float, unreadable: int) -> Line:
+        """Return the next line that says a place."""
+        if self._ahead is not None:
+            line, self._ahead = self._ahead, None
+            return line
+        end = time.monotonic() + timeout
+        pattern = re.compile(self.settings.pattern)
+        while True:
+            try:
+                raw = self.transport.read_until(_LINE_END, limit=_LONGEST, timeout=max(end - time.monotonic(), 0.0))
+                text = text_of(raw)
+                if text:
+                    units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
+                    return parse_line(text, pattern, length=units[0], time=units[1])
+            except InstrumentTimeoutError as error:
+                raise InstrumentTimeoutError(
+                    f"no line for {timeout:g} s; has the program stopped, or is the cable off? {error}"
+                ) from error
+            except ProtocolError as error:
+                self.unreadable += 1
+                log.warning("%s: %s", self.address, error)
+                if self.unreadable - unreadable > self.settings.most_unreadable:
+                    raise ProtocolError(
+                        f"{self.unreadable - unreadable} lines cannot be read. The last one: {error} Are baud rate and "
+                        "pattern right?"
+                    ) from error
+
+    def _kept(self, contact: Contact) -> Contact:
+        self.last = contact
+        self._contacts += not contact.flag
+        return contact
+
+    def _connect(self) -> Transport:
+        return open_transport(
+            self.address,
+            simulator=self.info.simulator,
+            recorder=self._record,
+            timeout=self.settings.timeout,
+            baudrate=self.settings.baudrate,
+        )
+
+    def _begin(self) -> None:
+        self._map = self.settings.pretravel_map()
+        self._before = self._ahead = None

@@ -1,0 +1,44 @@
+"""Settings of contacts that a machine prints."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from errormotion.datasets.units import Length, Time
+from errormotion.instruments.touch_probe.dprnt.codec import PATTERN
+from errormotion.instruments.touch_probe.settings import ProbeSettings
+
+
+class DprntSettings(ProbeSettings):
+    """Settings of contacts that a machine prints."""
+
+    pattern: str = Field(
+        default=PATTERN, description="regular expression of a line, with groups x, y, z, and perhaps number and time"
+    )
+    length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed places")
+    time_unit: Literal["ms", "s"] = Field(default="ms", description="unit of printed times")
+    first_number: int = Field(default=1, description="number of the first touch, where touches are numbered", ge=0)
+    margin: Length = Field(default=1e-3, description="how far off the straight way of its touch a place may be", gt=0)
+    free: Length = Field(default=0.2e-3, description="first part of a touch's way, where a trip is a false one", ge=0)
+    at_target: Length = Field(
+        default=5e-6, description="so near to the target the touch has ended there without a trip", ge=0
+    )
+    start_timeout: Time = Field(default=600.0, description="time limit of the first line of a cycle", gt=0)
+    timeout: Time = Field(default=60.0, description="time limit from line to line", gt=0)
+    most_unreadable: int = Field(default=10, description="unreadable lines in one cycle that are put up with", ge=0)
+    baudrate: int = Field(default=4800, description="of a serial line", gt=0)
+    control: str = Field(default="FANUC", description="what control prints, for the record")
+
+    @field_validator("pattern")
+    @classmethod
+    def _has_groups(cls, pattern: str) -> str:
+        try:
+            groups = re.compile(pattern).groupindex
+        except re.error as error:
+            raise ValueError(f"expected a regular expression; {error}") from None
+        if missing := [name for name in "xyz" if name not in groups]:
+            raise ValueError(f"expected groups x, y and z, as in (?P<x>...); missing {', '.join(missing)}")
+        return pattern

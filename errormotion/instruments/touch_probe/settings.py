@@ -1,0 +1,77 @@
+"""What all touch probes have as settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from errormotion.datasets.folders import folders_beside
+from errormotion.datasets.pretravel import PretravelMap
+from errormotion.datasets.units import Length
+from errormotion.errors import InstrumentError
+from errormotion.plugins import Contact, PluginSettings, Touch
+
+
+class ProbeSettings(PluginSettings):
+    """The probe itself."""
+
+    tip_radius: Length = Field(default=3e-3, description="radius of the tip", gt=0)
+    noise: Length | None = Field(
+        default=None, description="standard deviation of one touch; unknown if not given", gt=0
+    )
+    pretravel: str = Field(default="", description="file of the pre-travel map that corrects the contacts")
+
+    @property
+    def touch_noise(self) -> float:
+        """Standard deviation of one touch, m; NaN where unknown."""
+        return math.nan if self.noise is None else self.noise
+
+    def pretravel_map(self) -> PretravelMap | None:
+        """Load the pre-travel map, taken from the folder of the bench or from the working folder; None without one.
+
+        Raises
+        ------
+        DatasetError
+            There is no such file, or it is no map.
+        """
+        if not self.pretravel:
+            return None
+        places = [base / self.pretravel for base in (*folders_beside(), Path.cwd())]
+        return PretravelMap.load(next((place for place in places if place.exists()), Path(self.pretravel)))
+
+
+def _normals(touches: Sequence[Touch]) -> list[tuple[float, ...]]:
+    """Return the normals of surfaces that are touched along them."""
+    return [tuple(float(x) for x in np.subtract(touch.start, touch.target)) for touch in touches]
+
+
+def refuse_unmapped(pretravel: PretravelMap | None, touches: Sequence[Touch]) -> None:
+    """Refuse touches from sides that the pre-travel map does not know.
+
+    Raises
+    ------
+    InstrumentError
+        Names the first of them.
+    """
+    if pretravel is None or not touches:
+        return
+    unknown = np.flatnonzero(~pretravel.supported(_normals(touches)))
+    if unknown.size:
+        first = touches[int(unknown[0])]
+        raise InstrumentError(
+            f"The pre-travel map has no touches near the direction of touch {int(unknown[0]) + 1} (item {first.item}); "
+            f"{unknown.size} of {len(touches)} touches are so. Calibrate the probe from there too, or leave the map out"
+        )
+
+
+def corrected(pretravel: PretravelMap | None, touch: Touch, contact: Contact) -> Contact:
+    """Return a contact where the tip met the surface, if there is a map and the contact is good; else as it is."""
+    if pretravel is None or contact.flag:
+        return contact
+    x, y, z = (float(value) for value in pretravel.met([contact.position], _normals([touch]))[0])
+    return replace(contact, position=(x, y, z))
