@@ -16,9 +16,9 @@ from errormotion.twin.paths import Path
 
 UNDERSTOOD = (
     "% , (comments), ; comments, N, G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, G31, "
-    "M3 S (/min), M5, POPEN, DPRNT[...] with #5061 to #5063, PCLOS, M2, M30"
+    "M3 S (/min), M5, POPEN, DPRNT[...] with #5061 to #5063 (mm) and #3001 (ms), PCLOS, M2, M30"
 )
-MM, MINUTE = 1000.0, 60.0  # per m; s
+MM, MINUTE, MILLI = 1000.0, 60.0, 1000.0  # per m; s; per s
 
 _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*")
 _COMMENT = re.compile(r"\([^()]*\)")
@@ -35,6 +35,7 @@ _PRINT = re.compile(r"(?:N\d+\s*)?DPRNT\s*\[(.*)\]")
 _PRINTED = re.compile(r"#(\d+)\s*\[\s*\d(\d)\s*\]")
 _PORT = re.compile(r"(?:N\d+\s*)?(POPEN|PCLOS)")
 _SKIPPED = {"5061": 0, "5062": 1, "5063": 2}  # where the last skip move has ended
+_CLOCK = "3001"  # of the control, milliseconds
 
 Array = np.ndarray[Any, Any]
 
@@ -53,6 +54,9 @@ class Peripherals(Protocol):
 
     def print(self, line: str, time: float) -> None:
         """Send a line."""
+
+    def clock(self, time: float) -> float:
+        """Return what the control's clock shows, s."""
 
 
 def interpret(
@@ -166,12 +170,15 @@ class _Control:
             self._advance(values, skipping="G31" in codes)
 
     def print(self, template: str) -> None:
-        """Print a line: places of the last skip move in mm, a star as a space, and everything else as it stands."""
+        """Print a line: places of the last skip move (mm), the clock (ms), a star as a space, the rest as it stands."""
         printer = self._needed("a printer")
 
         def value(found: re.Match[str]) -> str:
+            if found[1] == _CLOCK:
+                return f"{printer.clock(self._times[-1]) * MILLI:.{int(found[2])}f}"
             if found[1] not in _SKIPPED:
-                raise InstrumentError(f"#{found[1]} is not understood; printed are {', #'.join(['', *_SKIPPED])[2:]}")
+                known = ", ".join(f"#{variable}" for variable in (*_SKIPPED, _CLOCK))
+                raise InstrumentError(f"#{found[1]} is not understood; printed are {known}")
             if self._skipped is None:
                 raise InstrumentError("no skip move, G31, has ended yet")
             return f"{self._skipped[_SKIPPED[found[1]]] * MM:.{int(found[2])}f}"

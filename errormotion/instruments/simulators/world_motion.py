@@ -338,6 +338,10 @@ class Errands:
         """Print a line when the program is there."""
         self.printed.append((self._begin + time, line))
 
+    def clock(self, time: float) -> float:
+        """Return the world's time, s."""
+        return self._begin + time
+
     def undo(self) -> None:
         """Take back what an aborted program has ordered."""
         self._world.machine.forget(self.events, self._begin)
