@@ -47,13 +47,13 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
 
     def paint(figure: Canvas) -> None:
         panels = figure.subplots(2, len(levels), sharex=True, sharey=True, squeeze=False)
-        figure.subplots_adjust(left=0.085, right=0.9, top=0.94, bottom=0.1, wspace=0.08, hspace=0.22)
+        figure.subplots_adjust(left=0.085, right=0.87, top=0.94, bottom=0.1, wspace=0.08, hspace=0.22)
         drawn = None
         for row, (name, values) in enumerate(zip(("as set", "best"), um, strict=True)):
             for axes, z in zip(panels[row], levels, strict=True):
                 here = np.abs(position[:, 2] - z) < _SAME
                 x, y = 1e3 * position[here, 0], 1e3 * position[here, 1]
-                drawn = axes.scatter(x, y, c=values[here], vmin=low, vmax=top, cmap="viridis_r", s=60, marker="s",
+                drawn = axes.scatter(x, y, c=values[here], vmin=low, vmax=top, cmap="viridis_r", s=90, marker="s",
                                      linewidths=0)  # fmt: skip
                 lost = ~np.isfinite(values[here])
                 axes.plot(x[lost], y[lost], "x", color=canvas.BLACK, markersize=4)
@@ -67,7 +67,7 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
             axes.set_xlabel("X / mm")
         for axes in panels[:, 0]:
             axes.set_ylabel("Y / mm")
-        bar = figure.add_axes((0.92, 0.1, 0.018, 0.84))
+        bar = figure.add_axes((0.89, 0.1, 0.018, 0.84))
         if drawn is not None:
             figure.colorbar(drawn, cax=bar, label="standard uncertainty / µm")
 

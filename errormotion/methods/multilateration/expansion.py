@@ -64,6 +64,7 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
         )
         return 1.0, {}
     T, p, h = (np.asarray(raw[name].transpose("station", "target").values, dtype=float) for name in _AIR)
+    _refuse_unknown_air(raw, {"air_temperature": T, "air_pressure": p, "relative_humidity": h})
     wavelength = float(raw["vacuum_wavelength"]) if "vacuum_wavelength" in raw else air.wavelength
     factor: Array | float = 1.0
     if "refractive_index" in raw:
@@ -78,6 +79,29 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
     }
     causes = {f"air {name}": abs(float(u)) for name, u in index_uncertainty(derivatives, stated).items()}
     return factor, causes | {"wavelength": air.wavelength_uncertainty}
+
+
+def _refuse_unknown_air(raw: xr.Dataset, air: dict[str, Array]) -> None:
+    """Refuse a state of the air that is not known where it decides: nowhere at all, or where lengths need it."""
+    read = np.isfinite(np.asarray(raw["displacement"].transpose("station", "target").values, dtype=float))
+    if "refractive_index" in raw:
+        index = np.asarray(raw["refractive_index"].transpose("station", "target").values, dtype=float)
+        air = {"refractive_index": index, **air}
+    for name, value in air.items():
+        lost = read & ~np.isfinite(value)
+        if "refractive_index" in raw and lost.any():
+            j, i = (int(k) for k in np.argwhere(lost)[0])
+            first = [
+                str(raw[dim].values[k]) if dim in raw.coords else f"{dim} {k + 1}"
+                for dim, k in (("station", j), ("target", i))
+            ]
+            raise MethodError(
+                f"{name}: expected its value with every reading, since displacements are computed anew from the air; "
+                f"found NaN at {int(lost.sum())} of {int(read.sum())}, first at {first[0]}, {first[1]}. Add them, or "
+                "leave refractive_index out."
+            )
+        if not np.isfinite(value).any():
+            raise MethodError(f"{name}: expected numbers; found NaN only. Leave it out if it is not known.")
 
 
 def scale_strain(raw: xr.Dataset, expansion: Expansion) -> tuple[Array, Array]:

@@ -368,6 +368,87 @@ def test_a_station_that_moved_halfway_is_named(raw, moved):
         Multilateration().identify(half)
 
 
+def test_swapped_readings_are_named_like_swapped_places(raw, errors):
+    swapped = raw.copy(deep=True)
+    swapped["displacement"][[0, 1]] = raw["displacement"].values[[1, 0]]
+    found = Multilateration().identify(swapped)
+    assert "the readings of station 1 are those of station 2" in notes(found)
+    np.testing.assert_allclose(vectors(found), vectors(errors), atol=1e-10)
+
+
+def test_one_reading_in_millimetres_is_left_out_and_a_station_in_millimetres_is_told(raw):
+    one = raw.copy(deep=True)
+    one["displacement"][1, 41] *= 1e3
+    found = Multilateration().identify(one)
+    assert np.argwhere(found["left_out"].values).tolist() == [[1, 41]]
+    whole = raw.copy(deep=True)
+    whole["displacement"][1] *= 1e3
+    with pytest.raises(DatasetError, match=r"is it in mm\?"):
+        Multilateration().identify(whole)
+
+
+def test_a_fringe_among_four_stations_gives_the_target_up_and_spoils_no_other(machine):
+    raw = machine.raw_multilateration(seed=2, noise=20e-9)
+    sound = Multilateration().identify(raw, Settings(parametric=False))
+    raw["displacement"][1, 41] += 633e-9 / 2
+    found = Multilateration().identify(raw, Settings(parametric=False))
+    assert np.flatnonzero(np.isnan(found["EX"].values)).tolist() == [41]
+    assert "targets given up (1)" in notes(found)
+    assert np.nanmax(np.abs(vectors(found) - vectors(sound))) < 100e-9
+
+
+def test_fringes_lost_for_good_look_like_a_station_that_moved(machine):
+    raw = machine.raw_multilateration(seed=2, station=_five(machine), noise=20e-9)
+    raw["displacement"][1, 41:] += 633e-9 / 2
+    with pytest.raises(MethodError, match="station S2 stood elsewhere from target T042 on"):
+        Multilateration().identify(raw, Settings(parametric=False))
+
+
+def _with_air(raw):
+    air = {"air_temperature": (21.0, "degC"), "air_pressure": (1e5, "Pa"), "relative_humidity": (0.4, "1")}
+    air["refractive_index"] = (1.00027, "1")
+    shape = raw["displacement"].shape
+    return raw.assign(
+        {name: (("station", "target"), np.full(shape, value), {"units": unit}) for name, (value, unit) in air.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "message"),
+    [
+        ("displacement", (slice(None), 7), None),
+        ("displacement", (2,), "No reading of station S3: leave it out, or measure from there"),
+        ("displacement", (slice(None),), "found NaN only. Was the beam broken all the time"),
+        ("target_nominal", (7,), "target_nominal: expected numbers; found NaN"),
+        ("station_nominal", (2,), None),
+        ("reading_time", (2,), None),
+        ("reflector", (7,), "reflector: expected its place for every target; found NaN"),
+        ("air_temperature", (1,), "found NaN at 100 of 400, first at S2, T001. Add them, or leave refractive_index"),
+        ("air_pressure", (slice(None), 5), "air_pressure: expected its value with every reading"),
+        ("refractive_index", (0, 3), "refractive_index: expected its value with every reading"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and " " not in value else None,
+)
+def test_rows_of_nan_are_left_out_or_told(raw, name, row, message):
+    broken = (_with_air(raw) if "air" in name or "index" in name else raw).copy(deep=True)
+    broken[name][row] = np.nan
+    if message is not None:
+        with pytest.raises((MethodError, DatasetError), match=message):
+            Multilateration().identify(broken, Settings(parametric=False))
+        return
+    found = Multilateration().identify(broken, Settings(parametric=False))
+    lost = np.isnan(found["EX"].values)
+    assert np.flatnonzero(lost).tolist() == ([7] if name == "displacement" else [])
+    assert np.isfinite(np.sqrt(np.einsum("tii->ti", found["covariance"].values[:, :3, :3]))[~lost]).all()
+
+
+def test_air_that_is_not_known_at_all_is_told(raw):
+    without = _with_air(raw).drop_vars("refractive_index")
+    without["relative_humidity"][:] = np.nan
+    with pytest.raises(MethodError, match="relative_humidity: expected numbers; found NaN only"):
+        Multilateration().identify(without)
+
+
 def test_broken_beams_leave_targets_unknown_and_counted(raw):
     broken = raw.copy(deep=True)
     broken["displacement"][:, 5] = np.nan
