@@ -28,14 +28,15 @@ def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     logging.getLogger("errormotion").setLevel(logging.ERROR)
     found = {kind: honesty(kind, seeds) for kind in ("gantry", "cframe")}
+    deviation = np.sqrt((0.5 + 1.5 / (len(BEGINS) - 1)) / (seeds * DRAWS)) / 2
     yield (
         f"{seeds} virtual machines of each kind, {DRAWS} draws of the noise on each: {BALLS} balls, {TOUCHES} touches "
         f"of each with 0.25 um noise, in {len(BEGINS)} cycles of {CYCLE:g} s, one every {BEGINS[1] / 60:g} minutes; "
-        f"the spindle turns at {SPEED:g} /min from the end of the cold cycle on. Pre-travel with three lobes, form of the "
-        "balls and geometric errors of the machine are in the touches. Errors are those relative to the cold cycle, at "
+        f"the spindle turns at {SPEED:g} /min from the end of the cold cycle on. Pre-travel with three lobes, form of "
+        "the balls and geometric errors of the machine are in the touches. Errors are relative to the cold cycle, at "
         "the middle of the balls; their coverage is the mean over the cycles. The ratio of spread to bound has a "
-        f"standard deviation of about {np.sqrt((0.5 + 1.5 / (len(BEGINS) - 1)) / (seeds * DRAWS)) / 2:.1%} (half of each "
-        "variance is the cold cycle's, one draw for all others)."
+        f"standard deviation of about {deviation:.1%} (half of each variance is "
+        " the cold cycle's, one draw for all others)."
     )
     for kind, (rows, text) in found.items():
         yield from (

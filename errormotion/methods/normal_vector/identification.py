@@ -196,6 +196,9 @@ def _normals_estimate(
     if not known[0]:
         notes.append("The normals are not known: one of their balls is missing in the cold cycle.")
         return None
+    if not normals.planes_apart(centre[0]):
+        notes.append(normals.ONE_PLANE)
+        return None
     twist = np.full((len(centre), 6), np.nan)
     covariance = np.full((len(centre), 6, 6), np.nan)
     shared = np.full((len(centre), 6, 12), np.nan)
@@ -260,6 +263,11 @@ def _tell(cleaned: Cleaned, data: Readings, notes: list[str]) -> None:
             f"Ball {names[move.ball]} moved before cycle {move.cycle} "
             f"({data.seen.cycle_time[move.cycle]:g} s), as the machine sees it by about ({shift}) um; left out from "
             f"there on.{also}"
+        )
+    if len(cleaned.moves) > 1:
+        notes.append(
+            "More than one ball seems to have moved. Do they stand firm, and do the right axes carry the tool "
+            "(tool_axes)? A machine that does not move as one rigid frame looks alike."
         )
     lost = sorted(set(range(len(data.seen.cycle_time))) - set(cleaned.used.tolist()))
     if lost:

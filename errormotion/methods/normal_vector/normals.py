@@ -27,12 +27,26 @@ if TYPE_CHECKING:
 STEP = 1e-6
 """Step of the derivative, m; its square over the balls' distances is far below rounding of a twist."""
 
+PARALLEL = 1e-3
+"""Sine of the angle between the planes below which they count as one."""
+ONE_PLANE = (
+    "The normals are not known: their four balls lie in one plane, so that both normals are one, and a turn about it "
+    "does not show in them."
+)
+"""What to say of such balls."""
+
 
 def plane_normals(centre: Array) -> Array:
     """Return the unit normals of the planes P1 P2 P3 and P1 P2 P4 of centres (..., 4, 3): (..., 2, 3)."""
     first, second, third, fourth = (centre[..., i, :] for i in range(4))
     found = np.stack([np.cross(second - first, other - first) for other in (third, fourth)], axis=-2)
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
+
+
+def planes_apart(centre: Array) -> bool:
+    """Return whether the two planes through centres (4, 3) differ enough to show the turn about their normals."""
+    first, second = plane_normals(centre)
+    return bool(np.linalg.norm(np.cross(first, second)) > PARALLEL)
 
 
 def cayley_rotation(before: Array, after: Array) -> Array:

@@ -106,6 +106,8 @@ def _loss(
         raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
     four = [names.index(name) for name in chosen]
     measured = centres(seen, anchor, reach)
+    if not published.planes_apart(measured.centre[0, four]):
+        return np.full(6, np.inf)
     C = published.covariance(
         measured.cofactor[0, four], measured.cofactor[1:2, four], motion.point, measured.centre[0, four]
     )
@@ -136,7 +138,9 @@ def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, n
             "its way is the lever by which a turn shows."
         )
     notes.append("Not seen: a tilt of the spindle behind the last axis; it displaces all balls alike.")
-    if np.isfinite(loss).all():
+    if np.isinf(loss).any():
+        notes.append(published.ONE_PLANE)
+    elif np.isfinite(loss).all():
         worse = ", ".join(f"{name} {factor:.2f}" for name, factor in zip(DOF, loss, strict=True))
         notes.append(f"The normals of two planes would be less certain by the factors {worse}.")
     return notes

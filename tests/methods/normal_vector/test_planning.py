@@ -45,7 +45,10 @@ def test_plan_of_balls_that_do_not_do_is_refused():
     one_height = tuple(Ball(centre=(x, y, 0.1)) for x, y in ((0, 0), (0.2, 0), (0, 0.2), (0.2, 0.2)))
     with pytest.raises(MethodError, match="different places along Z"):
         METHOD.plan(Settings(balls=one_height, tool_axes="Z"))
-    METHOD.plan(Settings(balls=one_height, tool_axes="XYZ"))
+    planned = METHOD.plan(Settings(balls=one_height, tool_axes="XYZ"))
+    assert np.isfinite(sigma(planned)).all()
+    assert np.isinf(planned["normals_loss"]).all()
+    assert "both normals are one" in planned.attrs["notes"][-1]
     with pytest.raises(MethodError, match="found 0"):
         METHOD.plan(Settings())
     with pytest.raises(MethodError, match="has none"):

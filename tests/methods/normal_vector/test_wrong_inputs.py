@@ -39,7 +39,9 @@ def test_balls_at_one_height_on_a_c_frame_are_enough_for_a_gantry_alone(probed):
     shift[:, 2] = 0.1 - raw["ball_nominal"].values[:, 2]
     raw = moved(raw, shift)
     refused(raw, r"only by balls at different places along Z.*EA, EB cannot be told.*posts")
-    METHOD.identify(raw.assign_attrs(tool_axes="XYZ"), Settings(robust=False))
+    errors = METHOD.identify(raw.assign_attrs(tool_axes="XYZ"), Settings(robust=False))
+    assert np.isfinite(errors["EC"]).all()
+    assert any("both normals are one" in note for note in errors.attrs["notes"])
 
 
 def test_no_axis_carries_the_tool_so_that_only_displacements_show(probed):
