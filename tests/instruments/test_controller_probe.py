@@ -1,0 +1,338 @@
+"""Probing through a controller: contacts, wrong triggers, and that nothing moves on after an error."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from errormotion.datasets.pretravel import PretravelMap, assemble, terms_up_to, unit
+from errormotion.errors import DatasetError, InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.controller.virtual import VirtualController
+from errormotion.instruments.simulators import world
+from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
+from errormotion.instruments.touch_probe.touching import Toucher
+from errormotion.plugins import Contact, Touch
+
+ADDRESS = "sim://cframe/controller?seed=3"
+NORMALS = ((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0), (0, 0, 1))
+
+
+def touches(items: Sequence[int] = (0,), normals: Sequence[Sequence[float]] = NORMALS) -> list[Touch]:
+    """Return touches of balls of the machine, from where a person believes them to be."""
+    machine = world("cframe", 3).machine
+    reach = machine.balls.nominal_radius + machine.probe.nominal_tip_radius
+    return [
+        Touch(*(tuple(machine.balls.nominal[item] + (reach + way) * n) for way in (2e-3, -1e-3)), item)
+        for item in items
+        for n in unit(normals)
+    ]
+
+
+def gathered(probe: ControllerProbe, items: Sequence[int] = (0,)) -> tuple[list[Contact], InstrumentError | None]:
+    """Return the contacts up to an error, and the error."""
+    contacts = []
+    try:
+        for contact in probe.measure(touches(items)):
+            contacts.append(contact)
+    except InstrumentError as error:
+        return contacts, error
+    return contacts, None
+
+
+def test_contacts_are_where_the_twin_says() -> None:
+    with ControllerProbe(ADDRESS) as probe:
+        machine = world("cframe", 3).machine
+        orders = touches((0, 1))
+        contacts = list(probe.measure(orders))
+        for touch, contact in zip(orders, contacts, strict=True):
+            true, _ = machine.contact(touch.start, touch.target, contact.time, noise=False)
+            # two contacts, each with 0.25 um of scatter: five sigma of the mean
+            assert np.linalg.norm(np.subtract(contact.position, true)) < 5 * 0.25e-6 / math.sqrt(2)
+        assert all(contact.flag == "" for contact in contacts)
+        assert all(a.time < b.time for a, b in pairwise(contacts))
+        reading = probe.read()
+    assert reading["contacts"] == 10
+    assert reading["contact"] == list(contacts[-1].position)
+    assert reading["position"][2] == pytest.approx(max(touch.start[2] for touch in orders) + 30e-3)  # it has risen
+
+
+def test_more_repeats_scatter_less() -> None:
+    spread = []
+    for repeats in (1, 8):
+        settings = ControllerProbeSettings(repeats=repeats, agreement=5e-6)
+        with ControllerProbe(ADDRESS, settings) as probe:
+            order = touches(normals=[(0, 0, 1)]) * 12
+            heights = [contact.position[2] for contact in probe.measure(order)]
+        spread.append(np.std(heights))
+    # 0.25 um, and 0.25 um / sqrt 8; a standard deviation of 12 values is known to 20 %
+    assert spread[0] == pytest.approx(0.25e-6, rel=0.6)
+    assert spread[1] < 0.6 * spread[0]
+
+
+def test_the_probe_says_who_and_what_it_is() -> None:
+    settings = ControllerProbeSettings(tip_radius=2e-3, noise=0.3e-6)
+    with ControllerProbe(ADDRESS, settings) as probe:
+        assert probe.identify().model == "cframe touch probe"
+        assert (probe.tip_radius, probe.noise, probe.pretravel) == (2e-3, 0.3e-6, None)
+    assert math.isnan(ControllerProbe(ADDRESS).noise)
+
+
+# ---------------------------------------------------------------------- pre-travel
+
+
+def lobed(lobing: float, directions: Sequence[Sequence[float]] = NORMALS) -> PretravelMap:
+    degrees, orders = terms_up_to(3)
+    coefficients = np.where((degrees == 0), 8e-6, np.where((degrees == 3) & (orders == 3), lobing, 0.0))
+    n = unit(directions)
+    values = {"normal": n, "residual": np.zeros(len(n)), "left_out": np.zeros(len(n)), "reach": 0.1, "noise": 1e-7}
+    return PretravelMap(
+        assemble(
+            {
+                **values,
+                "coefficient": coefficients,
+                "coefficient_covariance": np.eye(len(degrees)) * 1e-14,
+                "degree": degrees,
+                "order": orders,
+                "cross_validated": [1e-7],
+                "highest": [3],
+                "ball_radius": 12.5e-3,
+                "tip_radius": 3e-3,
+            },
+            {"provenance": "{}"},
+        )
+    )
+
+
+def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -> None:
+    made = lobed(1e-6)
+    path = made.save(tmp_path / "probe.nc")
+    results = []
+    for pretravel in ("", str(path)):
+        with ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=pretravel)) as probe:
+            results.append(np.array([contact.position for contact in probe.measure(touches())]))
+    value, _ = made.length(NORMALS)
+    np.testing.assert_allclose(results[1] - results[0], value[:, None] * np.array(NORMALS), atol=1e-15)
+
+
+def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path) -> None:
+    path = lobed(0.0, NORMALS[:4]).save(tmp_path / "probe.nc")
+    with ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=str(path))) as probe:
+        with pytest.raises(InstrumentError, match=r"direction of touch 5 \(item 0\); 1 of 5 touches"):
+            next(probe.measure(touches()))
+        assert world("cframe", 3).time == 0.0
+
+
+def test_a_map_that_is_not_there_is_told_on_opening() -> None:
+    with pytest.raises(DatasetError, match=r"nowhere\.nc.*no such file"):
+        ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel="nowhere.nc")).open()
+
+
+# ---------------------------------------------------------------------- what goes wrong
+
+
+@pytest.mark.parametrize(
+    ("fault", "message", "error"),
+    [
+        ("alarm", "in alarm: servo alarm", InstrumentError),
+        ("estop", "in emergency stop", InstrumentError),
+        ("disconnect", "connection .* is lost", InstrumentError),
+        ("silence", "expected an answer", InstrumentTimeoutError),
+        ("garbage", "Expected an answer in JSON", ProtocolError),
+    ],
+)
+def test_a_fault_in_the_middle_ends_the_cycle_and_keeps_the_contacts(
+    fault: str, message: str, error: type[InstrumentError]
+) -> None:
+    settings = ControllerProbeSettings(controller_settings={"timeout": 0.3})
+    with ControllerProbe(f"{ADDRESS}&fault={fault}&fault_at=30", settings) as probe:
+        here = world("cframe", 3)
+        contacts, raised = gathered(probe)
+        assert type(raised) is error
+        assert re.search(rf"Touch 3 of 5 \(item 0\): .*{message}", str(raised))
+        assert [contact.flag for contact in contacts] == ["", ""]
+        rests = here.position()
+        here.elapse(10.0)
+        assert here.position() == rests  # nothing moves on
+
+
+def test_nothing_begins_in_alarm_or_emergency_stop() -> None:
+    with ControllerProbe(ADDRESS) as probe, VirtualController(ADDRESS) as control:
+        control.press_estop()
+        with pytest.raises(InstrumentError, match="in emergency stop; nothing moves"):
+            next(probe.measure(touches()))
+        control.reset()
+        world("cframe", 3).raise_alarm("oil low")
+        with pytest.raises(InstrumentError, match="in alarm: oil low; nothing moves"):
+            next(probe.measure(touches()))
+
+
+def test_a_probe_that_never_trips_is_found_at_the_second_ball() -> None:
+    with ControllerProbe(f"{ADDRESS}&fault=no_trip") as probe:
+        contacts, raised = gathered(probe, (0, 1, 2))
+        assert [contact.flag for contact in contacts] == ["no trip", *["not made"] * 4, "no trip"]
+        assert all(math.isnan(x) for contact in contacts for x in contact.position)
+        assert "did not trip on items 0 and 1" in str(raised)
+        rests = touches((1,))[0].start
+        assert world("cframe", 3).position() == pytest.approx(rests, abs=1e-12)  # back at the start of its touch
+
+
+def test_a_ball_that_is_not_there_costs_its_own_touches_only() -> None:
+    orders = [Touch(tuple(np.add(t.start, (0, 0, 0.1))), tuple(np.add(t.target, (0, 0, 0.1))), 0) for t in touches()]
+    with ControllerProbe(ADDRESS) as probe:
+        contacts = list(probe.measure([*orders, *touches((1,))]))
+    assert [contact.flag for contact in contacts] == ["no trip", *["not made"] * 4, *[""] * 5]
+
+
+def test_a_stuck_probe_gives_its_flag_and_then_an_error() -> None:
+    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30") as probe:
+        contacts, raised = gathered(probe)
+    assert [contact.flag for contact in contacts] == ["", "", "tripped at the start"]
+    assert "Touch 3 of 5 (item 0): the probe is tripped before it moves, and stays so" in str(raised)
+
+
+def test_a_probe_that_sticks_for_a_moment_is_waited_for() -> None:
+    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30&fault_for=1") as probe:
+        contacts, raised = gathered(probe)
+    assert raised is None
+    assert [contact.flag for contact in contacts] == [""] * 5
+
+
+def test_something_in_the_way_stops_the_machine_there() -> None:
+    """Without clearance the straight way from one side of the ball to the other goes through it."""
+    settings = ControllerProbeSettings(clearance=0.0)
+    with ControllerProbe(ADDRESS, settings) as probe:
+        source = probe.measure([touches()[0], touches()[2]])
+        assert next(source).flag == ""
+        with pytest.raises(InstrumentError, match=r"Touch 2 of 2 \(item 0\): the probe touched something at X"):
+            next(source)
+        here = world("cframe", 3)
+        assert here.machine.probe_gap(here.position(), here.time)[0] < 1e-6
+        assert here.alarms == []
+
+
+def test_a_turning_spindle_is_refused() -> None:
+    with ControllerProbe(ADDRESS) as probe, VirtualController(ADDRESS) as control:
+        control.spindle(3000.0)
+        with pytest.raises(InstrumentError, match="spindle turns at 3000"):
+            next(probe.measure(touches()))
+
+
+def test_a_caller_who_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
+    with ControllerProbe(ADDRESS) as probe:
+        source = probe.measure(touches())
+        next(source)
+        source.close()
+        assert world("cframe", 3).position() == pytest.approx(touches()[0].start, abs=1e-12)
+
+
+def test_controllers_that_cannot_probe_or_do_not_exist_are_refused() -> None:
+    with pytest.raises(InstrumentError, match="'mtconnect' cannot probe"):
+        ControllerProbe("sim://cframe/x", ControllerProbeSettings(controller="mtconnect")).open()
+    with pytest.raises(InstrumentError, match="No instrument plugin 'virtul_controller'"):
+        ControllerProbe(ADDRESS, ControllerProbeSettings(controller="virtul_controller")).open()
+    with pytest.raises(InstrumentError, match="colour"):
+        ControllerProbe(ADDRESS, ControllerProbeSettings(controller_settings={"colour": 1})).open()
+    with pytest.raises(InstrumentError, match="is not open"):
+        ControllerProbe(ADDRESS).read()
+
+
+def test_a_recorded_cycle_plays_back(tmp_path: Path) -> None:
+    path = tmp_path / "probe.rec"
+    orders = touches()
+    with ControllerProbe(ADDRESS, record=path) as probe:
+        contacts = list(probe.measure(orders))
+    with ControllerProbe(f"replay://{path}") as probe:
+        assert list(probe.measure(orders)) == contacts
+
+
+# ---------------------------------------------------------------------- one touch, on a controller that misbehaves
+
+
+class Controller:
+    """A controller whose probe trips where a test says: along X, m."""
+
+    def __init__(self, trips: Callable[[int, float, float], float | None]) -> None:
+        self.trips = trips
+        self.place = np.zeros(3)
+        self.probings = 0
+        self.aside = 0.0
+
+    def state(self) -> dict[str, Any]:
+        return {"time": float(self.probings)}
+
+    def move_to(self, position: Sequence[float], feed: float | None = None) -> None:
+        self.place = np.array(position)
+
+    def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
+        where = self.trips(self.probings, float(self.place[0]), float(target[0]))
+        self.probings += 1
+        self.place = np.array(target if where is None else [where, self.aside, 0.0])
+        return {"tripped": where is not None, "position": self.place.tolist(), "time": float(self.probings)}
+
+    def elapse(self, seconds: float) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+SURFACE = 2e-3
+WAY = Touch((0.0, 0.0, 0.0), (3e-3, 0.0, 0.0))
+
+
+def surface(begin: float, target: float) -> float | None:
+    return SURFACE if begin < SURFACE <= target else None
+
+
+def touch(trips: Callable[[int, float, float], float | None], **settings: float) -> tuple[Contact, Controller]:
+    control = Controller(trips)
+    return Toucher(control, ControllerProbeSettings(**settings).strategy).touch(WAY), control
+
+
+def test_a_false_trip_on_the_way_is_not_taken_for_a_contact() -> None:
+    contact, control = touch(lambda n, begin, target: 1e-3 if n == 0 else surface(begin, target))
+    assert contact.position == pytest.approx((SURFACE, 0.0, 0.0), abs=1e-15)
+    assert control.place.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_false_trip_at_the_start_is_tried_again() -> None:
+    contact, control = touch(lambda n, begin, target: 0.1e-3 if n == 0 else surface(begin, target))
+    assert contact.flag == ""
+    assert control.probings == 4
+    with pytest.raises(InstrumentError, match=r"trips within 0\.2 mm of the start, where nothing is"):
+        touch(lambda n, begin, target: 0.1e-3)
+
+
+def test_false_trips_without_end_are_no_contact() -> None:
+    contact, control = touch(lambda n, begin, target: 1e-3 if n % 2 == 0 else None)
+    assert contact.flag == "no trip"
+    assert math.isnan(contact.position[0])
+    assert control.place.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("difference", "flag"), [(2.9e-6, ""), (3.1e-6, "repeat differs")])
+def test_repeats_have_to_agree(difference: float, flag: str) -> None:
+    places = [SURFACE, SURFACE - difference, SURFACE]
+    contact, _ = touch(lambda n, begin, target: places[n], agreement=3e-6)
+    assert contact.flag == flag
+    assert math.isnan(contact.position[0]) == bool(flag)
+    if not flag:
+        assert contact.position[0] == pytest.approx(SURFACE - difference / 2, abs=1e-15)
+    assert contact.time == 2.5
+
+
+def test_slow_contacts_far_before_the_fast_one_differ() -> None:
+    contact, _ = touch(lambda n, begin, target: SURFACE if n == 0 else SURFACE - 0.2e-3, margin=0.1e-3)
+    assert contact.flag == "repeat differs"
+
+
+def test_a_place_off_the_way_is_an_error() -> None:
+    control = Controller(lambda n, begin, target: surface(begin, target))
+    control.aside = 0.2e-3
+    with pytest.raises(InstrumentError, match=r"2\.000 mm along it and 0\.200 mm aside"):
+        Toucher(control, ControllerProbeSettings().strategy).touch(WAY)
+    with pytest.raises(InstrumentError, match="target is not its start"):
+        Toucher(control, ControllerProbeSettings().strategy).touch(Touch((0, 0, 0), (0, 0, 0)))
