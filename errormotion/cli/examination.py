@@ -13,6 +13,7 @@ from importlib.metadata import requires, version
 from pathlib import Path
 
 from errormotion.cli.guard import log_file
+from errormotion.errors import InstrumentError
 
 LEAST_DISK = 2 * 2**30
 """Bytes; four hours of five packed channels at 20 kHz take about 1 GB."""
@@ -36,6 +37,7 @@ def examine() -> list[Finding]:
         ("plugins", _plugins),
         ("simulators", _loopback),
         ("serial ports", _serial),
+        ("LinuxCNC", _linuxcnc),
         ("disk here", _disk),
         ("temporary folder", _temporary),
         ("log file", _log),
@@ -107,6 +109,20 @@ def _serial() -> str:
     if closed:
         raise _Trouble(f"no permission for {', '.join(closed)}; join the group that owns them (often 'dialout')")
     return ", ".join(ports) or "no USB serial adapter plugged in"
+
+
+def _linuxcnc() -> str:
+    """LinuxCNC is wanted by nobody but those who simulate one, so its absence is no trouble; a broken one is."""
+    from errormotion.instruments.simulators.linuxcnc_process import installed, why_not
+
+    if shutil.which("linuxcnc") is None:
+        return f"none here, and so no sim://.../linuxcnc: {why_not()}"
+    if reason := why_not():
+        raise _Trouble(reason)
+    try:
+        return f"{installed()}, for sim://.../linuxcnc"
+    except InstrumentError as error:
+        raise _Trouble(str(error)) from None
 
 
 def _disk() -> str:

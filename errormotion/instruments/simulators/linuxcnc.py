@@ -176,6 +176,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         self._then: dict[str, Callable[[Message], None]] = {}
         self._asked: dict[Any, str] = {}
         self._closed = False
+        self._trouble = ""  # of a request that the driver knows nothing of
         super().__init__(address, line_end=b"\n", default_name="linuxcnc")
         self._linger = address.number("linger", LINGER)
         try:
@@ -235,10 +236,10 @@ class SimulatedLinuxCNC(SimulatedDevice):
     def _prepared(self, request: Message, state: Message) -> None:
         """Forward an order for which the state had to be known."""
         op, start = request["op"], state["commanded_position"]
-        if op == "elapse" and not state["running"]:
+        if op == "elapse" and not state["ordered"]:
             self._jump(request)
             return
-        if op != "elapse" and not state["running"]:
+        if op != "elapse" and not state["ordered"]:
             self._set_balls(op, start, request)
         self._forward(request)
 
@@ -314,7 +315,11 @@ class SimulatedLinuxCNC(SimulatedDevice):
             then = self._then.pop(number, None)
             if then is not None and state:
                 then(state)
+            elif not message["ok"]:
+                self._trouble = str(message["error"])
             return
+        if self._trouble:
+            message = {"id": number, "ok": False, "error": f"the simulated probe is out of order: {self._trouble}"}
         if not beating:
             self._asked.pop(number, None)
         if isinstance(result, dict):

@@ -23,6 +23,7 @@ from pathlib import Path
 from errormotion.errors import InstrumentError
 
 PACKAGE = "linuxcnc-uspace"
+PYTHON = "/usr/bin/python3"
 LOCK = Path("/tmp/errormotion-linuxcnc.lock")
 THEIR_LOCK = Path("/tmp/linuxcnc.lock")
 NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
@@ -40,6 +41,16 @@ def why_not() -> str:
     if not NML.exists():
         return f"{NML} is missing; install {PACKAGE} again"
     return ""
+
+
+def installed() -> str:
+    """Return the name and version of the LinuxCNC here; InstrumentError where its Python module does not load."""
+    done = subprocess.run(
+        [PYTHON, "-c", "import hal, linuxcnc; print(linuxcnc.version)"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise InstrumentError(f"LinuxCNC's module for {PYTHON} does not load: {done.stderr.strip()[-300:]}")
+    return f"LinuxCNC {done.stdout.strip()}"
 
 
 class LinuxCNCProcess:

@@ -34,6 +34,8 @@ POLL = 0.01  # s between two looks at an order
 BEAT = 0.2  # s
 SETTLE = 5.0  # s that LinuxCNC may take to accept an order
 START = 30.0  # s
+AT_REST = 0.5  # s that a machine without orders may seem to move
+CHANGE = 1.0  # s that a change of state or mode may take
 TEXTS = 0.3  # s that the text of an error may lag behind the error
 REACHED = 1e-6  # m: an order that ends closer than this has reached its goal
 LONGEST = 1 << 24  # bytes of a request
@@ -161,6 +163,8 @@ class Bridge:
     async def _order(self, client: Client, number: Any, work: Callable[[], Any]) -> None:
         self.alarms.clear()
         answer = await self._with_beats(client, number, self._answer(number, work))
+        if not answer["ok"]:
+            self._calm()
         if self.program is None:
             await self._rest()
         self.job = None  # before the answer, which the next order may follow at once
@@ -255,6 +259,7 @@ class Bridge:
             "mode": modes.get(s.task_mode, ""),
             "program": Path(s.file).name if s.file else "",
             "running": bool(self.job or self.program) or not self._idle(),
+            "ordered": bool(self.job or self.program),
             "homed": self._homed(),
             "enabled": s.task_state == self.cnc.STATE_ON,
             "estop": s.task_state == self.cnc.STATE_ESTOP,
@@ -290,14 +295,15 @@ class Bridge:
         """Press the e-stop."""
         self._end_jobs("e-stop", None, abort=False)
         self.command.state(self.cnc.STATE_ESTOP)
+        if not await self._becomes(lambda: self.stat.task_state == self.cnc.STATE_ESTOP):
+            raise RefusedError(f"LinuxCNC does not go into e-stop{await self._texts()}")
 
     async def reset(self) -> None:
         """Release the e-stop and forget the alarms; the machine stays off."""
         self._look()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             self.command.state(self.cnc.STATE_ESTOP_RESET)
-            await self._settle("reset of the e-stop")
-            if self.stat.task_state == self.cnc.STATE_ESTOP:
+            if not await self._becomes(lambda: self.stat.task_state != self.cnc.STATE_ESTOP):
                 raise RefusedError(f"the e-stop stays: is a button pressed?{await self._texts()}")
         self.alarms.clear()
 
@@ -316,13 +322,12 @@ class Bridge:
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it first")
         self.command.state(self.cnc.STATE_ON)
-        await self._settle("switching on")
-        if self.stat.task_state != self.cnc.STATE_ON:
+        if not await self._becomes(lambda: self.stat.task_state == self.cnc.STATE_ON):
             raise RefusedError(f"the machine stays off{await self._texts()}")
 
     async def home(self) -> None:
         """Home all joints; return when they are."""
-        self._demand(homed=False)
+        await self._demand(homed=False)
         await self._mode(self.cnc.MODE_MANUAL)
         self.command.teleop_enable(0)
         await self._settle("joint mode")
@@ -338,7 +343,7 @@ class Bridge:
 
     async def move_to(self, position: Any, feed: Any = None) -> dict[str, Any]:
         """Move in a straight line, at a feed in m/s or in rapid; return when the machine is there."""
-        self._demand()
+        await self._demand()
         goal, words = self._goal(position), _speed(feed)
         began = self.time
         await self._mdi(f"G53 {words} {_axis_words(goal)}")
@@ -347,7 +352,7 @@ class Bridge:
 
     async def probe(self, target: Any, feed: Any) -> dict[str, Any]:
         """Move in a straight line until the probe trips; tell where it did, if it did."""
-        self._demand()
+        await self._demand()
         goal, words = self._goal(target), _speed(feed, "G38.3")
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
@@ -363,7 +368,7 @@ class Bridge:
 
     async def spindle(self, speed: Any) -> None:
         """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it."""
-        self._demand(homed=False)
+        await self._demand(homed=False)
         number = _number(speed, "spindle speed in 1/min")
         await self._mdi("M5" if number == 0 else f"{'M3' if number > 0 else 'M4'} S{abs(number):.3f}")
         if self.stat.state == self.cnc.RCS_ERROR:
@@ -371,7 +376,7 @@ class Bridge:
 
     async def run_program(self, text: Any) -> dict[str, Any]:
         """Run an NC program; return when it has begun."""
-        self._demand()
+        await self._demand()
         if not isinstance(text, str) or not text.strip():
             raise RefusedError("expected the text of a program")
         self._written += 1
@@ -430,9 +435,10 @@ class Bridge:
 
     # ------------------------------------------------------------------ steps of orders
 
-    def _demand(self, *, homed: bool = True) -> None:
+    async def _demand(self, *, homed: bool = True) -> None:
         """Refuse unless the machine is ready for an order."""
         self._look()
+        await self._rest(AT_REST)
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it, and enable it again")
         if self.stat.task_state != self.cnc.STATE_ON:
@@ -464,7 +470,7 @@ class Bridge:
         if self.stat.task_mode != mode:
             self.command.mode(mode)
             await self._settle("change of mode")
-            if self.stat.task_mode != mode:
+            if not await self._becomes(lambda: self.stat.task_mode == mode):
                 raise RefusedError(f"LinuxCNC does not change its mode{await self._texts()}")
 
     async def _mdi(self, line: str) -> None:
@@ -506,16 +512,35 @@ class Bridge:
             if self.stat.echo_serial_number >= self.command.serial and done:
                 return
             if time.monotonic() > until:
+                self.command.abort()  # what is not taken now must not be carried out later
                 raise RefusedError(f"LinuxCNC does not respond: {what} took more than {SETTLE:g} s")
             await asyncio.sleep(POLL / 2)
 
-    async def _rest(self) -> None:
+    def _calm(self) -> None:
+        """After an order that failed, whatever the reason, nothing moves on."""
+        with contextlib.suppress(Exception):
+            self._look()
+            if self._idle():
+                return
+        with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
+            self.command.abort()
+
+    async def _rest(self, limit: float = SETTLE) -> None:
         """Wait until nothing moves, as it soon does."""
-        until = time.monotonic() + SETTLE
+        until = time.monotonic() + limit
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
             while not self._idle() and time.monotonic() < until:
                 await asyncio.sleep(POLL)
                 self._look()
+
+    async def _becomes(self, condition: Callable[[], bool]) -> bool:
+        """Wait until something is so, for a while; whether it is."""
+        until = time.monotonic() + CHANGE
+        while True:
+            self._look()
+            if condition() or time.monotonic() > until:
+                return condition()
+            await asyncio.sleep(POLL)
 
     async def _require_arrival(self, goal: list[float]) -> None:
         place = self._metres(self.stat.position)

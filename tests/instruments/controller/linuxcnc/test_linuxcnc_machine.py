@@ -8,6 +8,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,7 +147,7 @@ def test_a_touch_is_where_the_twin_trips_and_at_most_a_cycle_of_travel_behind(ma
 def test_a_sideways_touch_and_the_setting_that_puts_it_back() -> None:
     feed, delay = 0.005, 0.5 * CYCLE  # the mean of 0 to 1 cycle
     with LinuxCNC(ADDRESS, LinuxCNCSettings(trip_delay=delay)) as machine:
-        x, y, z = above(1, 0.0)
+        x, y, z = above(0, 0.0)
         machine.move_to([x, y, z + 0.05])
         machine.move_to([x - 0.05, y + 0.002, z + 0.05])
         machine.move_to([x - 0.05, y + 0.002, z])
@@ -307,13 +308,17 @@ def test_who_hangs_up_in_a_move_ends_it() -> None:
 
 
 def test_homes_a_machine_that_was_just_switched_on(machine: LinuxCNC) -> None:
+    machine.move_to(HERE)
     machine.estop()
     machine.reset()
     with pytest.raises(InstrumentError, match="off; enable it"):
         machine.home()
     machine.enable()
+    before = machine.state()["position"]
     machine.home()
-    assert machine.state()["homed"]
+    state = machine.state()
+    assert state["homed"]
+    np.testing.assert_allclose(state["position"], before, atol=1e-9)  # as with absolute encoders
 
 
 # ---------------------------------------------------------------------- programs
@@ -405,7 +410,7 @@ def test_a_session_is_replayed(machine: LinuxCNC, tmp_path: Path) -> None:
 @pytest.mark.parametrize("check", INSTRUMENT_CHECKS, ids=lambda check: check.name)
 def test_passes_the_kit(check: object) -> None:
     (subject,) = subjects_of("instruments", "linuxcnc", address=ADDRESS)
-    result = run_check(check, subject)
+    result = run_check(check, replace(subject, settings={"timeout": 1.0}))
     assert result.ok, f"{check.claim}\n{result.message}\n{result.trace}"
 
 
