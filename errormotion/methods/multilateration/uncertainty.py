@@ -190,7 +190,8 @@ def responses(network: Network, changes: Sequence[Array]) -> Responses:
             gradient[c, : 4 * n] += np.concatenate([by_place, -rest.sum(axis=1)[:, None]], axis=1).ravel()
             if further:
                 gradient[c, 4 * n :] += np.einsum("kjt,jt->k", network.extra[:, :, part], rest)
-        shift += np.einsum("tag,cta->cg", G[used], alone[:, used])
+        carries = network.carries[part]  # the datum is fitted to these
+        shift += np.einsum("tag,cta->cg", G[carries], alone[:, carries])
     return Responses(network, changes, gradient, shift @ network.datum.H.T)
 
 

@@ -1,0 +1,68 @@
+"""Results of many targets, put together in blocks: the same as in one piece."""
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.errors import DatasetError
+from errormotion.methods.multilateration import Multilateration, Settings, assembly, uncertainty
+from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.uncertainty import Scatter, responses
+from errormotion.twin import VirtualMachine
+
+
+@pytest.fixture(scope="module")
+def raw():
+    machine = VirtualMachine("cframe", seed=3)
+    q = machine.target_grid((4, 4, 3))
+    return machine.raw_multilateration(np.concatenate([q, q[::4]]), seed=1, missing=0.04, repeatability=1e-6)
+
+
+def test_blocks_make_no_difference(raw, monkeypatch):
+    settings = Settings(scale_uncertainty="1 um/m", expansion={"coefficient": 11.5e-6, "temperature": 23.0})
+    whole = Multilateration().identify(raw, settings)
+    monkeypatch.setattr(uncertainty, "BLOCK", 7)
+    monkeypatch.setattr(assembly, "BLOCK", 11)
+    pieces = Multilateration().identify(raw, settings)
+    datasets.validate(pieces)
+    assert set(pieces.variables) == set(whole.variables)
+    assert pieces.attrs.keys() == whole.attrs.keys()
+    for name, variable in whole.variables.items():
+        assert pieces[name].dims == variable.dims
+        if variable.dtype.kind == "f":
+            # Sums in another order: rounding.
+            size = np.nanmax(np.abs(variable.values), initial=0.0)
+            np.testing.assert_allclose(pieces[name].values, variable.values, rtol=1e-6, atol=1e-9 * size)
+        else:
+            assert (pieces[name].values == variable.values).all()
+
+
+def test_violations_are_found_in_any_block(monkeypatch):
+    monkeypatch.setattr(assembly, "BLOCK", 10)
+    covariance = np.tile(np.eye(6), (25, 1, 1)) * 1e-12
+    covariance[22, 1, 1] = -1e-12
+    with pytest.raises(DatasetError, match="variances of 0 or more"):
+        assembly.build(
+            np.zeros((25, 6)), covariance, np.zeros((1, 25, 6)), {}, {}, component="tool", machine="m",
+            frame="machine", functional_point=[0, 0, 0], reference="r", method="multilateration", method_version="1",
+            provenance={}, sources=["a"], source_groups=["a"],
+        )  # fmt: skip
+
+
+def test_responses_in_blocks_are_those_of_the_network(raw, monkeypatch):
+    monkeypatch.setattr(uncertainty, "BLOCK", 7)
+    d, u = raw["displacement"].values, raw["target_nominal"].values
+    network = solve(d, u, raw["station_nominal"].values, noise=1e-6)
+    rng = np.random.default_rng(1)
+    changes = [1e-6 * rng.normal(size=d.shape), np.nan_to_num(d) * 1e-6]
+    found = responses(network, changes)
+    for k, change in enumerate(changes):
+        moved = np.concatenate([found.of(part)[k] for part in uncertainty.blocks(len(u))])
+        np.testing.assert_allclose(moved, network.response(change)[0], rtol=1e-6, atol=1e-13)
+
+
+def test_shares_of_the_scatter_are_those_of_the_variance():
+    scatter = Scatter(0.3e-6, 0.4e-6)
+    assert scatter.total == pytest.approx(0.5e-6)
+    assert scatter.shares == {"stations": pytest.approx(0.36), "repeatability": pytest.approx(0.64)}
+    assert Scatter(1e-6).shares == {"stations": 1.0}
