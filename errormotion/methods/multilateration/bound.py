@@ -55,6 +55,10 @@ def bound(
     u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
     if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:
         raise MethodError(f"expected places (target, 3) and (station, 3), found {u.shape} and {U.shape}")
+    if not (np.isfinite(u).all() and np.isfinite(U).all()):
+        raise MethodError(
+            "expected places of targets and stations as numbers, found NaN or infinite ones; leave them out"
+        )
     stations = Stations(U, np.zeros(len(U)), np.zeros(0))
     d = readings(u, stations)
     if seen is not None:

@@ -25,6 +25,7 @@ _FITTING = 10.0
 _DAMPED = 1e-8
 _UNDAMPED = 1e-11
 _LONG = 12
+_NEAR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -40,51 +41,53 @@ class State:
 
 def descend(problem: Problem, stations: Stations, target: Array, tolerance: float) -> State:
     """Take steps until a further one would move no target by more than ``tolerance``, from targets (m, 3)."""
-    many = len(target) // SAMPLE
+    Z, many = problem.basis(stations, problem.centre), len(target) // SAMPLE
     if many >= _WORTH and not problem.known:
-        stations = _rehearsed(problem.sample(many), stations)
-    start = np.ascontiguousarray(target.T)
-    place = start.copy()
-    Z = problem.basis(stations, problem.centre)
+        stations = _rehearsed(problem.sample(many), stations, Z)
+    place = np.ascontiguousarray(target.T)
     sums = problem.reduce(stations, place)
     mu, moved, stepped, passes = 0.0, np.inf, np.inf, 1
     while passes < PASSES:
         step, size, gain = _step(Z, sums.H, sums.h, mu)
         trial = stations.stepped(step)
-        # Steps shrink at least as fast as they have: what is left after this one is this one times their ratio.
-        if mu == 0.0 and size * min(1.0, size / stepped) < tolerance and stepped < np.inf:
+        if mu == 0.0 and _ahead(size, stepped) < tolerance:
             return State(trial, place, replace(sums, square=max(sums.square - gain, 0.0)), passes, True)
         found = problem.reduce(trial, place)
         passes += 1
         if not found.square <= sums.square * (1 + 1e-9) + 1e-6:
-            place[:] = start
+            place[:] = target.T
             mu, stepped = max(10 * mu, _DAMPED), np.inf
             if mu > 1e8:
                 break
             continue
         stations, sums, stepped, mu = trial, found, size, (0.1 * mu if mu > _UNDAMPED else 0.0)
-        ahead = found.moved * min(1.0, found.moved / moved) if moved < np.inf else np.inf
-        moved = found.moved
+        ahead, moved = _ahead(found.moved, moved), found.moved
         # What no longer shrinks and is far below any noise is rounding.
         if mu == 0.0 and (ahead < tolerance or (passes > _LONG and moved < 1e-10)):
             return State(stations, place, sums, passes, True)
     return State(stations, place, sums, passes, False)
 
 
-def _rehearsed(problem: Problem, stations: Stations) -> Stations:
+def _ahead(size: float, last: float) -> float:
+    """Return how far it still is after a step: steps shrink at least as fast as they have; unknown after the first."""
+    if last == np.inf:
+        return float(np.inf)
+    return size * min(1.0, size / last) if last > 0.0 else size
+
+
+def _rehearsed(problem: Problem, stations: Stations, Z: Array) -> Stations:
     """Return the stations that a sample of the targets leads to; those given where it leads nowhere."""
     by_target, by_station = problem.counts
     unknown = len(problem.free) - 6
     if by_station.min() < 4 or np.maximum(by_target - 3, 0).sum() < 2 * unknown:
         return stations
     place, now, last = np.ascontiguousarray(problem.nominal.T), stations, np.inf
-    Z = problem.basis(stations, problem.centre)
     for _ in range(_LONG):
         sums = problem.reduce(now, place)
         step, size, _ = _step(Z, sums.H, sums.h, 0.0)
         now = now.stepped(step)
         # The sample is off by its noise: closer than this to its own answer is of no use.
-        if size < 1e-7 or size * min(1.0, size / last) < 1e-8:
+        if size < _NEAR or _ahead(size, last) < 0.1 * _NEAR:
             fits = sums.square < _FITTING**2 * problem.reading.size
             return now if fits else stations
         last = size

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.compiling import Array, compiled
 from errormotion.methods.multilateration.model import Stations
-
-Array = NDArray[np.float64]
 
 LOOSE = 0.05
 """A freedom with a standard uncertainty above this share of the distances is loose: nothing is linear any more."""
@@ -67,6 +66,15 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
         )
 
 
+def refuse_nowhere(*sums: Array) -> None:
+    """Raise MethodError where sums over the targets are no numbers."""
+    if not all(np.isfinite(each).all() for each in sums):
+        raise MethodError(
+            "expected every target away from every station, and noise and distances in metres, found a distance that "
+            "has no direction or a weight beyond all numbers; check places and noise"
+        )
+
+
 def refuse_loose(information: Array, basis: Array, stations: Stations, target: Array, rough: Array) -> Array:
     """Raise MethodError where a freedom is loose; else return eigenvalues of the information, its diagonal made 1.
 
@@ -83,20 +91,13 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     rough : ndarray (n, 3)
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
-    if not (np.isfinite(information).all() and np.isfinite(basis).all() and np.trace(information) > 0):
-        raise MethodError(
-            "expected stations and targets at places of their own, found distances that have no direction or say "
-            f"nothing of the stations. What is special: {_reason(rough, target)}"
-        )
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _NOTHING * np.trace(information)))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    refuse_nowhere(information, basis)
     centre = target.mean(axis=0)
     distance = float(np.sqrt(np.mean(np.sum((stations.place - centre) ** 2, axis=1))))
-    motions = basis @ (scale[:, None] * vectors) / np.sqrt(np.maximum(values, _NOTHING * values[-1]))
-    sigma = np.linalg.norm(motions[: 4 * len(stations.place)], axis=0)
+    values, motions, sigma = _freedoms(information, basis, 4 * len(stations.place))
     loose = (values < DIGITS * values[-1]) | (sigma > LOOSE * distance)
     if not loose.any():
-        return np.asarray(values, dtype=float)
+        return values
     k = int(np.count_nonzero(loose))
     freedoms = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
@@ -105,6 +106,34 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
         f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {freedoms}. "
         f"What is special: {_reason(rough, target)}"
     )
+
+
+@compiled()
+def _freedoms(
+    information: Array, basis: Array, places: int
+) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
+    """Return eigenvalues of the information, its diagonal made 1, what a deviation of each does, and how far it goes.
+
+    Sizes are those of the first so many parameters.
+    """
+    p = len(information)
+    scale, scaled = np.empty(p), np.empty((p, p))
+    for i in range(p):
+        scale[i] = 1.0 / np.sqrt(max(information[i, i], _NOTHING * np.trace(information)))
+    for i in range(p):
+        for j in range(p):
+            scaled[i, j] = information[i, j] * scale[i] * scale[j]
+    values, vectors = np.linalg.eigh(scaled)
+    factor = np.empty((p, p))
+    for j in range(p):
+        size = 1.0 / np.sqrt(max(values[j], _NOTHING * values[-1]))
+        for i in range(p):
+            factor[i, j] = scale[i] * vectors[i, j] * size
+    motions, sigma = basis @ factor, np.zeros(p)
+    for j in range(p):
+        for i in range(places):
+            sigma[j] += motions[i, j] ** 2
+    return values, motions, np.sqrt(sigma)
 
 
 def describe(motion: Array, stations: Stations, centre: Array) -> str:

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from errormotion.methods.multilateration.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
-from errormotion.methods.multilateration.four import reduce_four, settle_four
+from errormotion.methods.multilateration.four import reduce_four, screen_four, settle_four
 
 LANES = 128
 """Equations whose products are added up together."""
@@ -24,7 +24,7 @@ LANES = 128
 _FLAT = 1e-13
 # Steps of a target in one pass, and below which length, m, one is the last.
 _STEPS = 8
-_SHORT = 3e-5
+_SHORT = 1e-3
 # The same where the stations are final.
 _LAST_STEPS = 30
 _SETTLED = 1e-7
@@ -402,3 +402,39 @@ def settle_targets(
     work = _settle_shared if place.shape[1] > MANY else _settle_alone
     sums = work(reading, weight, station, dead_path, extra, value, place, nominal, centre, openness)
     return openness, sums.sum(axis=0)
+
+
+@compiled()
+def _screen_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:  # pragma: no cover - compiled
+    largest = np.zeros(1)
+    count = screen_four(reading, weight, station, dead_path, place, 0, place.shape[1], factor, weak, largest)
+    return count, largest[0]
+
+
+@compiled(parallel=True)
+def _screen_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:  # pragma: no cover - compiled
+    parts, m = chunks(place.shape[1]), place.shape[1]
+    largest, count = np.zeros((parts, 1)), np.zeros(parts, dtype=np.int64)
+    for part in numba.prange(parts):
+        count[part] = screen_four(
+            reading, weight, station, dead_path, place, part * CHUNK, min(m, (part + 1) * CHUNK), factor, weak,
+            largest[part],
+        )  # fmt: skip
+    return count.sum(), largest.max()
+
+
+def screen_targets(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:
+    """Return how many readings of targets (3, m) seen by four stations are checked, and the worst residual.
+
+    Residuals are over what they should be, the stations' factor (16, p) taken into account; readings with a redundancy
+    below ``weak`` are not checked.
+    """
+    work = _screen_shared if place.shape[1] > MANY else _screen_alone
+    count, square = work(reading, weight, station, dead_path, place, factor, weak)
+    return int(count), math.sqrt(square)

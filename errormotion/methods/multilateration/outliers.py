@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
+from errormotion.methods.multilateration.kernels import screen_targets
 from errormotion.methods.multilateration.model import directions
 
 if TYPE_CHECKING:
@@ -77,9 +78,23 @@ def normalised(network: Network) -> Array:
 
 def gate(t: Array) -> float:
     """Return above which normalised residual (n, m) a reading is wrong."""
-    checks = max(int(np.count_nonzero(np.isfinite(t))), 1)
     scale = max(1.0, 1.4826 * float(np.nanmedian(np.abs(t))))
-    return scale * float(norm.isf(0.5 * FALSE_ALARMS / checks))
+    return scale * _least_gate(int(np.count_nonzero(np.isfinite(t))))
+
+
+def _least_gate(checks: int) -> float:
+    return -float(ndtri(0.5 * FALSE_ALARMS / max(checks, 1)))
+
+
+def _clean(network: Network) -> bool:
+    """Whether no reading is above the lowest gate there is, with noise as it was stated."""
+    if len(network.station) != 4 or len(network.extra):
+        return False
+    checks, worst = screen_targets(
+        network.reading, network.weight, network.station, network.dead_path, np.ascontiguousarray(network.target.T),
+        network.factor, _WEAK,
+    )  # fmt: skip
+    return worst <= _least_gate(checks)
 
 
 def gross(reading: Array, weight: Array, nominal: Array, place: Array, dead_path: Array) -> Found:
@@ -109,6 +124,8 @@ def search(network: Network, weight: Array, nominal: Array, before: Found) -> Fo
     before : Found
         What was found before.
     """
+    if _clean(network):
+        return before
     with np.errstate(invalid="ignore"):
         t = np.abs(normalised(network))
     if not np.isfinite(t).any():

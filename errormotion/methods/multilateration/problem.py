@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -77,11 +78,8 @@ class Problem:
 
     def basis(self, stations: Stations, centre: Array) -> Array:
         """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
-        T = stations.motions(centre)[self.free]
-        size = np.sqrt(np.einsum("ij,ij->j", T, T))
-        full = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0]
-        Z = np.zeros((len(self.free), full.shape[1] - 6))
-        Z[self.free] = full[:, 6:]
+        Z = np.zeros((len(self.free), int(np.count_nonzero(self.free)) - 6))
+        _complement(stations.place, centre, self.free, Z)
         return Z
 
     def reduce(self, stations: Stations, place: Array) -> Sums:
@@ -156,6 +154,37 @@ def state_problem(
     if extra_prior is not None:
         precision[4 * n :] = 1.0 / np.broadcast_to(np.asarray(extra_prior, dtype=float), (len(c),)) ** 2
     return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, _mean(u))
+
+
+@compiled()
+def _complement(place: Array, centre: Array, free: NDArray[np.bool_], Z: Array) -> None:  # pragma: no cover - compiled
+    """Fill Z with orthonormal columns, orthogonal to the motions of the places, by Householder's reflections."""
+    where = np.flatnonzero(free)
+    q, T, beta = len(where), np.zeros((len(where), 6)), np.zeros(6)
+    for a in range(q):
+        j, k = where[a] // 4, where[a] % 4
+        if j < len(place) and k < 3:
+            T[a, k] = 1.0
+            h, i = (k + 1) % 3, (k + 2) % 3
+            T[a, 3 + h], T[a, 3 + i] = place[j, i] - centre[i], centre[h] - place[j, h]
+    for c in range(6):
+        size = math.sqrt(np.sum(T[:, c] ** 2))
+        if size > 0.0:
+            T[:, c] /= size
+    for c in range(6):
+        square = np.sum(T[c:, c] ** 2)
+        alpha = -math.copysign(math.sqrt(square), T[c, c])
+        beta[c] = 1.0 / (square - alpha * T[c, c]) if square > 0.0 else 0.0
+        T[c, c] -= alpha
+        for k in range(c + 1, 6):
+            T[c:, k] -= beta[c] * np.sum(T[c:, c] * T[c:, k]) * T[c:, c]
+    for p in range(Z.shape[1]):
+        column = np.zeros(q)
+        column[6 + p] = 1.0
+        for c in range(5, -1, -1):
+            column[c:] -= beta[c] * np.sum(T[c:, c] * column[c:]) * T[c:, c]
+        for a in range(q):
+            Z[where[a], p] = column[a]
 
 
 @compiled()

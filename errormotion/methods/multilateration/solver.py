@@ -22,9 +22,9 @@ from errormotion.methods.multilateration.start import initial_stations
 from errormotion.methods.multilateration.turning import Motion, moments, moved
 from errormotion.methods.multilateration.weakness import carriers
 
-TOLERANCE = 1e-13
+TOLERANCE = 1e-12
 """What a further step may still move a target, m."""
-LOOKED_AT = 256
+LOOKED_AT = 128
 """Targets on whose datum a loose freedom is judged: an even choice of them does for all."""
 _HOPELESS = 100.0
 _ROUNDS = 12
@@ -145,6 +145,7 @@ def conclude(
     if np.count_nonzero(carries) != sums[0]:
         sums = moments(place, problem.nominal, carries, problem.centre)
     some = slice(None, None, max(1, place.shape[1] // LOOKED_AT))
+    determinacy.refuse_nowhere(place[:, some], state.sums.H, sums)
     determinacy.refuse_flat(int(sums[0]), start, place[:, some].T)
     motion = Motion.of(sums, problem.centre)
     stations, target = motion.stations(free), moved(place, motion.a, motion.b, motion.R, openness)
@@ -160,7 +161,8 @@ def conclude(
         carries[sample],
         motion.b,
     )
-    basis = Z - stations.motions(motion.b) @ (np.linalg.pinv(GG, hermitian=True) @ GF @ Z)
+    determinacy.refuse_nowhere(GG, GF)
+    basis = Z - stations.motions(motion.b) @ np.linalg.lstsq(GG, GF @ Z)[0]
     values = determinacy.refuse_loose(information, basis, stations, target[sample], start)
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
     by_target, by_station = problem.counts

@@ -12,6 +12,7 @@ stands; then its rough place decides.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,21 +54,18 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     n = len(reading)
     if station is not None and station.shape != (n, 3):
         raise MethodError(f"expected rough places ({n}, 3) of the stations, found {station.shape}; give one per row")
-    centre = target.mean(axis=0)
-    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
-    axes = np.linalg.svd((target - centre)[_some(len(target), 4 * SOME)], full_matrices=False)
-    spread = axes[1] / axes[1][0]
+    centre, extent, products = _shape(target, _some(len(target), 4 * SOME).step)
+    values, axes = np.linalg.eigh(products)
+    spread = np.sqrt(np.maximum(values[::-1], 0.0) / values[-1])
     if spread[1] < FLAT:
         raise MethodError(
             "expected targets spread in space, found them on one line; distances to these leave every station free "
             "to turn about that line: add targets beside it"
         )
-    normal = axes[2][2] if spread[2] < FLAT else None
+    normal = axes[:, 0] if spread[2] < FLAT else None
     places, dead_paths = np.empty((n, 3)), np.empty(n)
     for j in range(n):
-        known = np.flatnonzero(weight[j] > 0)
-        some = known[_some(len(known), SOME)]
-        d, u = reading[j, some], target[some] - centre
+        d, u = _taken(reading[j], weight[j], target, centre, SOME)
         rough = None if station is None or not np.isfinite(station[j]).all() else station[j] - centre
         if len(d) < 5:
             if rough is None:
@@ -80,7 +78,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
         found, scale = _best(_guesses(d, u, rough, normal), d, u)
         if scale > FITS * extent and normal is None:
             found, scale = min((found, scale), _best(_from_few(d, u), d, u), key=lambda each: each[1])
-        if scale > FITS * extent or _reversed(d, u, found, scale):
+        if scale > FITS * extent or _reversed(d, u, found, normal, scale):
             raise MethodError(_what_is_wrong(j, d, u, extent, scale))
         places[j], dead_paths[j] = found[:3] + centre, found[3]
     return Start(places, dead_paths)
@@ -91,13 +89,124 @@ def _some(count: int, most: int) -> slice:
     return slice(None, None, max(1, -(-count // most)))
 
 
-def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> list[Array]:
-    """Return places and dead paths (U, L) to start from."""
-    guesses = [] if rough is None else [np.append(rough, np.median(np.linalg.norm(u - rough, axis=1) - d))]
+@compiled()
+def _shape(target: Array, every: int) -> tuple[Array, float, Array]:  # pragma: no cover - compiled
+    """Return the mean (3,) of targets (m, 3), their extent, m, and products (3, 3) about the mean of every so many."""
+    centre, low, high, products = np.zeros(3), target[0].copy(), target[0].copy(), np.zeros((3, 3))
+    for k in range(3):
+        total, least, most = 0.0, target[0, k], target[0, k]
+        for i in range(len(target)):
+            total += target[i, k]
+            least, most = min(least, target[i, k]), max(most, target[i, k])
+        centre[k], low[k], high[k] = total / len(target), least, most
+    for i in range(0, len(target), every):
+        for k in range(3):
+            for h in range(3):
+                products[k, h] += (target[i, k] - centre[k]) * (target[i, h] - centre[h])
+    return centre, math.sqrt(np.sum((high - low) ** 2)), products
+
+
+@compiled()
+def _taken(
+    reading: Array, weight: Array, target: Array, centre: Array, most: int
+) -> tuple[Array, Array]:  # pragma: no cover - compiled
+    """Return some of a station's readings (k,) and their targets (k, 3) about ``centre``, evenly spread."""
+    known = 0
+    for i in range(len(weight)):
+        known += weight[i] > 0.0
+    every = max(1, -(-known // most))
+    d, u, ahead, taken = np.empty(known // every + 1), np.empty((known // every + 1, 3)), 0, 0
+    # Where none is missing there is nothing to count.
+    for i in range(0, len(weight), every if known == len(weight) else 1):
+        if not weight[i] > 0.0:
+            continue
+        if ahead == 0 or known == len(weight):
+            d[taken], ahead = reading[i], every
+            for k in range(3):
+                u[taken, k] = target[i, k] - centre[k]
+            taken += 1
+        ahead -= 1
+    return d[:taken], u[:taken]
+
+
+@compiled()
+def _linear(d: Array, u: Array) -> Array:  # pragma: no cover - compiled
+    """Return (U, L) of a station from the equations that are linear in U, L and K, gross readings given little weight.
+
+    Their least squares is by Householder's reflections.
+    """
+    n, x = len(d), np.zeros(5)
+    middle = np.median(d)
+    A, b, size, w, off = np.empty((n, 5)), np.empty(n), np.zeros(5), np.ones(n), np.empty(n)
+    M, c = np.empty((n, 5)), np.empty(n)
+    for i in range(n):
+        e = d[i] - middle
+        A[i, 0], A[i, 1], A[i, 2], A[i, 3], A[i, 4] = 2 * u[i, 0], 2 * u[i, 1], 2 * u[i, 2], 2 * e, 1.0
+        b[i] = u[i, 0] ** 2 + u[i, 1] ** 2 + u[i, 2] ** 2 - e * e
+        for k in range(5):
+            size[k] += A[i, k] ** 2
+    size = np.sqrt(size)
+    for _ in range(_REWEIGHTED):
+        for i in range(n):
+            c[i] = w[i] * b[i]
+            for k in range(5):
+                M[i, k] = w[i] * A[i, k] / size[k]
+        for k in range(5):
+            square = 0.0
+            for i in range(k, n):
+                square += M[i, k] ** 2
+            alpha = -math.copysign(math.sqrt(square), M[k, k])
+            beta = 1.0 / (square - alpha * M[k, k]) if square > 0.0 else 0.0
+            M[k, k] -= alpha
+            for h in range(k + 1, 6):
+                s = 0.0
+                for i in range(k, n):
+                    s += M[i, k] * (M[i, h] if h < 5 else c[i])
+                s *= beta
+                for i in range(k, n):
+                    if h < 5:
+                        M[i, h] -= s * M[i, k]
+                    else:
+                        c[i] -= s * M[i, k]
+            M[k, k] = alpha
+        for k in range(4, -1, -1):
+            s = c[k]
+            for h in range(k + 1, 5):
+                s -= M[k, h] * x[h]
+            x[k] = s / M[k, k] if abs(M[k, k]) > 1e-14 else 0.0
+        for k in range(5):
+            x[k] /= size[k]
+        largest = 0.0
+        for i in range(n):
+            s = -b[i]
+            for k in range(5):
+                s += A[i, k] * x[k]
+            off[i] = abs(s)
+            largest = max(largest, off[i])
+        typical = np.median(off)
+        # Straight least squares will do where nothing is far off.
+        if largest <= 10 * typical:
+            break
+        for i in range(n):
+            w[i] = 1.0 / math.sqrt(1.0 + (off[i] / (3 * typical + 1e-300)) ** 2)
+    found = x[:4].copy()
+    found[3] -= middle
+    return found
+
+
+def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> Iterator[Array]:
+    """Yield places and dead paths (U, L) to start from, the best first."""
+    yield _linear(d, u) if normal is None else _beside_plane(d, u, rough, normal)
+    if rough is not None:
+        yield np.append(rough, np.median(np.linalg.norm(u - rough, axis=1) - d))
+
+
+def _beside_plane(d: Array, u: Array, rough: Array | None, normal: Array) -> Array:
+    """Return (U, L) by the linear equations where targets lie in a plane through their mean."""
     w, middle = np.ones(len(d)), np.median(d)
     d = d - middle
     # In the plane of flat targets the normal part of U has no column.
-    B = np.eye(3) if normal is None else np.linalg.svd(normal[None])[2][1:].T
+    B = np.linalg.svd(normal[None])[2][1:].T
     A = np.column_stack([2 * u @ B, 2 * d, np.ones(len(d))])
     b = np.sum(u**2, axis=1) - d**2
     scale = 1.0 / np.linalg.norm(A, axis=0)
@@ -110,8 +219,6 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> l
             break
         w = 1.0 / np.sqrt(1.0 + (off / (3 * typical + 1e-300)) ** 2)
     U, L, K = B @ x[:-2], x[-2], x[-1]
-    if normal is None:
-        return [np.append(U, L - middle), *guesses]
     height = np.sqrt(max(L**2 - K - U @ U, 0.0))
     if rough is None and height > FLAT * np.linalg.norm(u, axis=1).max():
         raise MethodError(
@@ -120,7 +227,7 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> l
             "targets off that plane"
         )
     side = -1.0 if rough is not None and normal @ rough < 0 else 1.0
-    return [np.append(U + side * height * normal, L - middle), *guesses]
+    return np.append(U + side * height * normal, L - middle)
 
 
 def _from_few(d: Array, u: Array) -> list[Array]:
@@ -129,25 +236,30 @@ def _from_few(d: Array, u: Array) -> list[Array]:
     tried = []
     for _ in range(_DRAWS):
         some = rng.permutation(len(d))[:_FEW]
-        x = _guesses(d[some], u[some], None, None)[0]
+        x = _linear(d[some], u[some])
         tried.append((_scale(d - np.linalg.norm(u - x[:3], axis=1) + x[3]), x))
     return [x for _, x in sorted(tried, key=lambda each: each[0])[:3]]
 
 
-def _reversed(d: Array, u: Array, found: Array, scale: float) -> bool:
+def _reversed(d: Array, u: Array, found: Array, normal: Array | None, scale: float) -> bool:
     """Return whether readings fit much better with their sign reversed: far stations bear either nearly as well."""
-    x = _guesses(d, u, None, None)[0] if np.linalg.matrix_rank(u, tol=FLAT * np.abs(u).max()) == 3 else found
-    return bool(x[3] + np.median(d) < 0 and _sharpened(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
+    x = _linear(d, u) if normal is None else found
+    return bool(x[3] + _middle(d) < 0 and _sharpened(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
 
 
-def _best(guesses: list[Array], d: Array, u: Array) -> tuple[Array, float]:
+def _best(guesses: Iterable[Array], d: Array, u: Array) -> tuple[Array, float]:
     """Return the best (U, L) from some guesses, and the robust scale of its residuals, m."""
-    enough, found = 0.1 * FITS * float(np.linalg.norm(np.ptp(u, axis=0))), []
+    enough, found = 0.1 * FITS * _shape(u, len(u))[1], []
     for guess in guesses:
         found.append(_sharpened(guess, d, u))
         if found[-1][1] < enough:
             break
     return min(found, key=lambda each: each[1])
+
+
+@compiled()
+def _middle(d: Array) -> float:  # pragma: no cover - compiled
+    return float(np.median(d))
 
 
 @compiled()
@@ -182,6 +294,8 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:  # pragma: 
         tried = x + np.linalg.solve(A, g)
         size = _residuals(tried, d, u, r_tried, e_tried)
         if not size <= scale * (1 + 1e-3):
+            if mu == 0.0 and size < 1.25 * scale:
+                break
             mu = max(10 * mu, 1e-3)
             if mu > 1e8:
                 break

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.methods.multilateration.compiling import compiled
 from errormotion.methods.multilateration.model import Stations, directions
 from errormotion.methods.multilateration.start import initial_stations
 
@@ -56,12 +57,17 @@ def carriers(openness: Array) -> NDArray[np.bool_]:
 
     Infinite where a target has no place. The middle one is that of an even choice where there are many.
     """
-    some = openness[:: max(1, len(openness) // _SOME)]
+    return np.asarray(openness <= _limit(len(openness)) ** 2 * _middle(openness, max(1, len(openness) // _SOME)))
+
+
+@compiled()
+def _middle(openness: Array, every: int) -> float:  # pragma: no cover - compiled
+    """Return the median of every so many-th value, of all where none of these is finite; 0 where none is."""
+    some = openness[::every]
     some = some[some < np.inf]
-    if not len(some):
+    if len(some) == 0:
         some = openness[openness < np.inf]
-    limit = _limit(len(openness)) ** 2 * np.median(some) if len(some) else 0.0
-    return np.asarray(openness <= limit)
+    return float(np.median(some)) if len(some) > 0 else 0.0
 
 
 def _limit(targets: int) -> float:

@@ -75,6 +75,58 @@ def test_a_fifth_station_in_the_plane_does_not_help():
         bound(u, station)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_four_stations_at_one_place_are_called_so(noise):
+    u, station = targets(), np.tile(GOOD[:1], (4, 1))
+    with pytest.raises(MethodError, match="stations 1 and 2 stand nearly at one place"):
+        solve(displacements(u, station, noise), u, station, noise=1e-6)
+    with pytest.raises(MethodError, match="stations 1 and 2 stand nearly at one place"):
+        bound(u, station)
+
+
+@pytest.mark.parametrize("height", [1e-15, 1e-12, 1e-9, 1e-6, 1e-4])
+def test_stations_nearly_in_one_plane_are_refused_in_words(height):
+    # Right-angled and doubled places, too: the information is singular to all its digits, or a little better.
+    u, station = targets(), np.add(FLAT, np.outer([0, 0, 0, height], [0, 0, 1]))
+    with pytest.raises(MethodError, match=r"2 freedoms loose .* the stations stand in one plane"):
+        bound(u, station)
+
+
+@pytest.mark.parametrize("spread", [[1, 0, 0], [1, 1e-9, 1e-9], [0, 0, 0], [1e-12, 1e-12, 1e-12]])
+def test_a_bound_of_targets_on_a_line_or_at_a_point_is_refused_in_words(spread):
+    with pytest.raises(MethodError, match="freedoms loose"):
+        bound(targets() * spread, GOOD)
+
+
+def test_a_target_at_a_station_and_noise_beyond_numbers_are_refused_in_words():
+    u = targets()
+    with pytest.raises(MethodError, match="every target away from every station"):
+        bound(np.vstack([u, GOOD[:1]]), GOOD)
+    with pytest.raises(MethodError, match="a weight beyond all numbers"), np.errstate(over="ignore"):
+        bound(u, GOOD, noise=1e-200)
+    with pytest.raises(MethodError, match="found NaN or infinite ones"):
+        bound(u, np.where(GOOD[0, 0] == GOOD, np.nan, GOOD))
+
+
+def test_stations_of_any_size_and_place_give_a_network_or_a_refusal_in_words():
+    rng, refused = np.random.default_rng(0), 0
+    for k in range(60):
+        station = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-8, 3, (4, 1))
+        if k % 3 == 0:
+            station[1] = station[0] * (1 + 10.0 ** rng.uniform(-16, -3))
+        if k % 3 == 1:
+            station[:, 2] = 10.0 ** rng.uniform(-18, -3) * rng.normal(size=4)
+        u = rng.normal(size=(rng.integers(10, 30), 3)) * 10.0 ** rng.uniform(-6, 1)
+        d = displacements(u, station)
+        for work in (lambda u=u, station=station: bound(u, station), lambda u=u, d=d, s=station: solve(d, u, s)):
+            try:
+                assert np.isfinite(work().station).all()
+            except MethodError:
+                refused += 1
+    # Most of these are hopeless.
+    assert refused > 60
+
+
 def test_stations_on_one_line_are_called_so():
     u = targets()
     with pytest.raises(MethodError, match="the stations stand on one line"):
@@ -122,6 +174,27 @@ def test_a_target_in_the_stations_plane_is_noted():
     assert "hardly determined" in note
     assert "one plane with the stations" in note
     assert network.target_covariance[7, 2, 2] > 20**2 * network.target_covariance[8, 2, 2]
+
+
+@pytest.mark.parametrize("n", [4, 5])
+def test_a_target_in_the_stations_plane_does_not_move_the_others(n):
+    station = np.array([[-0.3, -0.3, 0.0], [0.36, -0.33, 0.0], [0.0, 0.37, 0.0], [0.02, 0.01, 0.4], [0.3, 0.3, 0.3]])
+    u = targets()
+    u[7] = [0.01, 0.02, 1e-7]
+    d = displacements(u, station[:n], 1e-6)
+    d[3:, 7] = np.nan
+    network = solve(d, u, noise=1e-6)
+    d[:, 7] = np.nan
+    without = solve(d, u, noise=1e-6)
+    others = np.arange(60) != 7
+    # It is off by nearly a millimetre, and the mean of sixty targets by a sixtieth of that if it had a say.
+    assert abs(network.target[7, 2] - u[7, 2]) > 0.5e-3
+    assert np.abs(network.target[others] - without.target[others]).max() < 1e-11
+    assert np.abs(network.station - without.station).max() < 1e-11
+    assert np.allclose(network.target_covariance[others], without.target_covariance[others], rtol=1e-9, atol=1e-18)
+    assert not network.carries[7]
+    assert network.carries[others].all()
+    assert any("no say in where the whole lies (1 of them): 8" in note for note in network.notes)
 
 
 def test_swapped_stations_are_noted_and_do_no_harm():

@@ -106,6 +106,23 @@ def test_noise_stated_too_small_is_no_reason_to_leave_readings_out():
     assert network.sigma0 == pytest.approx(5.0, abs=4 * 5 / np.sqrt(2 * network.freedom))
 
 
+@pytest.mark.parametrize("n", [4, 6])
+def test_a_residual_is_reading_minus_model_left_out_or_not(n):
+    u, d = readings(n)
+    d[1, 7] += 100e-6
+    d[0, 12] = np.nan
+    d[1:, 20] = np.nan
+    network = solve(d, u, noise=1e-6)
+    assert network.left_out == ((1, 7),)
+    distance = np.linalg.norm(network.target - network.station[:, None], axis=-1)
+    model = distance - network.dead_path[:, None]
+    assert np.array_equal(np.isfinite(network.residual), np.isfinite(d) & np.isfinite(network.target[:, 0]))
+    assert np.nanmax(np.abs(network.residual - (d - model))) < 1e-15
+    # What was left out shows its whole error: its target lies where the others put it.
+    assert network.residual[1, 7] == pytest.approx(100e-6, abs=40e-6)
+    assert network.weight[1, 7] == 0
+
+
 def test_without_robust_all_count():
     u, d = readings(4)
     d[1, 7] += 100e-6
