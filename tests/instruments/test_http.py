@@ -94,6 +94,7 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
         ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an answer of HTTP"),
         ([answer(b"1")[:-5]], InstrumentTimeoutError, "silent"),
         ([], InstrumentTimeoutError, "silent"),
+        ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
         ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
         ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n"], ProtocolError, "cut off"),
     ],

@@ -1,5 +1,6 @@
 """Pre-travel maps: what a ball tells of a probe, how well, and what it refuses."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from errormotion.datasets import save
-from errormotion.datasets.pretravel import SCHEMA, PretravelMap, harmonics, terms_up_to, unit, violations
+from errormotion.datasets.pretravel import ROWS, SCHEMA, PretravelMap, harmonics, terms_up_to, unit, violations
 from errormotion.errors import DatasetError, FitError
 from errormotion.methods.normal_vector.pretravel import PretravelSettings, calibrating_touches, fit_pretravel
 from errormotion.twin import VirtualMachine
@@ -181,3 +182,12 @@ def test_a_broken_map_is_refused(name: str, factor: float, message: str) -> None
         PretravelMap(made.assign({name: made[name] * factor}))
     assert violations(made) == []
     assert violations(made.drop_vars(name))
+
+
+def test_the_reference_page_says_what_is_checked() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "schemas.md").read_text()
+    section = page.partition("\n## Pre-travel map")[2].partition("\n## ")[0]
+    told = [line for line in section.splitlines() if line.startswith("| `")]
+    for row, line in zip(ROWS, told, strict=True):
+        limits = "" if math.isinf(row.low) else f"{row.low:g} to {row.high:g}"
+        assert line == f"| `{row.name}` | {', '.join(row.dims)} | {row.unit} | yes | {limits} | {row.meaning} |"

@@ -121,6 +121,10 @@ class HttpTransport(Transport):
             body = response.read(limit + 1)
             if len(body) > limit:
                 raise ProtocolError(f"{self.url}: the answer to '{path}' is larger than {limit} bytes")
+            if response.length:
+                raise ProtocolError(
+                    f"{self.url}: the answer to '{path}' is cut off, {response.length} bytes before its end"
+                )
         except http.client.HTTPException as error:
             self._hang_up()
             raise ProtocolError(f"{self.url}: the answer to '{path}' is cut off: {error!r}") from None
