@@ -146,6 +146,31 @@ class Contact:
     flag: str = ""
 
 
+@dataclass(frozen=True)
+class Step:
+    """One step of what a machine is to do: for its limits, and for a dry run.
+
+    Attributes
+    ----------
+    what : str
+        ``move``, ``touch`` or ``rest``.
+    place : (3,) tuple of float or None
+        Where it ends, X Y Z, m; None where the machine stays.
+    feed : float
+        m/s; NaN at rest.
+    seconds : float
+        How long it takes.
+    spindle_speed : float
+        1/min.
+    """
+
+    what: str
+    place: tuple[float, float, float] | None
+    feed: float
+    seconds: float
+    spindle_speed: float = 0.0
+
+
 @runtime_checkable
 class Instrument(Protocol):
     """A driver: one plain class. Nothing touches the wire before ``__enter__`` (or ``open``)."""
@@ -198,8 +223,10 @@ class Method(Protocol):
     """What is measured and how it becomes an error dataset.
 
     A method may also have ``follow(settings)``: it returns a function that takes each acquired dataset and returns a
-    line of text for the person at the machine. And it may have ``programs(settings)``: the NC programs with which a
-    machine makes the test, the name of each file to its text.
+    line of text for the person at the machine. It may have ``programs(settings)``: the NC programs with which a
+    machine makes the test, the name of each file to its text. And ``motions(settings, instruments)``: every `Step` that
+    the machine will make, with the settings of the bench's instruments by kind; they are held against the limits of
+    the bench before anything moves.
     """
 
     info: ClassVar[MethodInfo]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -54,9 +54,15 @@ class NormalVector:
 
     def programs(self, settings: BallSettings) -> Mapping[str, str]:
         """Return the NC programs with which a machine makes the test by itself, the name of each file to its text."""
-        from errormotion.methods.normal_vector import acquisition
+        from errormotion.methods.normal_vector.programs import programs
 
-        return acquisition.programs(settings)
+        return programs(settings)
+
+    def motions(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+        """Return every step that the machine will make, for its limits and for a dry run."""
+        from errormotion.methods.normal_vector.cycle import campaign_steps
+
+        return campaign_steps(settings, instruments)
 
     def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``time``."""
