@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.folders import folders_beside
+from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
@@ -236,6 +237,11 @@ class InclinationCalibration:
         used = self._values("setting_left_out") == 0
         return np.asarray(tilt_vector(self._values("inclination"), self._values("rotation"))[used])
 
+    def told(self) -> dict[str, str]:
+        """Return name and hash, for the provenance of what it was used for; the hash is not of the name."""
+        attrs = {name: value for name, value in self.dataset.attrs.items() if name != "name"}
+        return {"name": self.name, "hash": hash_dataset(self.dataset.drop_attrs(deep=False).assign_attrs(attrs))}
+
     @cached_property
     def support(self) -> TiltSupport:
         """Where the calibrated settings speak for a tilt."""
@@ -290,8 +296,8 @@ class InclinationCalibration:
         many = f" ({len(wrong)} of {len(points)} tilts lie so)" if len(points) > 1 else ""
         raise MethodError(
             f"Calibration '{self.name}': {tilt_text(first)} lies {where}{many}; nearest calibrated: {near}. "
-            "Calibrate there, measure within the calibrated settings, or allow extrapolation (extrapolate=True): the "
-            "uncertainty then grows with the distance."
+            "Calibrate there, measure within the calibrated settings, or allow extrapolation (extrapolate = true in "
+            "the test's settings): the uncertainty then grows with the distance."
         )
 
     def compensate(
@@ -340,7 +346,8 @@ class InclinationCalibration:
             raise MethodError(
                 f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid range lies beyond the calibrated "
                 f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Is the mid range of "
-                "the sensor right? Else measure within that range, or allow extrapolation (extrapolate=True)."
+                "the sensor right? Else measure within that range, or allow extrapolation (extrapolate = true in the "
+                "test's settings)."
             )
 
 

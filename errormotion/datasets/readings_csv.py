@@ -221,7 +221,7 @@ def _plausible(
         first = outside[0]
         complaints.add(
             int(lines[first]),
-            f"{place}: makes a {row.name} of {inside[first]:.6g} {row.unit}; expected {row.low:g}..{row.high:g} "
+            f"{place}: makes {row.name} = {inside[first]:.6g} {row.unit}; expected {row.low:g}..{row.high:g} "
             f"{row.unit}. Is the unit '{unit}' right? ({outside.size} such values)",
         )
     return not outside.size

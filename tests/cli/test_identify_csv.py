@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import xarray as xr
 
 from errormotion import datasets
@@ -68,8 +69,19 @@ def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) ->
     assert "is a folder of runs; say which method's with --method" in told
 
 
-def test_check_bar_alone_tells_no_beam(run: Run) -> None:
-    published = Path(__file__).parents[2] / "examples" / "check_bar" / "scheme1.csv"
+@pytest.mark.parametrize(
+    ("name", "radius", "left_out"),
+    [("scheme1", 25.0009, 0), ("scheme2_0deg_compensated", 24.9608, 1), ("scheme3", 25.0018, 0)],
+)
+def test_check_bar_alone_is_fitted_and_tells_no_beam(run: Run, name: str, radius: float, left_out: int) -> None:
+    published = Path(__file__).parents[2] / "examples" / "check_bar" / f"{name}.csv"
     run("validate", published)
-    told = run("identify", published, "--out", "errors.nc", code=1).stderr
-    assert "hold a check bar alone" in told
+    told = run("identify", published, "--out", "errors.nc").stdout
+    assert f"Check bar: radius {radius:.4f} mm (U = " in told
+    assert "the beam is taken as stated, without uncertainty, and its errors are unknown" in told
+    errors = datasets.load("errors.nc")
+    assert datasets.violations(errors) == []
+    assert np.isnan(errors.em.twist()).all()
+    assert int(errors["bar_left_out"].sum()) == left_out
+    assert "good" in run("validate", "errors.nc").stdout
+    assert "Check bar" in Path(run("report", "errors.nc").stdout.strip()).read_text()

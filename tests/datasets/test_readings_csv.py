@@ -150,7 +150,7 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
         (
             "x [mm]",
             "x [m]",
-            "line 7: column 'x [m]': makes a stage of 100 m; expected -20..20 m. Is the unit 'm' right?",
+            "line 7: column 'x [m]': makes stage = 100 m; expected -20..20 m. Is the unit 'm' right?",
         ),
         ("-1.508", "-1,508", "line 8: expected 5 fields; found 6 (the decimal sign is a point)"),
         ("-1.508", "broken", "line 8: column 'reading [mm]': expected a number; found 'broken'"),
@@ -167,7 +167,7 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
             "line 5: distance_noise: expected one number and a unit such as m; found '0,1 um' (the dec",
         ),
         ("0.1 um", "0.1 s", "line 5: distance_noise: expected a unit of the kind of m; found 's'"),
-        ("0.1 um", "0.1 m", "line 5: distance_noise: makes a distance_noise of 0.1 m; expected 0..0.001 m"),
+        ("0.1 um", "0.1 m", "line 5: distance_noise: makes distance_noise = 0.1 m; expected 0..0.001 m"),
         ("0.1 um", "", "line 5: distance_noise: expected one number"),
         ("0.342 0 0.940", "0.342 0", "line 4: nominal_direction: expected 3 numbers; found '0.342 0'"),
         ("0.342 0 0.940", "0,342 0 0,940", "(the decimal sign is a point; blanks separate numbers)"),

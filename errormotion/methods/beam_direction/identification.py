@@ -13,6 +13,7 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibration import InclinationCalibration, tilt_text
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
+from errormotion.methods.beam_direction.bar_result import bar_extras
 from errormotion.methods.beam_direction.compensation import Planes, Sensor, Settled, settle, uncompensated
 from errormotion.methods.beam_direction.origin import Origin, locate
 from errormotion.methods.beam_direction.propagation import Propagated, closure_chi2, propagate
@@ -56,7 +57,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     )
     middle = float(raw["mid_range"]) if "mid_range" in raw else 0.0
     plain = uncompensated(planes, data.nominal_direction, settings.layout.scale_uncertainty, middle)
-    sensor = _sensor(raw, settings)
+    sensor = sensor_of(raw, settings)
     if sensor is None:
         settled = plain
         notes.append("No inclination compensation: the readings are taken as they are.")
@@ -81,7 +82,12 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
     steps += [f"inclination compensation, {settled.iterations} iterations"] if sensor is not None else []
     extras = _extras(data, fits, settled, plain, found, total, corrected, factor, p, settings.beam)
-    extras |= _bar(raw, data, settings, sensor, p, u, total, notes)
+    if "bar_distance" in raw:
+        if not np.isfinite(p).all():
+            notes.append("Check bar: its centre counts from the nominal zero point, since the actual one is not known.")
+        place = p if np.isfinite(p).all() else np.nan_to_num(p0)
+        calibration = sensor.calibration if sensor is not None else None
+        extras |= bar_extras(raw, place, u, np.nan_to_num(total), calibration, data.moves, settings, notes)
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -96,7 +102,8 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         reference="nominal beam; its errors are stated at its nominal zero point (nominal_origin)",
         method=method,
         method_version=version,
-        provenance=provenance.make(settings, raw, None, steps=steps),
+        provenance=provenance.make(settings, raw, None, steps=steps)
+        | ({"calibration": sensor.calibration.told()} if sensor is not None else {}),
         influence=by_source[:, None, :] if settled.sources else None,
         sources=settled.sources or None,
         source_groups=settled.groups or None,
@@ -105,7 +112,16 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     return ds.assign_attrs(notes=notes or [""])
 
 
-def _sensor(raw: xr.Dataset, settings: Settings) -> Sensor | None:
+def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
+    """Return what the compensation has to know; None where nothing is to be compensated.
+
+    Raises
+    ------
+    MethodError
+        The data do not say how the sensor is turned.
+    DatasetError
+        No such calibration.
+    """
     if settings.compensation is None:
         return None
     calibration = InclinationCalibration.find(settings.compensation)
@@ -306,50 +322,4 @@ def _extras(
         "uncompensated_direction": array(plain.direction.direction[None], vector, "1"),
         "iterations": array([settled.iterations], ("beam",), ""),
         "noise": array([data.noise * factor], ("beam",), "m", "as the residuals show it where they show more"),
-    }
-
-
-def _bar(
-    raw: xr.Dataset,
-    data: Readings,
-    settings: Settings,
-    sensor: Sensor | None,
-    origin: Array,
-    direction: Array,
-    covariance: Array,
-    notes: list[str],
-) -> dict[str, xr.DataArray]:
-    """Return the check bar as the beam sees it, where one was measured."""
-    if "bar_distance" not in raw:
-        return {}
-    from errormotion.methods.beam_direction.check_bar import measure_bar
-
-    known = np.isfinite(origin).all()
-    place = origin if known else np.nan_to_num(data.nominal_origin)
-    if not known:
-        notes.append("Check bar: its centre counts from the nominal zero point, since the actual one is not known.")
-    points, bar = measure_bar(
-        raw,
-        place,
-        direction,
-        np.nan_to_num(covariance),
-        calibration=sensor.calibration if sensor is not None else None,
-        moves=data.moves,
-        robust=settings.robust,
-        extrapolate=settings.extrapolate,
-    )
-    notes.extend(f"Check bar: {note}" for note in (*points.notes, *bar.notes))
-    left_out = np.zeros(len(bar.residuals), np.int8)
-    left_out[list(bar.left_out)] = 1
-    coords = {"direction": list("xyz")}
-    m = {"units": "m"}
-    return {
-        "bar_point": xr.DataArray(points.points, coords, ("bar_reading", "direction"), attrs=m),
-        "bar_residual": xr.DataArray(bar.residuals, dims="bar_reading", attrs=m),
-        "bar_left_out": xr.DataArray(left_out, dims="bar_reading"),
-        "bar_centre": xr.DataArray(bar.centre, coords, "direction", attrs=m),
-        "bar_centre_u": xr.DataArray(np.sqrt(np.diag(bar.centre_covariance)), coords, "direction", attrs=m),
-        "bar_axis": xr.DataArray(bar.axis, coords, "direction", attrs={"units": "1"}),
-        "bar_radius_fitted": xr.DataArray(bar.free_radius, attrs=m),
-        "bar_radius_u": xr.DataArray(bar.free_radius_u, attrs=m),
     }

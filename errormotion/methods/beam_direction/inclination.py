@@ -217,7 +217,7 @@ def _notes(
         for a, b in zip(np.degrees(readings.inclination), np.degrees(readings.rotation), strict=True)
     ]
     if readings.missing:
-        yield f"{readings.missing} groups without a reading were not used."
+        yield f"{_of(readings.missing, 'group')} without a reading {_were(readings.missing)} not used."
     wild = np.flatnonzero(lines.left_out)
     if wild.size:
         named = [
@@ -225,11 +225,15 @@ def _notes(
             f"({1e6 * lines.residual[k]:+.1f} um)"
             for k in wild[np.argsort(-np.abs(lines.residual[wild]), kind="stable")][:_NAMED]
         ]
-        yield f"{wild.size} of {lines.left_out.size} readings were left out: {_list(named, wild.size)}."
+        yield f"{wild.size} of {lines.left_out.size} readings {_were(wild.size)} left out: {_list(named, wild.size)}."
     wrong = np.flatnonzero(~kept)
     if wrong.size:
         named = [settings[k] for k in wrong[:_NAMED]]
-        yield f"{wrong.size} settings contradict all the others and were left out: {_list(named, wrong.size)}."
+        contradict = "contradicts" if wrong.size == 1 else "contradict"
+        yield (
+            f"{_of(wrong.size, 'setting')} {contradict} all the others and {_were(wrong.size)} left out: "
+            f"{_list(named, wrong.size)}."
+        )
     if np.isfinite(readings.noise) and not 0.5 <= lines.noise / max(readings.noise, 1e-12) <= 2.0:
         yield (
             f"The readings scatter by {1e6 * lines.noise:.3g} um about their lines; stated were "
@@ -262,6 +266,14 @@ def _holes(calibration: InclinationCalibration) -> Iterator[str]:
             f"A hole of {np.degrees(widest):.0f} deg at every rotation spoils what is told beside it too: the "
             "intervals hold less often than they say. Measure settings in it."
         )
+
+
+def _of(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _were(count: int) -> str:
+    return "was" if count == 1 else "were"
 
 
 def _list(named: list[str], count: int) -> str:

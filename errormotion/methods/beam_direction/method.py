@@ -58,6 +58,8 @@ class BeamDirection:
     def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``beam``.
 
+        A check bar alone is measured with the beam as the data state it: its errors are then NaN.
+
         Parameters
         ----------
         raw : Dataset
@@ -79,10 +81,10 @@ class BeamDirection:
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         if "distance" not in checked:
-            raise MethodError(
-                "The raw data hold a check bar alone: it proves a beam that is known and finds none. "
-                "Measure planes as well, or fit the bar with errormotion.methods.beam_direction.check_bar.measure_bar."
-            )
+            from errormotion.methods.beam_direction.bar_result import identify_bar
+            from errormotion.methods.beam_direction.identification import sensor_of
+
+            return identify_bar(checked, sensor_of(checked, settings), settings, self.info.id, self.info.version)
         return identify_beam(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:

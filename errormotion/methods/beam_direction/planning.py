@@ -91,7 +91,8 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
         reference="planned, not measured",
         method=method.info.id,
         method_version=method.info.version,
-        provenance=provenance.make(settings, None, None, steps=["plan"]),
+        provenance=provenance.make(settings, None, None, steps=["plan"])
+        | ({"calibration": left.calibration.told()} if left is not None else {}),
         influence=influence,
         sources=["scale", "triangulation plane", *(f"inclination calibration {i + 1}" for i in range(number))],
         source_groups=["sensor", "triangulation plane", *["inclination calibration"] * number],
@@ -259,9 +260,12 @@ def _worse(covariance: Array, limits: Limits) -> float:
 def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limits, left: Left | None) -> list[str]:
     paper, own, pair, best = (format_quantity(float(angle), "arcsec", 3) for angle in angles)
     total = limits.readings
+    tilts = [design.tilts(setup.normals, limits.beam) for setup in setups[:2]]
+    refused = [np.flatnonzero(~left.speaks(t)) + 1 if left is not None else np.zeros(0, int) for t in tilts]
     notes = [
         f"With {total} readings in all the worse of the beam's two angles has a standard uncertainty of {own} as set, "
-        f"and of {paper} with the published two planes at 20 deg, turned by 90 deg, strokes of one length.",
+        f"and of {paper} with the published two planes at 20 deg, turned by 90 deg, strokes of one length"
+        + (", which this calibration does not speak for." if refused[0].size else "."),
         f"The best two planes: {pair}, {angles[0] / angles[2]:.3g} times better than the published ones.",
     ]
     if setups[3] is not setups[2]:
@@ -275,14 +279,12 @@ def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limi
             )
             + "; the rest is the sensor's scale and what is left of its inclination error."
         )
-    if left is not None:
-        for name, setup in (("the published set-up", setups[0]), ("the set-up as set", setups[1])):
-            dumb = np.flatnonzero(~left.speaks(design.tilts(setup.normals, limits.beam))) + 1
-            if dumb.size:
-                notes.append(
-                    f"The calibration does not speak for plane {' and '.join(map(str, dumb))} of {name}: the "
-                    "figures take what it says there all the same, and its uncertainty; a measurement would be refused."
-                )
+    for name, dumb in zip(("the published set-up", "the set-up as set"), refused, strict=True):
+        if dumb.size:
+            notes.append(
+                f"The calibration does not speak for plane {' and '.join(map(str, dumb))} of {name}: the "
+                "figures take what it says there all the same, and its uncertainty; a measurement would be refused."
+            )
     for i, (face, strokes, counts) in enumerate(
         zip(setups[3].planes, setups[3].strokes, setups[3].readings, strict=True)
     ):

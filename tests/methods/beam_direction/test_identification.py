@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from errormotion.datasets import load, save, validate
+from errormotion.datasets import load, provenance, save, validate
+from errormotion.datasets.calibration import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt
 from errormotion.methods.beam_direction import BeamDirection, Settings
@@ -116,6 +117,19 @@ def test_planes_stand_as_the_gauge_was_set(machine, calibration):
     np.testing.assert_allclose(np.tan(errors["inclination"]), np.hypot(*q.T), atol=2e-4)
     turned = np.angle(np.exp(1j * (errors["rotation"].values - np.arctan2(q[:, 1], q[:, 0]))))
     np.testing.assert_allclose(turned, 0, atol=1e-3)
+
+
+def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=3)
+    known = InclinationCalibration.load(calibration)
+    told = provenance.of(identify(raw, compensation=calibration))["calibration"]
+    assert told == known.told()
+    assert told["name"] == "sensor"
+    changed = InclinationCalibration(known.dataset.assign(mid_range=1e-3))
+    renamed = InclinationCalibration(known.dataset.assign_attrs(name="other"))
+    assert changed.told()["hash"] != told["hash"]
+    assert renamed.told()["hash"] == told["hash"]
+    assert "calibration" not in provenance.of(identify(raw))
 
 
 def test_calibration_is_part_of_the_uncertainty(machine, calibration):

@@ -127,7 +127,8 @@ def test_a_setting_at_the_wrong_angle_is_left_out_and_named() -> None:
     wrong = np.isclose(raw["inclination"], np.radians(20)) & np.isclose(raw["rotation"], np.radians(60))
     raw["reading"] = raw["reading"] + xr.where(wrong, 3e-4 * raw["reference"], 0.0)
     found = calibrate(raw)
-    assert "inclination 20 deg at rotation 60 deg" in found.dataset.attrs["notes"]
+    told = "1 setting contradicts all the others and was left out: inclination 20 deg at rotation 60 deg."
+    assert told in found.dataset.attrs["notes"]
     assert int(found.dataset["setting_left_out"].sum()) == 1
     q = tilt_vector(np.radians(20.0), np.radians(60.0))
     assert abs(found.slope(q)[0] - plane_slope(q)) < 4 * found.slope(q)[1]

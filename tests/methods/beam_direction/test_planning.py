@@ -213,8 +213,9 @@ def test_the_best_planes_are_those_that_the_calibration_speaks_for(calibration):
     assert InclinationCalibration.load(calibration).supported(q).all()
     assert float(ds["gain"]) > 1.5
     refused = [note for note in ds.attrs["notes"] if "does not speak for" in note]
-    assert "plane 2 of the published set-up" in refused[0]
-    assert "would be refused" in refused[0]
+    assert "strokes of one length, which this calibration does not speak for." in refused[0]
+    assert "plane 2 of the published set-up" in refused[1]
+    assert "would be refused" in refused[1]
 
 
 def test_a_plan_with_a_calibration_needs_to_know_how_the_sensor_is_turned(calibration):
