@@ -9,15 +9,16 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
+from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.datasets import tomlfile
-from errormotion.errors import BenchError, InstrumentError, PluginError
+from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
@@ -39,6 +40,7 @@ class BenchTable(BaseModel):
     name: str
     machine: str
     instruments: dict[str, InstrumentTable] = Field(min_length=1)
+    limits: Limits = Limits()
 
 
 class TestTable(BaseModel):
@@ -90,11 +92,17 @@ class BenchPlan:
     instruments: tuple[BenchInstrument, ...]
     source: Path
     text: str
+    limits: Limits = field(default_factory=Limits)
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of instruments on offer."""
         return tuple(sorted({instrument.driver.info.kind for instrument in self.instruments}))
+
+    @property
+    def settings_by_kind(self) -> dict[str, Any]:
+        """Settings of the instruments by their kind; of several of a kind, the first."""
+        return {each.driver.info.kind: each.settings for each in reversed(self.instruments)}
 
 
 @dataclass(frozen=True)
@@ -182,7 +190,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return BenchPlan(table.name, table.machine, tuple(instruments), source, text)
+    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, table.limits)
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -248,7 +256,19 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
                 f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs {' and '.join(lacking)}; "
                 f"the bench {bench.source} offers {', '.join(bench.kinds)}"
             )
+        mistakes += _limit_mistakes(entry["method"], found, bench, place)
     return mistakes
+
+
+def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> list[str]:
+    """Return what the test would do beyond the limits of the bench."""
+    where = tomlfile.dotted(place)
+    try:
+        steps = steps_of(plugins.get("methods", method), settings, bench.settings_by_kind)
+    except MethodError as error:
+        return [f"{where}: {error}"]
+    told = violations(extent(steps), bench.limits) if steps else []
+    return [f"{where}: {text} ([limits] of {bench.source})" for text in told]
 
 
 def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:

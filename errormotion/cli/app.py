@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from errormotion.cli.guard import ERROR, INVALID, guarded
+from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
 
 app = typer.Typer(
@@ -69,9 +69,24 @@ def run(
     runs: Runs = None,
     yes: Annotated[bool, typer.Option("--yes", help="Don't wait for the operator: all is as it is asked for.")] = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell path and duration; nothing is opened or moved.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="With --dry-run: a folder for pictures of the path.")] = None,
     json_: Json = False,
 ) -> None:
     """Make the tests of a campaign: acquire, identify, report."""
+    if dry_run:
+        from errormotion.cli import dry_run as dry
+
+        if campaign is None:
+            typer.echo("--dry-run needs a campaign file.", err=True)
+            raise typer.Exit(USAGE)
+        dry.run(campaign, out, json_)
+        return
+    if out is not None:
+        typer.echo("--out belongs to --dry-run.", err=True)
+        raise typer.Exit(USAGE)
     from errormotion.cli import running
 
     running.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)

@@ -1,0 +1,125 @@
+"""Limits of a machine: what no test may make it leave, checked before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from errormotion.datasets.units import Length, Speed, Velocity, format_quantity
+from errormotion.plugins import Step
+
+AXES = ("X", "Y", "Z")
+_ROUNDING = 1e-9
+
+
+class Limits(BaseModel):
+    """``[limits]`` of a bench file; what is not given is not limited."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    X: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of X")
+    Y: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of Y")
+    Z: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of Z")
+    feed: Velocity | None = Field(default=None, description="highest feed", gt=0)
+    spindle_speed: Speed | None = Field(default=None, description="highest spindle speed", ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Limits:
+        for axis in AXES:
+            span = getattr(self, axis)
+            if span is not None and not span[0] < span[1]:
+                raise ValueError(f"{axis}: expected the lowest place before the highest; found {span[0]}, {span[1]} m")
+        return self
+
+
+@dataclass(frozen=True)
+class Extent:
+    """What a test asks of a machine.
+
+    Attributes
+    ----------
+    seconds : float
+        How long it takes.
+    way : float
+        Length of all moves, m.
+    low, high : (3,) tuple of float
+        Least and greatest place of X, Y, Z, m; NaN where nothing moves.
+    feed : float
+        Highest feed, m/s; 0 where nothing moves.
+    spindle_speed : float
+        Highest, 1/min.
+    touches, moves : int
+    """
+
+    seconds: float
+    way: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    feed: float
+    spindle_speed: float
+    touches: int
+    moves: int
+
+
+def extent(steps: Sequence[Step]) -> Extent:
+    """Return what steps ask of a machine."""
+    places = [step.place for step in steps if step.place is not None]
+    columns = list(zip(*places, strict=True)) or [(math.nan,)] * 3
+    moving = [step for step in steps if step.place is not None]
+    return Extent(
+        math.fsum(step.seconds for step in steps),
+        math.fsum(math.dist(a, b) for a, b in pairwise(places)),
+        tuple(min(column) for column in columns),
+        tuple(max(column) for column in columns),
+        max((step.feed for step in moving), default=0.0),
+        max((step.spindle_speed for step in steps), default=0.0),
+        sum(step.what == "touch" for step in steps),
+        sum(step.what == "move" for step in steps),
+    )
+
+
+def violations(found: Extent, limits: Limits) -> list[str]:
+    """Return in one sentence each what would leave the limits."""
+    told = []
+    for k, axis in enumerate(AXES):
+        span = getattr(limits, axis)
+        if span is None or math.isnan(found.low[k]):
+            continue
+        if found.low[k] < span[0] - _ROUNDING or found.high[k] > span[1] + _ROUNDING:
+            told.append(
+                f"{axis} would go from {_mm(found.low[k])} to {_mm(found.high[k])}; its limits are {_mm(span[0])} and "
+                f"{_mm(span[1])}"
+            )
+    if limits.feed is not None and found.feed > limits.feed * (1 + _ROUNDING):
+        told.append(f"the feed would be {_feed(found.feed)}; its limit is {_feed(limits.feed)}")
+    if limits.spindle_speed is not None and found.spindle_speed > limits.spindle_speed:
+        told.append(
+            f"the spindle would turn at {found.spindle_speed:g} /min; its limit is {limits.spindle_speed:g} /min"
+        )
+    return told
+
+
+def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[Step] | None:
+    """Return every step that a test will make the machine do; None where the method does not say.
+
+    Parameters
+    ----------
+    method : class of a method
+    settings : its settings
+    instruments : dict
+        Settings of the bench's instruments by kind.
+    """
+    motions = getattr(method, "motions", None)
+    return None if motions is None else list(method().motions(settings, instruments))
+
+
+def _mm(value: float) -> str:
+    return format_quantity(value, "mm", 7)
+
+
+def _feed(value: float) -> str:
+    return format_quantity(value, "mm/min", 6)

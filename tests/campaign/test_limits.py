@@ -1,0 +1,95 @@
+"""Nothing moves that would leave the limits of its bench."""
+
+from pathlib import Path
+
+import pytest
+
+from errormotion.campaign.files import load_campaign
+from errormotion.campaign.limits import Limits, extent, violations
+from errormotion.errors import BenchError
+from errormotion.plugins import Step
+
+BENCH = """\
+schema = "errormotion.bench/1"
+name = "Gantry"
+machine = "Gantry"
+[instruments.control]
+driver = "virtual_controller"
+address = "sim://gantry/controller?seed=31"
+[instruments.probe]
+driver = "controller_probe"
+address = "sim://gantry/controller?seed=31"
+"""
+
+CAMPAIGN = """\
+schema = "errormotion.campaign/1"
+name = "Warm-up"
+bench = "bench.toml"
+[[test]]
+name = "probing"
+method = "normal_vector"
+[test.settings]
+balls = [
+    { centre = ["400 mm", "-700 mm", "120 mm"] },
+    { centre = ["3600 mm", "-700 mm", "500 mm"] },
+    { centre = ["3500 mm", "700 mm", "200 mm"] },
+]
+duration = "20 min"
+schedule = [{ at = "0 min", spindle_speed = "9000 /min" }]
+"""
+
+
+def campaign(folder: Path, limits: str) -> Path:
+    (folder / "bench.toml").write_text(BENCH + "[limits]\n" + limits)
+    path = folder / "campaign.toml"
+    path.write_text(CAMPAIGN)
+    return path
+
+
+def test_a_test_within_the_limits_is_accepted(tmp_path: Path) -> None:
+    wide = 'X = ["0 m", "4 m"]\nZ = ["0 m", "1 m"]\nfeed = "20 m/min"\nspindle_speed = "9000 /min"\n'
+    plan = load_campaign(campaign(tmp_path, wide))
+    assert plan.bench.limits.X == (0.0, 4.0)
+    assert plan.bench.limits.Y is None
+
+
+@pytest.mark.parametrize(
+    ("limits", "told"),
+    [
+        ('X = ["0 m", "3 m"]', r"test\[0\]: X would go from .* mm to 36.* mm; its limits are 0 mm and 3000 mm"),
+        ('Z = ["200 mm", "1 m"]', r"Z would go from 120 mm to .* mm; its limits are 200 mm and 1000 mm"),
+        ('feed = "1 m/min"', r"the feed would be \d+ mm/min; its limit is 1000 mm/min"),
+        ('spindle_speed = "8000 /min"', r"the spindle would turn at 9000 /min; its limit is 8000 /min"),
+    ],
+)
+def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path, limits: str, told: str) -> None:
+    with pytest.raises(BenchError, match=told):
+        load_campaign(campaign(tmp_path, limits))
+
+
+@pytest.mark.parametrize(
+    ("limits", "told"),
+    [
+        ('X = ["4 m", "0 m"]', "X: expected the lowest place before the highest"),
+        ("X = [0, 4]", r"limits\.X\[0\]: expected a length with its unit, such as '5 mm'; found 0"),
+        ('W = ["0 m", "4 m"]', r"limits\.W: unknown key"),
+    ],
+)
+def test_limits_without_sense_are_told(tmp_path: Path, limits: str, told: str) -> None:
+    with pytest.raises(BenchError, match=told):
+        load_campaign(campaign(tmp_path, limits))
+
+
+def test_the_extent_is_what_the_steps_say() -> None:
+    steps = [
+        Step("move", (0.0, 0.0, 0.0), 0.1, 0.0),
+        Step("touch", (0.3, 0.4, 0.0), 0.01, 50.0, 0.0),
+        Step("rest", None, float("nan"), 10.0, 6000.0),
+        Step("move", (0.3, 0.4, -1.0), 0.2, 5.0),
+    ]
+    found = extent(steps)
+    assert (found.seconds, found.way, found.touches, found.moves) == (65.0, 1.5, 1, 2)
+    assert (found.low, found.high) == ((0.0, 0.0, -1.0), (0.3, 0.4, 0.0))
+    assert (found.feed, found.spindle_speed) == (0.2, 6000.0)
+    assert violations(found, Limits()) == []
+    assert violations(extent([]), Limits(X=(0.0, 1.0))) == []

@@ -1,0 +1,54 @@
+"""A dry run tells and draws what would move, and opens nothing."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from errormotion.cli.app import app
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    for name in ("virtual_probing", "virtual_beam"):
+        shutil.copytree(EXAMPLES / name, tmp_path / name)
+    return tmp_path
+
+
+def test_path_duration_and_limits_are_told_and_drawn(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--out", "pictures"])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("monday: 3 h 0")
+    assert "380 touches" in result.stdout  # 19 cycles of 5 touches of 4 balls
+    assert "0.0 to 4000.0" in result.stdout
+    assert result.stdout.endswith("Nothing has moved.\n")
+    assert (folder / "pictures" / "monday-dry-run.png").read_bytes().startswith(b"\x89PNG")
+    assert not (folder / "runs").exists()
+    again = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--out", "pictures"])
+    assert again.exit_code == 1
+    assert "is there already" in again.stderr
+
+
+def test_a_program_reads_the_same(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--json"])
+    motions = json.loads(result.stdout)["tests"][0]["motions"]
+    assert motions["touches"] == 380
+    assert motions["spindle_speed"] == 12000.0
+
+
+def test_a_method_that_does_not_say_what_moves_is_told(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run"])
+    assert "beam: the method does not say what moves" in result.stdout
+
+
+@pytest.mark.parametrize("arguments", [["--dry-run"], ["virtual_beam/campaign.toml", "--out", "x"]])
+def test_options_that_do_not_go_together_are_refused(folder: Path, arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, ["run", *arguments])
+    assert result.exit_code == 2
+    assert not (folder / "runs").exists()
