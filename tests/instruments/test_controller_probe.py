@@ -230,6 +230,22 @@ def test_a_caller_who_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
         assert world("cframe", 3).position() == pytest.approx(touches()[0].start, abs=1e-12)
 
 
+def test_an_interrupted_cycle_stops_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ControllerProbe(ADDRESS) as probe:
+        source = probe.measure(touches())
+        next(source)
+        stopped = []
+
+        def interrupted(target: Sequence[float], feed: float) -> dict[str, Any]:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(probe.control, "probe", interrupted)
+        monkeypatch.setattr(probe.control, "stop", lambda: stopped.append(True))
+        with pytest.raises(KeyboardInterrupt):
+            next(source)
+    assert stopped == [True]
+
+
 def test_controllers_that_cannot_probe_or_do_not_exist_are_refused() -> None:
     with pytest.raises(InstrumentError, match="'mtconnect' cannot probe"):
         ControllerProbe("sim://cframe/x", ControllerProbeSettings(controller="mtconnect")).open()
