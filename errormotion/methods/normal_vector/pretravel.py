@@ -1,7 +1,7 @@
 """The pre-travel map of a probe, from touches all over a ball of known radius.
 
-Where the probe trips, the tip p is by R + r - s(n) away from the middle c of the ball: R and r are the radii of ball and
-tip, n the direction from c to p, s the pre-travel. c and the coefficients of s are found together. How many degrees
+Where the probe trips, the tip p is by R + r - s(n) away from the middle c of the ball: R and r are the radii of ball
+and tip, n the direction from c to p, s the pre-travel. c and the coefficients of s are found together. How many degrees
 s has is decided by the error at touches that are left out one by one. The covariance has, beside the noise, what all
 touches share: how well the radii are known, how round the ball is, and by how much the machine itself measures longer
 in one direction than in another over the size of the ball.
