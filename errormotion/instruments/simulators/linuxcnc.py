@@ -6,7 +6,7 @@ The world's clock goes on with the real time that the machine moves, and jumps w
 
 Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
 ``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; how long LinuxCNC stays up when the last driver has
-gone; 0 = not at all. It ends with the process anyway), ``wait`` (60 s; for another simulated LinuxCNC on this computer
+gone; 0 = not at all. It ends with the process anyway), ``wait`` (90 s; for another simulated LinuxCNC on this computer
 to end).
 """
 
@@ -30,7 +30,7 @@ from errormotion.instruments.simulators.virtual_world import VirtualWorld
 from errormotion.instruments.transports import Address, Transport, open_transport
 
 LINGER = 10.0  # s
-WAIT = 60.0  # s
+WAIT = 90.0  # s
 FIRST = 5.0  # s that LinuxCNC waits for its first driver, at least
 OWN = "simulator"
 """What the numbers of requests begin with that the driver knows nothing of."""

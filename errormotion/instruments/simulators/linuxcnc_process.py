@@ -26,11 +26,15 @@ PACKAGE = "linuxcnc-uspace"
 PYTHON = "/usr/bin/python3"
 LOCK = Path("/tmp/errormotion-linuxcnc.lock")
 THEIR_LOCK = Path("/tmp/linuxcnc.lock")
+FOLDER = "errormotion-linuxcnc-"
+SIGN = "processes"
+"""File in its folder that all of its processes, and they alone, hold open."""
+PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
 PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
 MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
 """Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
-START = 20.0  # s
+START = 15.0  # s
 END = 10.0  # s
 
 
@@ -82,7 +86,9 @@ class LinuxCNCProcess:
         lock = _lock(wait)
         try:
             _refuse_beside_another()
-            self.folder = Path(tempfile.mkdtemp(prefix="errormotion-linuxcnc-"))
+            for left in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):  # of one whose process was killed
+                shutil.rmtree(left, ignore_errors=True)
+            self.folder = Path(tempfile.mkdtemp(prefix=FOLDER))
             try:
                 self._write(files, bridge)
                 self._child = self._start(lock)
@@ -133,8 +139,8 @@ class LinuxCNCProcess:
 
     def _start(self, lock: int) -> subprocess.Popen[bytes]:
         user = _user()
-        environment = {"HOME": str(self.folder), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8"}
-        with (self.folder / "log.txt").open("wb") as log:
+        environment = {"HOME": str(self.folder), "PATH": PATH, "LC_ALL": "C.UTF-8"}
+        with (self.folder / "log.txt").open("wb") as log, (self.folder / SIGN).open("wb") as sign:
             return subprocess.Popen(
                 ["linuxcnc", "-r", str(self.folder / "linuxcnc.ini")],
                 cwd=self.folder,
@@ -143,7 +149,7 @@ class LinuxCNCProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                pass_fds=(lock,),
+                pass_fds=(lock, sign.fileno()),
                 user=user.pw_uid if user else None,
                 group=user.pw_gid if user else None,
                 extra_groups=[] if user else None,
@@ -164,15 +170,21 @@ class LinuxCNCProcess:
     # ------------------------------------------------------------------ end
 
     def _kill_the_rest(self) -> None:
-        left = _session(self._child.pid)
-        for pid in left:
-            with suppress(ProcessLookupError, PermissionError):
-                os.kill(pid, signal.SIGKILL)
-        if left:
-            for key in MEMORY:
-                subprocess.run(["ipcrm", "-M", key], capture_output=True, check=False)
-            with suppress(OSError):
-                THEIR_LOCK.unlink()
+        if self._child.poll() is None or _parts(self.folder):
+            user = _user()
+            with suppress(
+                OSError, subprocess.TimeoutExpired
+            ):  # its realtime process belongs to root: it has to be asked
+                subprocess.run(
+                    ["rtapi_app", "exit"],
+                    env={"HOME": str(self.folder), "PATH": PATH},
+                    capture_output=True,
+                    timeout=END,
+                    check=False,
+                    user=user.pw_uid if user else None,
+                    group=user.pw_gid if user else None,
+                )
+            _kill(_parts(self.folder))
 
 
 def _user() -> pwd.struct_passwd | None:
@@ -180,9 +192,33 @@ def _user() -> pwd.struct_passwd | None:
     return pwd.getpwnam("nobody") if os.geteuid() == 0 else None
 
 
+def _parts(of: Path | None = None) -> dict[int, str]:
+    """Return the processes of simulated LinuxCNCs, or of that in a folder, by name: they hold a file of its folder.
+
+    What belongs to another user cannot be seen.
+    """
+    begin = f"{of or Path(tempfile.gettempdir()) / FOLDER}"
+    found = {}
+    for pid, (name, _) in _processes().items():
+        with suppress(OSError):
+            links = [os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()]
+            if any(link.startswith(begin) and Path(link.removesuffix(" (deleted)")).name == SIGN for link in links):
+                found[pid] = name
+    return found
+
+
+def _kill(processes: dict[int, str]) -> None:
+    """End processes at once, and remove what they leave."""
+    for pid in processes:
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+    for key in MEMORY if processes else ():
+        subprocess.run(["ipcrm", "-M", key], capture_output=True, check=False)
+
+
 def _lock(wait: float) -> int:
     """Return the locked file; InstrumentError while another LinuxCNC of ours runs for too long."""
-    until = time.monotonic() + wait
+    until, led = time.monotonic() + wait, time.monotonic()
     with suppress(FileExistsError):
         os.close(os.open(LOCK, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644))
     file = os.open(LOCK, os.O_RDONLY)
@@ -191,19 +227,24 @@ def _lock(wait: float) -> int:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return file
         except BlockingIOError:
+            parts = _parts()
+            if not parts or "bridge.py" in parts.values():
+                led = time.monotonic()
+            elif time.monotonic() - led > 2 * START:  # they run on without a head
+                _kill(parts)
             if time.monotonic() < until:
                 time.sleep(0.1)
                 continue
             os.close(file)
             raise InstrumentError(
-                f"Another simulated LinuxCNC runs on this computer, which has room for one; it did not end within "
-                f"{wait:g} s. Close it, or wait longer with 'wait=' in the address"
+                "Another simulated LinuxCNC runs on this computer, which has room for one; it did not end in time, that "
+                f"is {wait:g} s. Close it, or wait longer with 'wait=' in the address"
             ) from None
 
 
 def _refuse_beside_another() -> None:
     """Leave a LinuxCNC alone that is not ours: it may be running a machine."""
-    found = {fields[0]: pid for pid, fields in _stat() if fields[0] in PROCESSES and fields[2] != "Z"}
+    found = {name: pid for pid, (name, state) in _processes().items() if name in PROCESSES and state != "Z"}
     if found:
         named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
         raise InstrumentError(f"A LinuxCNC runs on this computer that is not a simulated one of ours: {named}")
@@ -211,17 +252,12 @@ def _refuse_beside_another() -> None:
         THEIR_LOCK.unlink()  # left by one that was killed
 
 
-def _session(session: int) -> list[int]:
-    return [pid for pid, fields in _stat() if int(fields[1]) == session and fields[2] != "Z"]
-
-
-def _stat() -> list[tuple[int, tuple[str, str, str]]]:
-    """Return name, session and state of every process."""
-    found = []
+def _processes() -> dict[int, tuple[str, str]]:
+    """Return name and state of every process."""
+    found = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             with suppress(OSError):
                 head, _, tail = (entry / "stat").read_text(errors="replace").rpartition(")")
-                fields = tail.split()
-                found.append((int(entry.name), (head.partition("(")[2], fields[3], fields[0])))
+                found[int(entry.name)] = (head.partition("(")[2], tail.split()[0])
     return found

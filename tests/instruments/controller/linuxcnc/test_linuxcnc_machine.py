@@ -448,6 +448,6 @@ def test_an_ini_file_in_inches_switched_on_and_homed_by_hand_and_nothing_left_be
         assert -2e-9 <= contact[2] - touch["position"][2] <= feed * CYCLE + 2e-9
     assert not control.process.running
     assert not folder.exists()
-    running = {name for _, (name, _, state) in linuxcnc_process._stat() if state != "Z"}
+    running = {name for name, state in linuxcnc_process._processes().values() if state != "Z"}
     assert running.isdisjoint(linuxcnc_process.PROCESSES)
     assert not linuxcnc_process.THEIR_LOCK.exists()
