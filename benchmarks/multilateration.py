@@ -1,11 +1,14 @@
 """Multilateration: the solver against general ones and the published scheme, what it states, and what layouts do.
 
-``python -m benchmarks.multilateration [--only compare coverage layout] [--most 1000000] [--peers 10000]
-[--stations near wide]``
+``python -m benchmarks.multilateration [--only compare coverage layout] [--targets 100 1000 ... 1000000]
+[--limit 600] [--stations near wide]``
 
-``compare`` gives every way the same readings, each in a process of its own: wall and processor time of one solution
-when everything is compiled and warm, the most memory that the process held, iterations, and how far its targets are
-off the truth and off ours (all as free networks on the nominal targets).
+``compare`` gives every way the same readings and the same start, each in a process of its own: wall and processor time
+of one solution when everything is compiled and warm (the least of as many as fit into three seconds), the most memory
+that the process held, iterations, and how far its targets are off the truth and off those of a peer that has converged
+tightly (all as free networks on the nominal targets). A way that takes longer than the limit, or more than 16 GiB, is
+said to, and is left out where there are more targets. General solvers return targets and stations; so does
+``errormotion, solution``. What it tells besides has rows of its own.
 ``coverage`` draws noise again and again. ``layout`` is the table of what places of the stations do.
 """
 
@@ -22,6 +25,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -29,7 +33,7 @@ from scipy.stats import norm
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.alternating import alternate
 from errormotion.methods.multilateration.bound import bound, relative_bound
-from errormotion.methods.multilateration.model import Stations, jacobian, readings
+from errormotion.methods.multilateration.model import Stations, directions, jacobian, readings
 from errormotion.methods.multilateration.solver import solve
 from errormotion.methods.multilateration.turning import fitted
 
@@ -67,7 +71,20 @@ def on_nominal(target, station, nominal):
 
 
 def ours(u, d, station):
+    network = solve(d, u, station, noise=NOISE, robust=False)
+    return network.target, network.station, network.iterations, network.converged
+
+
+def ours_checked(u, d, station):
     network = solve(d, u, station, noise=NOISE)
+    return network.target, network.station, network.iterations, network.converged
+
+
+def ours_in_full(u, d, station):
+    network = solve(d, u, station, noise=NOISE)
+    assert network.target_covariance.shape == (len(u), 3, 3)
+    assert network.joint_covariance.shape == (16, 16)
+    assert network.redundancy.shape == network.residual.shape == d.shape
     return network.target, network.station, network.iterations, network.converged
 
 
@@ -77,44 +94,53 @@ def unpacked(x, m):
 
 
 def general(u, d, station):
-    """Residuals, sparse Jacobian and start for a general solver: the same model, the same start."""
-    m, known = len(u), np.ones(d.shape, dtype=bool)
+    """Residuals, sparse Jacobian and start for a general solver: the same model, the same start.
+
+    Where the Jacobian has values is found once.
+    """
+    m = len(u)
     L = np.median(np.linalg.norm(u - station[:, None], axis=-1) - d, axis=1)
     start = np.concatenate([u.ravel(), np.column_stack([station, L]).ravel()])
-    return (
-        lambda x: (readings(*unpacked(x, m)) - d).T.ravel() / NOISE,
-        lambda x: jacobian(*unpacked(x, m), known) / NOISE,
-        start,
-    )
+    pattern = jacobian(*unpacked(start, m), np.ones(d.shape, dtype=bool))
+
+    def slope(x):
+        e = directions(*unpacked(x, m)).transpose(1, 0, 2) / NOISE
+        values = np.concatenate([e, -e, np.full((m, 4, 1), -1 / NOISE)], axis=-1)
+        return sp.csr_array((values.ravel(), pattern.indices, pattern.indptr), shape=pattern.shape)
+
+    return lambda x: (readings(*unpacked(x, m)) - d).T.ravel() / NOISE, slope, start
 
 
-def trust_region(u, d, station, **options):
-    off, slope, start = general(u, d, station)
-    found = least_squares(off, start, slope, method="trf", tr_solver="lsmr", **options)
-    target, stations = unpacked(found.x, len(u))
-    return *on_nominal(target, stations.place, u), found.nfev, found.status > 0
+TIGHT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15, "max_nfev": 100}
+"""Tolerances at rounding. Without the inner solver's, too, it never arrives."""
 
 
-def trust_region_tight(u, d, station):
-    """Tolerances at rounding, and the inner solver's, too: without these it never arrives."""
-    inner = {"atol": 1e-14, "btol": 1e-14, "maxiter": 2000}
-    return trust_region(
-        u, d, station, x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=300, tr_options=inner
-    )
+def least_squares_with(**options):
+    def work(u, d, station):
+        off, slope, start = general(u, d, station)
+        dense = options.get("tr_solver") == "exact"
+        found = least_squares(off, start, (lambda x: slope(x).toarray()) if dense else slope, **options)
+        target, stations = unpacked(found.x, len(u))
+        return *on_nominal(target, stations.place, u), found.nfev, found.status > 0
+
+    return work
+
+
+def lsmr(x_scale, inner, method="trf"):
+    return least_squares_with(method=method, tr_solver="lsmr", x_scale=x_scale, tr_options=inner, **TIGHT)
 
 
 def sparse_newton(u, d, station):
-    """Gauss-Newton on the normal equations by sparse LU, six coordinates of the stations held."""
+    """Gauss-Newton on the normal equations by sparse LU, six coordinates of the stations held, targets first."""
     off, slope, x = general(u, d, station)
     b = 3 * len(u)
     keep = np.setdiff1d(np.arange(len(x)), [b, b + 1, b + 2, b + 5, b + 6, b + 10])
     done, size = 0, np.inf
     while size > 1e-12 and done < 30:
-        J = slope(x)
-        g, A = J.T @ off(x), (J.T @ J).tocsc()[:, keep][keep]
-        step = -spl.splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(
-            g[keep]
-        )
+        J = slope(x)[:, keep]
+        g, A = J.T @ off(x), (J.T @ J).tocsc()
+        # The order in which a target's unknowns are eliminated first leaves no more than need be.
+        step = -spl.splu(A, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(g)
         x[keep] += step
         done, size = done + 1, np.abs(step).max()
     target, stations = unpacked(x, len(u))
@@ -126,66 +152,114 @@ def published(u, d, station):
     return found.target, found.station, found.iterations, found.converged
 
 
-WAYS = {
-    "errormotion": ours,
-    "least_squares, default": trust_region,
-    "least_squares, tight": trust_region_tight,
+OURS = {
+    "errormotion, solution": ours,
+    "and outlier tests": ours_checked,
+    "and all covariances": ours_in_full,
+}
+PEERS = {
     "sparse Gauss-Newton (splu)": sparse_newton,
+    "trf, lsmr, not damped": lsmr(1.0, {"regularize": False, "maxiter": 100, "atol": 1e-12, "btol": 1e-12}),
+    "the same, scaled": lsmr("jac", {"regularize": False, "maxiter": 100, "atol": 1e-12, "btol": 1e-12}),
+    "trf, lsmr": lsmr(1.0, {"atol": 1e-14, "btol": 1e-14}),
+    "the same, scaled ": lsmr("jac", {"atol": 1e-14, "btol": 1e-14}),
+    "dogbox, lsmr": lsmr("jac", {"atol": 1e-12, "btol": 1e-12}, "dogbox"),
+    "trf, exact (dense)": least_squares_with(method="trf", tr_solver="exact", x_scale=0.1, **TIGHT),
+    "trf, lsmr, as it comes": least_squares_with(method="trf", tr_solver="lsmr"),
     "alternating (published)": published,
 }
+WAYS = OURS | PEERS
+MOST = {"trf, exact (dense)": 100}
+"""Targets above which a way is not tried: dense matrices."""
+SAME = 1e-11
+"""A peer has the answer when its targets are this close to the reference, m."""
+REPEATED, SECONDS, MEMORY = 50, 3.0, 16 * 2**30
 
 
 def one(way: str, m: int, places, out: str) -> None:
-    """Solve once to warm up, on few targets, then once for the figures."""
-    u, _, d, station = data(30_000 if way == "errormotion" else 50)
-    WAYS[way](u, d, station)
+    """Solve once to warm up, on few targets, then as often as fits for the figures."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    for some in (50, 30_000) if way in OURS else (50,):
+        u, _, d, station = data(some)
+        WAYS[way](u, d, station)
     u, true, d, station = data(m, places)
-    work, repeats, walls, processors = WAYS[way], 5 if way == "errormotion" and m < 500_000 else 1, [], []
-    for _ in range(repeats):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    work, walls, processors = WAYS[way], [], []
+    while not walls or (len(walls) < REPEATED and sum(walls) < SECONDS):
         wall, processor = time.perf_counter(), time.process_time()
         target, place, iterations, converged = work(u, d, station)
         walls.append(time.perf_counter() - wall)
         processors.append(time.process_time() - processor)
     np.savez(out + ".npz", target=target, place=place)
     truth, _ = on_nominal(true, places, u)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     figures = {
-        "wall": min(walls), "processor": min(processors), "memory": memory, "iterations": int(iterations),
+        "wall": min(walls), "processor": min(processors), "before": before,
+        "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "iterations": int(iterations),
         "converged": bool(converged), "error": float(np.sqrt(np.mean(np.sum((target - truth) ** 2, axis=1)))),
     }  # fmt: skip
     Path(out + ".json").write_text(json.dumps(figures))
 
 
-def compare(layout: str, most: int, peers: int) -> None:
+def measured(way: str, m: int, layout: str, out: str, limit: float):
+    """Return figures and targets of a way; or what became of it, and None."""
+    command = [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), layout, out]
+    try:
+        done = subprocess.run(command, check=False, timeout=limit + 120, capture_output=True, text=True)
+    except subprocess.TimeoutExpired:
+        return f"longer than {limit:.0f} s", None
+    if done.returncode:
+        why = "more than 16 GiB" if "MemoryError" in done.stderr else done.stderr.strip().split("\n")[-1][:60]
+        return why or f"stopped ({done.returncode})", None
+    return json.loads(Path(out + ".json").read_text()), np.load(out + ".npz")["target"]
+
+
+def compare(layout: str, counts: list[int], limit: float) -> None:
     far = np.linalg.norm(LAYOUTS[layout], axis=1).mean()
-    print(f"The same readings for all, four stations {far * 1e3:.0f} mm from the cube's middle, 1 um of noise;")
-    print("error: rms of the targets against the truth; off ours: the furthest target.")
-    print(f"Load while this ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")
+    print(f"\nThe same readings for all, four stations {far * 1e3:.0f} mm from the cube's middle, 1 um of noise;")
+    print("error: rms of the targets against the truth; off: the furthest target from the reference.")
+    print("peak: of the process; rows of errormotion hold compiled code and a warm-up with 30 000 targets, too.")
+    print(f"Load when this began: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")
     print(
-        f"{'targets':>9} {'way':>28} {'wall':>11} {'cpu':>10} {'times ours':>11} {'peak':>9} {'its':>6} {'done':>5} "
-        f"{'error':>9} {'off ours':>10}"
+        f"{'targets':>9} {'way':>27} {'wall':>12} {'cpu':>11} {'times ours':>10} {'peak':>10} {'its':>5} {'done':>4} "
+        f"{'error':>9} {'off':>9}"
     )
-    with tempfile.TemporaryDirectory() as folder:
-        for m in (m for m in (100, 1000, 10_000, 100_000, 1_000_000) if m <= most):
-            first, reference = None, None
-            for way in WAYS if m <= peers else ["errormotion"]:
-                out = str(Path(folder) / "out")
-                done = subprocess.run(
-                    [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), layout, out], check=False
-                )
-                if done.returncode:
-                    print(f"{m:>9} {way:>28} failed", flush=True)
-                    continue
-                f = json.loads(Path(out + ".json").read_text())
-                found = np.load(out + ".npz")["target"]
-                first, reference = first or f, found if reference is None else reference
-                off = np.linalg.norm(found - reference, axis=1).max()
-                print(
-                    f"{m:>9} {way:>28} {f['wall'] * 1e3:>8.1f} ms {f['processor'] * 1e3:>7.0f} ms "
-                    f"{f['wall'] / first['wall']:>9.0f} x {f['memory']:>5.0f} MiB {f['iterations']:>6} "
-                    f"{'yes' if f['converged'] else 'no':>5} {f['error'] * 1e6:>6.3f} um {off:>8.1e} m",
-                    flush=True,
-                )
+    gone: set[str] = set()
+    for m in counts:
+        found = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for way in WAYS:
+                if way not in gone and m <= MOST.get(way, m):
+                    found[way] = measured(way, m, layout, str(Path(folder) / "out"), limit)
+        gone |= {way for way, (_, target) in found.items() if target is None}
+        summary(m, found)
+
+
+def summary(m: int, found) -> None:
+    solved = {way: (f, target) for way, (f, target) in found.items() if target is not None}
+    reference = next(way for way in [*PEERS, *OURS] if way in solved and solved[way][0]["converged"])
+    wall = found["errormotion, solution"][0]["wall"]
+    same = {}
+    for way, (f, target) in found.items():
+        if target is None:
+            print(f"{m:>9} {way:>27} {f}")
+            continue
+        off = np.linalg.norm(target - solved[reference][1], axis=1).max()
+        if way in PEERS and f["converged"] and off < SAME:
+            same[way] = f["wall"]
+        print(
+            f"{m:>9} {way:>27} {f['wall'] * 1e3:>9.2f} ms {f['processor'] * 1e3:>8.1f} ms "
+            f"{f['wall'] / wall:>8.1f} x {f['memory']:>6.0f} MiB {f['iterations']:>5} "
+            f"{'yes' if f['converged'] else 'no':>4} {f['error'] * 1e6:>6.3f} um {off:>7.0e} m",
+            flush=True,
+        )
+    if same:
+        best = min(same, key=same.get)
+        full = found["and all covariances"][0]["wall"]
+        print(
+            f"{'':>9} best peer with the answer: {best.strip()}, {same[best] / wall:.0f} times ours, "
+            f"{same[best] / full:.0f} times ours with all covariances; reference: {reference}",
+            flush=True,
+        )
 
 
 def coverage(seeds: int = 300) -> None:
@@ -305,8 +379,8 @@ def layout(draws: int = 200) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--most", type=int, default=1_000_000, help="most targets for ours")
-    parser.add_argument("--peers", type=int, default=10_000, help="most targets for the other ways")
+    parser.add_argument("--targets", nargs="+", type=int, default=[100, 1000, 10_000, 100_000, 1_000_000])
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds that a way may take")
     parser.add_argument("--stations", nargs="+", choices=tuple(LAYOUTS), default=tuple(LAYOUTS), help="for compare")
     parser.add_argument("--one", nargs=4, metavar=("WAY", "M", "LAYOUT", "OUT"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -320,7 +394,7 @@ def main() -> None:
         coverage()
     if "compare" in arguments.only:
         for name in arguments.stations:
-            compare(name, arguments.most, arguments.peers)
+            compare(name, arguments.targets, arguments.limit)
 
 
 if __name__ == "__main__":
