@@ -13,7 +13,7 @@ import re
 import time
 from pathlib import Path
 
-from validation import beam_direction, crossbeam_scan, multilateration, normal_vector, spindle_drift
+from validation import beam_direction, crossbeam_scan, multilateration, normal_vector, spindle_drift, thermal_model
 
 from errormotion import __version__
 
@@ -24,6 +24,7 @@ PARTS = {
     "beam_direction": beam_direction,
     "multilateration": multilateration,
     "normal_vector": normal_vector,
+    "thermal_model": thermal_model,
 }
 INTRODUCTION = """\
 # Validation
