@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.datasets import tomlfile
+from errormotion.datasets.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 
@@ -167,11 +168,24 @@ def load_campaign(path: str | Path) -> CampaignPlan:
         except BenchError as error:
             trouble = error
     try:
-        return parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
+        campaign = parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
     except BenchError as error:
         if trouble is None:
             raise
         raise trouble if not str(error).strip() else BenchError(f"{error}\n{trouble}") from None
+    if mistakes := list(_missing(campaign)):
+        raise BenchError(tomlfile.report(path, mistakes))
+    return campaign
+
+
+def _missing(campaign: CampaignPlan) -> Iterator[str]:
+    """Tell which files that settings name are not there, or are not what they should be."""
+    for number, test in enumerate(campaign.tests):
+        check = getattr(test.method, "check", None)
+        if check is not None:
+            with looking_beside(campaign.folder):
+                found = check(test.method(), test.settings)
+            yield from (f"{tomlfile.dotted(('test', number, 'settings', key))}: {text}" for key, text in found.items())
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:

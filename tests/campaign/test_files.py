@@ -1,5 +1,6 @@
 """Every mistake in a bench or campaign file is told at once: file, key, expected, found, nearest."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -98,3 +99,13 @@ def test_broken_toml_is_told_with_its_line(write: Callable[..., Path]) -> None:
     path = write('name = "a')
     with pytest.raises(BenchError, match=r"campaign\.toml, line 7, column 10: not TOML"):
         load_campaign(path)
+
+
+def test_a_calibration_that_is_not_there_is_told_when_the_campaign_is_read(tmp_path: Path) -> None:
+    source = Path(__file__).parents[2] / "examples" / "virtual_beam"
+    shutil.copy(source / "bench.toml", tmp_path)
+    shutil.copy(source / "campaign.toml", tmp_path)
+    with pytest.raises(BenchError, match=r"test\[0\]\.settings\.compensation: .*lk-h050"):
+        load_campaign(tmp_path / "campaign.toml")
+    shutil.copytree(source / "calibrations", tmp_path / "calibrations")
+    assert load_campaign(tmp_path / "campaign.toml").tests[0].name == "beam"

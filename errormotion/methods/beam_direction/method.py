@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import xarray as xr
 
 from errormotion.datasets import validate
-from errormotion.errors import MethodError
+from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
@@ -46,6 +46,18 @@ class BeamDirection:
         from errormotion.methods.beam_direction import acquisition
 
         return acquisition.measure_planes(bench, settings, inputs, done)
+
+    def check(self, settings: BeamSettings) -> dict[str, str]:
+        """Return why the calibration that the settings name cannot be used, where it cannot."""
+        if settings.compensation is None:
+            return {}
+        from errormotion.datasets.calibration import InclinationCalibration
+
+        try:
+            InclinationCalibration.find(settings.compensation)
+        except DatasetError as error:
+            return {"compensation": str(error)}
+        return {}
 
     def append_dim(self, settings: BeamSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``plane``."""
