@@ -237,8 +237,8 @@ def _lock(wait: float) -> int:
                 continue
             os.close(file)
             raise InstrumentError(
-                "Another simulated LinuxCNC runs on this computer, which has room for one; it did not end in time, that "
-                f"is {wait:g} s. Close it, or wait longer with 'wait=' in the address"
+                "Another simulated LinuxCNC runs on this computer, which has room for one; it did not end in time, "
+                f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address"
             ) from None
 
 
