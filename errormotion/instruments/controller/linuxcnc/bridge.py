@@ -331,6 +331,7 @@ class Bridge:
         await self._mode(self.cnc.MODE_MANUAL)
         self.command.teleop_enable(0)
         await self._settle("joint mode")
+        await self._ended(self.job)  # it may have been broken off already
         self.command.home(-1)
         await self._settle("homing")
         while not (self._homed() and self._idle()):
@@ -385,6 +386,7 @@ class Bridge:
         await self._mode(self.cnc.MODE_AUTO)
         self.command.program_open(str(file))
         await self._settle("opening the program")
+        await self._ended(self.job)  # it may have been broken off already
         self.command.auto(self.cnc.AUTO_RUN, 0)
         await self._settle("starting the program", running=True)
         assert self.job is not None
@@ -484,6 +486,7 @@ class Bridge:
             await self._line(" ".join(before))
 
     async def _line(self, line: str) -> None:
+        await self._ended(self.job)  # it may have been broken off already
         self.command.mdi(line)
         while not await self._ended(self.job):
             await asyncio.sleep(POLL)

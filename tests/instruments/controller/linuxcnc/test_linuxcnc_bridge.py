@@ -427,6 +427,33 @@ def test_a_client_that_hangs_up_takes_its_motion_with_it(play: Callable[[Test], 
     play(test)
 
 
+@pytest.mark.parametrize(
+    ("op", "arguments"),
+    [
+        ("move_to", {"position": [0, 0, 0.1]}),
+        ("probe", {"target": [0, 0, 0.1], "feed": 0.01}),
+        ("run_program", {"text": "G4 P9"}),
+        ("spindle", {"speed": 100}),
+    ],
+)
+def test_what_is_broken_off_before_it_began_does_not_begin(
+    play: Callable[[Test], None], op: str, arguments: dict[str, Any]
+) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        change = fake.mode
+
+        def interrupted(mode: int) -> None:
+            change(mode)
+            bridge._end_jobs("it was stopped", None)
+
+        fake.mode = interrupted  # type: ignore[method-assign]
+        assert "broken off: it was stopped" in await wire.ask(op, **arguments)
+        assert "abort" in fake.lines
+        assert not [line for line in fake.lines if line.startswith(("G", "M", "run"))]
+
+    play(test)
+
+
 def test_waiting_ends_by_a_stop(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         assert await wire.ask("elapse", seconds=0.01) is None
