@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,9 +22,12 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+Place = tuple[float, float, float]
+
 TIP_RADIUS = 3e-3
 """Taken where neither the settings nor the probe say, m."""
-SLOWEST = 1e-9
+SHORTEST = 1e-3
+"""Waits and moves below this are none, s."""
 _HERE = 1e-9  # m
 
 
@@ -57,18 +61,23 @@ def _order(balls: int, touches: int, back: bool) -> Iterator[tuple[int, int]]:
             yield ball, touch
 
 
-def itinerary(touches: Sequence[Touch], clearance: float) -> Iterator[Touch | tuple[float, float, float]]:
+def itinerary(touches: Sequence[Touch], clearance: float, here: Place | None = None) -> Iterator[Touch | Place]:
     """Yield the way through the touches of a cycle: places to go to, and touches to make from where the machine is.
 
     From touch to touch the tip rises by the clearance (m) above the starts of the touches of its ball, or of all balls
-    where it goes to another one; it goes across, and down.
+    where it goes to another one; it goes across, and down. It goes up first from ``here``, where that is known.
     """
-    high = max(touch.start[2] for touch in touches) + clearance
+    high = safe_height(touches, clearance)
+    above = high
+    if here is not None:
+        above = max(here[2], high)
+        yield here[0], here[1], above
     before: Touch | None = None
     for touch in touches:
-        same = before is not None and before.item == touch.item
-        top = max(t.start[2] for t in touches if t.item == touch.item) + clearance if same else high
+        top = above
         if before is not None:
+            top = safe_height([t for t in touches if t.item == touch.item], clearance)
+            top = top if before.item == touch.item else high
             yield before.start[0], before.start[1], top
         yield touch.start[0], touch.start[1], top
         yield touch.start
@@ -78,7 +87,12 @@ def itinerary(touches: Sequence[Touch], clearance: float) -> Iterator[Touch | tu
         yield before.start[0], before.start[1], high
 
 
-def cycle_steps(settings: Settings, probe: Any = None) -> list[Step]:
+def safe_height(touches: Sequence[Touch], clearance: float) -> float:
+    """Return the height at which the tip passes over what is touched, m."""
+    return max(touch.start[2] for touch in touches) + clearance
+
+
+def cycle_steps(settings: Settings, probe: Any = None, here: Place | None = None) -> list[Step]:
     """Return every step of one cycle.
 
     Parameters
@@ -86,18 +100,19 @@ def cycle_steps(settings: Settings, probe: Any = None) -> list[Step]:
     settings : Settings
     probe : settings of the bench's touch probe, optional
         Its feeds and its clearance hold where it has some; else those of the method.
+    here : (3,) tuple of float, optional
+        Where the machine is before, m; else the way to the first touch does not count.
     """
     tip = settings.tip_radius or float(getattr(probe, "tip_radius", TIP_RADIUS))
-    clearance = max(settings.clearance, float(getattr(probe, "clearance", 0.0)))
+    clearance = float(getattr(probe, "clearance", settings.clearance))
     feed = float(getattr(probe, "approach_feed", settings.positioning_feed))
     search = float(getattr(probe, "search_feed", settings.probing_feed))
     slow = _slow_seconds(probe)
     touches, _ = cycle_touches(settings, tip)
     steps: list[Step] = []
-    here: tuple[float, float, float] | None = None
-    for item in itinerary(touches, clearance) if touches else ():
+    for item in itinerary(touches, clearance, here) if touches else ():
         if isinstance(item, Touch):
-            way = float(settings.approach)
+            way = settings.approach
             contact = _tuple(np.array(item.start) + way * _unit(np.subtract(item.target, item.start)))
             steps.append(Step("touch", contact, search, way / search + slow))
             steps.append(Step("move", item.start, feed, way / feed))
@@ -115,11 +130,55 @@ def _unit(vector: Array) -> Array:
 
 
 def _slow_seconds(probe: Any) -> float:
-    """Return how long the slow contacts behind the first one take, s."""
-    names = ("back_off", "margin", "touch_feed", "repeats")
+    """Return how long the slow contacts behind the first one take, s: back a little, and to the contact again."""
+    names = ("back_off", "approach_feed", "touch_feed", "repeats")
     if probe is None or not all(hasattr(probe, name) for name in names):
         return 0.0
-    return float(probe.repeats * (probe.back_off + probe.margin) * 2 / probe.touch_feed)
+    return float(probe.repeats * probe.back_off * (1 / probe.approach_feed + 1 / probe.touch_feed))
+
+
+@dataclass(frozen=True)
+class Part:
+    """The warm-up before a cycle, and the cycle.
+
+    Attributes
+    ----------
+    number : int
+        Of the cycle, 0 for the cold one.
+    warm_up : list of Step
+    settle : float
+        Rest between both, s.
+    here : (3,) tuple of float or None
+        Where the cycle begins, m; None: not known.
+    cycle : list of Step
+    """
+
+    number: int
+    warm_up: list[Step]
+    settle: float
+    here: Place | None
+    cycle: list[Step]
+
+
+def parts(settings: Settings, probe: Any = None) -> Iterator[Part]:
+    """Yield the cold cycle, and every later one with the warm-up before it; ``probe`` as for `cycle_steps`."""
+    now, cold, number = 0.0, 0.0, 0
+    here: Place | None = None
+    while (number := due(settings, number, now)) < cycles(settings):
+        warm_up: list[Step] = []
+        settle = settings.settle
+        if number:
+            end = number * settings.interval
+            warm_up = warm_up_steps(settings, now - cold, end - cold, here)
+            here = next((step.place for step in reversed(warm_up) if step.place is not None), here)
+            now = max(now, end)
+            settle = settings.settle if warm_up and warm_up[-1].spindle_speed else 0.0
+        steps = cycle_steps(settings, probe, here)
+        yield Part(number, warm_up, settle, here, steps)
+        now += settle + math.fsum(step.seconds for step in steps)
+        cold = cold if number else now
+        here = steps[-1].place if steps else here
+        number += 1
 
 
 def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
@@ -131,33 +190,34 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
     instruments : mapping of str to settings, optional
         Settings of the bench's instruments by their kind.
     """
-    cycle = cycle_steps(settings, (instruments or {}).get("touch_probe"))
-    length = math.fsum(step.seconds for step in cycle)
-    steps = [*cycle]
-    for number in range(1, cycles(settings)):
-        begin, end = (number - 1) * settings.interval + length, number * settings.interval
-        steps += warm_up_steps(settings, begin - length, max(end - length, begin - length))
-        if settings.settle:
-            steps.append(Step("rest", None, math.nan, settings.settle, 0.0))
-        steps += cycle
+    steps: list[Step] = []
+    for part in parts(settings, (instruments or {}).get("touch_probe")):
+        steps += part.warm_up
+        if part.settle:
+            steps.append(Step("rest", None, math.nan, part.settle, 0.0))
+        steps += part.cycle
     return steps
 
 
-def warm_up_steps(settings: Settings, begin: float, end: float) -> list[Step]:
-    """Return what the machine does between two times of the warm-up, s: spindle speeds, moves to and fro, or rests."""
+def warm_up_steps(settings: Settings, begin: float, end: float, here: Place | None = None) -> list[Step]:
+    """Return what the machine does between two times of the warm-up, s: spindle speeds, moves to and fro, or rests.
+
+    The moves begin with the first one, from ``here``, where that is known.
+    """
     steps: list[Step] = []
     now, number = begin, 0
-    while end - now > SLOWEST:
+    while end - now > SHORTEST:
         speed, until = speed_at(settings, now)
         until = min(until, end)
         if settings.moves:
             place = settings.moves[number % len(settings.moves)]
-            previous = settings.moves[number - 1]
-            seconds = float(np.linalg.norm(np.subtract(place, previous))) / settings.moves_feed
-            number += 1
-            if now + seconds <= end and seconds > 0:
+            seconds = math.dist(place, place if here is None else here) / settings.moves_feed
+            if here is None or (seconds <= SHORTEST and len(set(settings.moves)) > 1):
+                number, here = number + 1, place
+                continue
+            if SHORTEST < seconds <= end - now:
                 steps.append(Step("move", place, settings.moves_feed, seconds, speed))
-                now += seconds
+                number, here, now = number + 1, place, now + seconds
                 continue
         steps.append(Step("rest", None, math.nan, until - now, speed))
         now = until
@@ -168,7 +228,7 @@ def speed_at(settings: Settings, time: float) -> tuple[float, float]:
     """Return the spindle speed (1/min) at a time of the warm-up, and the time at which it changes, s."""
     speed = 0.0
     for event in settings.schedule:
-        if event.at > time + SLOWEST:
+        if event.at > time + 1e-9:
             return speed, event.at
         speed = event.spindle_speed
     return speed, math.inf
@@ -176,19 +236,29 @@ def speed_at(settings: Settings, time: float) -> tuple[float, float]:
 
 def cycles(settings: Settings) -> int:
     """Return the number of probing cycles, the cold one included."""
-    return int(settings.duration // settings.interval) + 1
+    return int(settings.duration / settings.interval + 1e-9) + 1
 
 
-def _tuple(place: Array) -> tuple[float, float, float]:
+def due(settings: Settings, number: int, now: float) -> int:
+    """Return which cycle is next at a time since the cold one began, s, if it is ``number`` or a later one.
+
+    One that is late is made at once; one whose successor is due as well is left out.
+    """
+    return max(number, int((now + SHORTEST) // settings.interval))
+
+
+def following(settings: Settings, last: float) -> int:
+    """Return which cycle follows one that began at a time since the cold one began, s."""
+    return int((last + SHORTEST) // settings.interval) + 1
+
+
+def planned_history(part: Part, settings: Settings) -> tuple[float, float]:
+    """Return mean spindle speed (1/min) and mean feed (m/s) from the cycle before to this one."""
+    turned = math.fsum(step.spindle_speed * step.seconds for step in part.warm_up)
+    way = math.fsum(step.feed * step.seconds for step in part.warm_up if step.place is not None)
+    return turned / settings.interval, way / settings.interval
+
+
+def _tuple(place: Array) -> Place:
     x, y, z = (float(value) for value in place)
     return x, y, z
-
-
-def planned_history(settings: Settings, number: int) -> tuple[float, float]:
-    """Return mean spindle speed (1/min) and mean feed (m/s) between two cycles as the settings plan them."""
-    if number == 0:
-        return 0.0, 0.0
-    steps = warm_up_steps(settings, (number - 1) * settings.interval, number * settings.interval)
-    turned = math.fsum(step.spindle_speed * step.seconds for step in steps)
-    way = math.fsum(step.feed * step.seconds for step in steps if step.place is not None)
-    return turned / settings.interval, way / settings.interval

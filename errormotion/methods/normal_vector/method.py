@@ -12,7 +12,7 @@ from errormotion.methods.normal_vector.settings import Settings as BallSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 SCHEMA = "errormotion.raw.normal_vector/1"
 
@@ -35,7 +35,7 @@ class NormalVector:
         ),
     )
     needs: ClassVar[Needs] = Needs(
-        instruments=("controller", "touch_probe"), raw_schema=SCHEMA, optional_instruments=("thermometer",)
+        instruments=("touch_probe",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
     )
     Settings: ClassVar[type[PluginSettings]] = BallSettings
 
@@ -44,13 +44,13 @@ class NormalVector:
         bench: Bench,
         settings: BallSettings,
         *,
-        inputs: Mapping[str, xr.Dataset],
+        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield one raw dataset a probing cycle. See ``acquisition``."""
         from errormotion.methods.normal_vector import acquisition
 
-        return acquisition.acquire(bench, settings, inputs, done)
+        return acquisition.acquire(bench, settings, done)
 
     def programs(self, settings: BallSettings) -> Mapping[str, str]:
         """Return the NC programs with which a machine makes the test by itself, the name of each file to its text."""
@@ -70,7 +70,15 @@ class NormalVector:
 
     def progress(self, settings: BallSettings) -> float:
         """Return the number of probing cycles, the cold one included."""
-        return float(settings.duration // settings.interval + 1)
+        from errormotion.methods.normal_vector.cycle import cycles
+
+        return float(cycles(settings))
+
+    def follow(self, settings: BallSettings) -> Callable[[xr.Dataset], str]:
+        """Return what tells of each cycle how far the balls have gone; see ``live``."""
+        from errormotion.methods.normal_vector.live import LiveBalls
+
+        return LiveBalls(settings).update
 
     def identify(self, raw: xr.Dataset, settings: BallSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``tool`` over ``time``.

@@ -29,6 +29,10 @@ SCHEMA = "errormotion.raw.normal_vector/1"
 FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
 """What a contact's flag says; the dataset holds its number in this list."""
 NOT_MADE = FLAGS.index("not made")
+FEWEST = 3
+"""Good touches of a ball without which a cold cycle tells nothing of it."""
+OF_THE_RUN = ("start", "cold_cycle_seconds", "clock_origin")
+"""Attributes that hold for all cycles: when the cold one began, how long it took, and the machine's clock then."""
 
 _M, _S = {"units": "m"}, {"units": "s"}
 
@@ -39,7 +43,7 @@ class Record:
     Parameters
     ----------
     bench : Bench
-        Its thermometers are read at the begin of each cycle; one that fails leaves NaN.
+        Its thermometers are read when a cycle begins; one that fails leaves NaN.
     settings : Settings
     probe : touch probe
     done : Dataset, optional
@@ -55,7 +59,7 @@ class Record:
 
     def __init__(self, bench: Bench, settings: Settings, probe: Any, done: xr.Dataset | None) -> None:
         self.settings = settings
-        self.first = 0 if done is None else int(done.sizes["time"])
+        self.first = 0 if done is None else cycle.following(settings, float(done["time"].values[-1]))
         self.tip_radius = float(settings.tip_radius or probe.tip_radius)
         stated = settings.touch_noise or float(probe.noise)
         self.noise = float(stated) if math.isfinite(stated) else None
@@ -66,11 +70,12 @@ class Record:
         self._temperature = np.full(len(self._columns), np.nan)
         self._invalid: Counter[str] = Counter()
         self._timed: bool | None = None if done is None else "touch_time" in done
-        self._attrs = None if done is None else {name: done.attrs[name] for name in ("start", "cold_cycle_seconds")}
-        self._start = datetime.now(UTC).isoformat(timespec="seconds")
+        self._start = ""
+        self._attrs = None if done is None else {name: done.attrs[name] for name in OF_THE_RUN}
 
-    def read_temperatures(self) -> None:
-        """Read every thermometer; a sensor or thermometer that fails is NaN, and counted."""
+    def begin(self) -> None:
+        """Begin a cycle: read every thermometer; a sensor or thermometer that fails is NaN, and counted."""
+        self._start = self._start or datetime.now(UTC).isoformat(timespec="milliseconds")
         self._temperature[:] = np.nan
         for name, thermometer in self._thermometers.items():
             try:
@@ -84,8 +89,30 @@ class Record:
                 if math.isnan(value):
                     self._invalid[f"{channel} unknown"] += 1
 
+    def refuse_unknown_balls(self, contacts: Sequence[Contact]) -> None:
+        """Refuse a cold cycle with a ball of which too little is known to compare anything with it.
+
+        Raises
+        ------
+        InstrumentError
+            Names the balls, and what their touches came to.
+        """
+        flags: dict[int, Counter[str]] = {ball: Counter() for ball in range(len(self.settings.balls))}
+        for (ball, _), contact in zip(self._order, contacts, strict=True):
+            flags[ball][contact.flag or "good"] += 1
+        told = [
+            f"{name} ({', '.join(f'{count} {flag}' for flag, count in flags[ball].items())})"
+            for ball, name in enumerate(touching.names(self.settings))
+            if flags[ball]["good"] < FEWEST
+        ]
+        if told:
+            raise InstrumentError(
+                f"The cold cycle has too few good touches of {'; '.join(told)}; expected {FEWEST} or more of each, "
+                "for all that follows is compared with them. Are the balls where the settings say, to the approach?"
+            )
+
     def dataset(
-        self, contacts: Sequence[Contact], begin: float, origin: float, history: tuple[float, float]
+        self, contacts: Sequence[Contact], begin: float, end: float, origin: float, history: tuple[float, float]
     ) -> xr.Dataset:
         """Return the raw dataset of one cycle.
 
@@ -93,8 +120,8 @@ class Record:
         ----------
         contacts : sequence of Contact
             In the order of ``touches``; those that a broken cycle lacks are ``not made``.
-        begin : float
-            Of the cycle, s since the cold one began.
+        begin, end : float
+            Of the cycle, s since the cold one began. The end of the cold one alone counts.
         origin : float
             What the machine's clock showed then, s.
         history : (float, float)
@@ -111,8 +138,7 @@ class Record:
         if self._timed is None:
             self._timed = bool(np.isfinite(time).any())
         if self._attrs is None:
-            known = time[np.isfinite(time)]
-            self._attrs = {"start": self._start, "cold_cycle_seconds": float(known.max()) if known.size else 0.0}
+            self._attrs = dict(zip(OF_THE_RUN, (self._start, float(end), float(origin)), strict=True))
         variables: dict[str, Any] = {
             "touch": (("time", "ball", "touch", "direction"), place, _M),
             "touch_flag": (("time", "ball", "touch"), flag, {"units": "1"}),

@@ -60,15 +60,16 @@ class Settings(PluginSettings):
         default=3e-3, gt=0, description="how far behind the due contact a touch that finds nothing ends"
     )
     clearance: Length = Field(
-        default=15e-3, gt=0, description="how high the tip passes over the highest ball between two balls"
+        default=15e-3,
+        gt=0,
+        description="how high above the starts of touches the tip passes; where the probe states one, that holds",
     )
-    probing_feed: Velocity = Field(default=0.3 / MINUTE, gt=0, description="feed of the touches")
-    positioning_feed: Velocity = Field(default=5.0 / MINUTE, gt=0, description="feed of all other moves of a cycle")
-    travel: dict[Literal["X", "Y", "Z"], tuple[Length, Length]] | None = Field(
-        default=None, description="lowest and highest place of each axis: nothing moves that would leave them"
+    probing_feed: Velocity = Field(
+        default=0.3 / MINUTE, gt=0, description="feed of the touches, where the probe states none"
     )
-    max_feed: Velocity | None = Field(default=None, gt=0, description="feed above which nothing is moved")
-
+    positioning_feed: Velocity = Field(
+        default=5.0 / MINUTE, gt=0, description="feed of all other moves of a cycle, where the probe states none"
+    )
     # Warm-up
     duration: Time = Field(default=180 * MINUTE, gt=0, description="length of the warm-up behind the cold cycle")
     interval: Time = Field(
@@ -76,10 +77,21 @@ class Settings(PluginSettings):
     )
     schedule: tuple[Event, ...] = Field(default=(), description="spindle speeds over time")
     moves: tuple[tuple[Length, Length, Length], ...] = Field(
-        default=(), description="places that the machine goes to in turn between the cycles, to warm its axes"
+        default=(),
+        description="places that the machine goes to in turn between the cycles, to warm its axes; on straight ways "
+        "that no ball may stand in",
     )
     moves_feed: Velocity = Field(default=10.0 / MINUTE, gt=0, description="feed of these moves")
     settle: Time = Field(default=2.0, ge=0, description="rest after the spindle was stopped, before the first touch")
+    to_probe: tuple[str, ...] = Field(
+        default=(), description="lines of a program that put the probe into the spindle, such as 'T9 M6'"
+    )
+    to_warm_up: tuple[str, ...] = Field(
+        default=(), description="lines of a program that put the tool of the warm-up into the spindle"
+    )
+    dwell: Literal["P s", "P ms", "X s"] = Field(
+        default="P s", description="how programs write a rest: G4 with P in s, P in ms, or X in s"
+    )
 
     # Identification
     tool_axes: Axes = Field(
@@ -123,9 +135,4 @@ class Settings(PluginSettings):
             raise ValueError(f"schedule: expected times that rise; found {times} s")
         if self.normals_balls is not None and len(set(self.normals_balls)) < 4:
             raise ValueError(f"normals_balls: expected four different balls; found {', '.join(self.normals_balls)}")
-        for axis, (low, high) in (self.travel or {}).items():
-            if not low < high:
-                raise ValueError(
-                    f"travel: expected the lowest place of {axis} before the highest; found {low}, {high} m"
-                )
         return self
