@@ -15,6 +15,7 @@ from errormotion.report.canvas import BLUE, DASHES, GREEN, ORANGE, PURPLE, SKY, 
 from errormotion.report.document import Figure
 from errormotion.report.series import Curve, Event, curves, last_known, minutes_of, running
 from errormotion.report.text import UM, fixed
+from errormotion.report.timeline import events_in_words, mark
 
 LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
     "X1": (BLUE, None),
@@ -34,7 +35,7 @@ def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | No
     if not found:
         return None
     svg = _stack(errors, [found], ["µm"], done, key, titles=["Displacement"], height=1.6)
-    caption = f"All displacements in one scale.{_events_in_words(done)}"
+    caption = f"All displacements in one scale.{events_in_words(done)}"
     return Figure(svg, caption, _in_words("All displacements over time", [found], minutes_of(errors)))
 
 
@@ -52,7 +53,7 @@ def displacements(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure
         "Displacement of the spindle side relative to the workpiece side, against the reference state. L1 and L2 are "
         "the two levels of measurement. Bands: expanded uncertainty, k = 2."
     )
-    return Figure(svg, caption + _events_in_words(done), _in_words("Displacement over time", rows, minutes_of(errors)))
+    return Figure(svg, caption + events_in_words(done), _in_words("Displacement over time", rows, minutes_of(errors)))
 
 
 def tilts(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:
@@ -92,7 +93,7 @@ def temperatures(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure 
         axes.legend(handles, [" " + names[i] for i in known], loc="center left", bbox_to_anchor=(1.01, 0.5))
         axes.set_ylabel("temperature / °C")
         _time_axis(axes, time)
-        _mark_events(axes, done, named=False)
+        mark(axes, done, named=False)
 
     words = ", ".join(
         f"{names[i]} from {fixed(values[np.isfinite(values[:, i]), i][0], 1)} to "
@@ -185,7 +186,7 @@ def _stack(
             _speed_strip(panels[-1], time, np.asarray(errors["spindle_speed"].values, float))
         _time_axis(panels[-1], time)
         for i, axes in enumerate(panels[: len(rows)]):
-            _mark_events(axes, done, named=i == 0)
+            mark(axes, done, named=i == 0)
         for axes, row_ends in zip(panels, ends, strict=False):
             canvas.label_ends(axes, row_ends)
 
@@ -208,45 +209,6 @@ def _time_axis(axes: Axes, time: np.ndarray) -> None:
     axes.set_xlabel("time / min")
     if time.size > 1:
         axes.set_xlim(time[0], time[-1])
-
-
-def _mark_events(axes: Axes, done: Sequence[Event], *, named: bool) -> None:
-    low, high = axes.get_xlim()
-    inside = [event for event in done if low + 0.005 * (high - low) < event.minute < high]
-    for event in inside:
-        axes.axvline(event.minute, color="#999999", linewidth=0.6, linestyle=(0, (2, 2)), zorder=0.5)
-    if named:
-        for minute, name in _named_together(inside, 0.03 * (high - low)):
-            axes.annotate(
-                name,
-                (minute, 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(0, 2),
-                textcoords="offset points",
-                ha="center",
-                fontsize=7,
-            )
-
-
-def _named_together(inside: Sequence[Event], near: float) -> list[tuple[float, str]]:
-    """Return place and name of events by number; those closer than ``near`` share one name."""
-    groups: list[list[int]] = []
-    for i, event in enumerate(inside):
-        if groups and event.minute - inside[groups[-1][-1]].minute < near:
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    return [
-        (float(np.mean([inside[i].minute for i in group])), ", ".join(str(i + 1) for i in group)) for group in groups
-    ]
-
-
-def _events_in_words(done: Sequence[Event]) -> str:
-    later = [event for event in done if event.minute > 0]
-    if not later:
-        return ""
-    words = "; ".join(f"({i + 1}) {fixed(event.minute, 1)} min: {event.what}" for i, event in enumerate(later))
-    return f" Dashed lines: {words}."
 
 
 def _in_words(what: str, rows: list[list[Curve]], time: np.ndarray) -> str:

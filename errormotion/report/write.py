@@ -22,8 +22,11 @@ from errormotion.report import (
     crossbeam_pose,
     generic,
     multilateration,
+    normal_vector,
     provenance,
     spindle,
+    thermal_model,
+    thermal_model_check,
 )
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
@@ -80,8 +83,40 @@ def write_report(
             )
     sources = [Source(dataset, raw, dict(run or {}), provenance.read(dataset)) for dataset in datasets]
     parts = [_builder(source.errors)(source, f"p{i + 1}") for i, source in enumerate(sources)]
-    page = _page(sources, parts, title)
-    out = Path(out)
+    return _write(_page(sources, parts, title), Path(out))
+
+
+def write_model_report(
+    model: xr.Dataset, measured: xr.Dataset, out: Path, *, predicted: xr.Dataset, figures: Mapping[str, Any]
+) -> Path:
+    """Write a page that lays a thermal model against a measured campaign.
+
+    Parameters
+    ----------
+    model : Dataset
+        Schema ``errormotion.model.thermal/1``.
+    measured : Dataset
+        Error dataset of a campaign that the model was not made of.
+    out : Path
+        The file; an older one is replaced in one step.
+    predicted : Dataset
+        What the model predicts of that campaign.
+    figures : mapping
+        What the comparison found: ``rms``, ``remaining``, ``removed`` and ``held``, six numbers each.
+
+    Returns
+    -------
+    Path
+        ``out``.
+    """
+    source = Source(predicted, None, {}, provenance.read(model))
+    made = thermal_model_check.part(source, "p1", model, measured, figures)
+    known = [source, Source(measured, None, {}, provenance.read(measured))]
+    return _write(_page(known, [made], None), Path(out))
+
+
+def _write(page: str, out: Path) -> Path:
+    """Write a page beside its place, and rename it."""
     beside = out.with_name(out.name + ".part")
     try:
         beside.write_text(page, encoding="utf-8")
@@ -132,6 +167,10 @@ def _builder(errors: xr.Dataset) -> Builder:
         return beam_direction.part
     if multilateration.is_multilateration(errors):
         return multilateration.part
+    if normal_vector.is_normal_vector(errors):
+        return normal_vector.part
+    if thermal_model.is_prediction(errors):
+        return thermal_model.part
     return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 

@@ -1,0 +1,265 @@
+"""Temperature sensors: where they sit on the machine, what each of them saw, and where it saw nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from errormotion.report import canvas
+from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, or_dash
+from errormotion.report.multilateration_turntable import Dots, Ellipsoids, Lines, Scene, draw
+from errormotion.report.text import DASH, finite, fixed, integer, listed, percent
+from errormotion.report.timeline import UNKNOWN, sensor_names
+
+Array = NDArray[np.float64]
+
+_FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
+_WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
+_WIDE, _HIGH = 110.0, 18.0
+_GAPS = 60
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What one sensor saw.
+
+    Attributes
+    ----------
+    name : str
+    place : (3,)
+        On the machine, m; NaN = unknown.
+    first, low, high, last : float
+        degC, of what is known; NaN where nothing is.
+    known : float
+        Share of the instants with a value.
+    curve : (2, n)
+        Time and temperature, for a small drawing; NaN where a gap is.
+    why : str
+        Why values are missing, where it is known.
+    """
+
+    name: str
+    place: Array
+    first: float
+    low: float
+    high: float
+    last: float
+    known: float
+    curve: Array
+    why: str = ""
+
+    @property
+    def change(self) -> float:
+        """Largest departure from the first known temperature, K."""
+        up, down = self.high - self.first, self.low - self.first
+        return up if up >= -down else down
+
+    @property
+    def placed(self) -> bool:
+        """Whether its place is known."""
+        return bool(np.isfinite(self.place).all())
+
+
+def of_dataset(errors: xr.Dataset, source: Source) -> list[Sensor]:
+    """Return the sensors of a dataset with temperatures over time, their places from the instruments' settings."""
+    names = sensor_names(errors)
+    if not names:
+        return []
+    values = np.asarray(errors["temperature"].transpose("time", "sensor").values, float)
+    time = np.asarray(errors["time"].values, float)
+    where = places(source)
+    found = []
+    for i, name in enumerate(names):
+        own = values[np.isfinite(values[:, i]), i]
+        first, last = (float(own[0]), float(own[-1])) if own.size else (math.nan, math.nan)
+        low, high = finite(np.min, own), finite(np.max, own)
+        share = own.size / max(len(values), 1)
+        place = where.get(name, np.full(3, np.nan))
+        found.append(Sensor(name, place, first, low, high, last, share, np.stack([time, values[:, i]])))
+    return found
+
+
+def places(source: Source) -> dict[str, Array]:
+    """Return the place of each sensor that the instruments' settings hold, m, by the names that datasets use."""
+    found: dict[str, Array] = {}
+    for holder in (source.provenance, source.run):
+        entries = holder.get("instruments")
+        for entry in entries if isinstance(entries, (list, tuple)) else []:
+            settings = entry.get("settings") if isinstance(entry, Mapping) else None
+            given = settings.get("places") if isinstance(settings, Mapping) else None
+            for name, place in given.items() if isinstance(given, Mapping) else []:
+                point = _point(place)
+                if point is not None:
+                    # Where two instruments have a channel of one name, datasets put the instrument before it.
+                    found.setdefault(str(name), point)
+                    found[f"{entry.get('name', '')}.{name}"] = point
+    return found
+
+
+def _point(place: Any) -> Array | None:
+    try:
+        point = np.asarray(place, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    return point if point.shape == (3,) and np.isfinite(point).all() else None
+
+
+def blocks(sensors: Sequence[Sensor], key: str, beside: tuple[Sequence[str], Array] | None = None) -> list[Block]:
+    """Return the map, where any place is known, and the table.
+
+    Parameters
+    ----------
+    sensors : sequence of Sensor
+    key : str
+        Keeps identifiers apart.
+    beside : (names, (k, 3)), optional
+        What else is drawn to see where the sensors are, m.
+    """
+    if not sensors:
+        return [Text("No temperatures were recorded.", "note")]
+    placed = [sensor for sensor in sensors if sensor.placed]
+    found: list[Block] = []
+    if placed:
+        found.append(_map(placed, [sensor.name for sensor in sensors if not sensor.placed], key, beside))
+    else:
+        found.append(
+            Text(
+                "The places of the sensors on the machine are not known, and no map is drawn. State them as "
+                "'places' of the thermometer in the bench.",
+                "note",
+            )
+        )
+    return [*found, table(sensors)]
+
+
+def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, beside: tuple[Sequence[str], Array] | None) -> Figure:
+    where = np.array([sensor.place for sensor in placed])
+    names, others = beside if beside is not None else ([], np.empty((0, 3)))
+    others = np.asarray(others, float)
+    kept = [i for i in range(len(others)) if np.isfinite(others[i]).all()]
+    names, others = [names[i] for i in kept], others[kept]
+    every = np.concatenate([where, others])
+    floor = float(every[:, 2].min()) - 0.05 * max(float(np.ptp(every, axis=0).max()), 0.1)
+    largest = finite(np.max, np.abs([sensor.change for sensor in placed]))
+    parts: list[Lines | Dots | Ellipsoids] = [Lines(_floor(every, floor), _FAINT, 0.6)]
+    parts.append(Lines(np.stack([every, every * (1, 1, 0) + (0, 0, floor)], axis=1), _FAINT, 0.5, dash="2 2"))
+    if len(others):
+        parts.append(Dots(others, _STILL, 2.2, names))
+    for sensor in placed:
+        label = (
+            f"{sensor.name} {fixed(sensor.change, 1, signed=True)} K" if _known(sensor) else f"{sensor.name} unknown"
+        )
+        parts.append(Dots(sensor.place[None], _colour(sensor, largest), 3.2, [label]))
+    shade = largest / len(_WARMER)
+    caption = (
+        "Sensors at their places on the machine, with the largest change from the first known temperature. "
+        + (
+            f"Grey: within {fixed(shade, 1)} K; ochre, orange and dark red: warmer by more than {fixed(shade, 1)}, "
+            f"{fixed(2 * shade, 1)} and {fixed(3 * shade, 1)} K; blue: cooler. "
+            if largest > 0
+            else ""
+        )
+        + "Broken lines lead to the ground of the drawing."
+        + (f" Grey points: {listed(list(names))}." if len(names) else "")
+        + (f" Without a known place: {listed(list(lost))}." if lost else "")
+        + " The buttons turn it, as do the arrow keys after a click on one."
+    )
+    words = "; ".join(f"{s.name} {fixed(s.change, 1, signed=True)} K" for s in placed)
+    return Figure(draw(Scene(parts), key), caption, f"Sensors in space, with their change: {words}.")
+
+
+def _known(sensor: Sensor) -> bool:
+    return math.isfinite(sensor.change)
+
+
+def _colour(sensor: Sensor, largest: float) -> str:
+    if not _known(sensor):
+        return canvas.BLACK
+    share = sensor.change / largest if largest > 0 else 0.0
+    if share < -1 / len(_WARMER):
+        return _COOLER
+    return _WARMER[int(np.clip(len(_WARMER) * share, 0, len(_WARMER) - 1))]
+
+
+def _floor(points: Array, height: float) -> Array:
+    """Return the edges of the rectangle under all points, (4, 2, 3)."""
+    (x0, y0), (x1, y1) = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    corners = np.array([[x, y, height] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+
+def table(sensors: Sequence[Sensor]) -> Table:
+    """Return range, last value and small curve of each sensor."""
+    rows: list[list[Cell | str]] = []
+    never = "no valid reading"
+    for sensor in sensors:
+        where = ", ".join(fixed(1e3 * value, 0) for value in sensor.place) if sensor.placed else DASH
+        missing = f"{percent(1 - sensor.known)} of the instants" + (f": {sensor.why}" if sensor.why else "")
+        rows.append(
+            [
+                sensor.name,
+                or_dash(where, "place not stated"),
+                *(or_dash(fixed(v, 1), never) for v in (sensor.first, sensor.low, sensor.high, sensor.last)),
+                or_dash(fixed(sensor.change, 1, signed=True), never),
+                missing if sensor.known < 1 else "never",
+                Cell(sparkline(sensor.curve)),
+            ]
+        )
+    return Table(
+        "Temperatures in °C, and the largest change from the first that is known, in K. The small curves have "
+        "an ordinate of their own each, from its lowest to its highest value; red: no value.",
+        ["sensor", "place / mm", "first", "lowest", "highest", "last", "change", "unknown", "course"],
+        rows,
+    )
+
+
+def sparkline(curve: Array) -> Markup:
+    """Return a curve (2, n) without axes; where it is NaN, a red bar stands at the foot."""
+    time, values = curve
+    time, values = canvas.decimate(np.asarray(time, float), np.asarray(values, float), 50)
+    size = f"viewBox='0 0 {_WIDE:g} {_HIGH:g}' width='{_WIDE:g}' height='{_HIGH:g}' style='vertical-align:middle'"
+    if time.size < 2 or not time[-1] > time[0]:
+        return Markup(f"<svg {size} aria-hidden='true'></svg>")
+    x = (time - time[0]) / (time[-1] - time[0]) * (_WIDE - 2) + 1
+    known = np.isfinite(values)
+    drawn = []
+    if known.any():
+        low, span = finite(np.min, values), max(float(np.ptp(values[known])), 0.2)
+        y = _HIGH - 5 - (values - low) / span * (_HIGH - 7)
+        path = "".join(f"{'L' if i and known[i - 1] else 'M'}{x[i]:.1f} {y[i]:.1f}" for i in range(x.size) if known[i])
+        drawn.append(f"<path d='{path}' fill='none' stroke='{canvas.BLUE}' stroke-width='1.2'/>")
+    bars = _runs(x, ~known)
+    if bars:
+        path = "".join(f"M{a:.1f} {_HIGH - 1.5:g}H{b:.1f}" for a, b in bars[:_GAPS])
+        drawn.append(f"<path d='{path}' fill='none' stroke='{UNKNOWN}' stroke-width='2.5'/>")
+    last = "the last is unknown" if not known[-1] else f"the last is {fixed(float(values[-1]), 1)} °C"
+    return Markup(f"<svg {size} role='img' aria-label='course; {last}'>{''.join(drawn)}</svg>")
+
+
+def _runs(x: Array, where: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Return begin and end of each run of places, from neighbour to neighbour."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [
+        (float(x[max(start - 1, 0)]), float(x[min(stop, x.size - 1)]))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def warmest(sensors: Sequence[Sensor]) -> str:
+    """Say which sensor changed most, and which are unknown; empty without sensors."""
+    known = [sensor for sensor in sensors if _known(sensor)]
+    if not known:
+        return f"{integer(len(sensors))} sensors, none with a valid reading." if sensors else ""
+    most = max(known, key=lambda sensor: abs(sensor.change))
+    words = (
+        f"{integer(len(sensors))} temperatures; {most.name} changed most, by {fixed(most.change, 1, signed=True)} K."
+    )
+    gone = [sensor.name for sensor in sensors if not math.isfinite(sensor.last)]
+    return words + (f" Never known: {listed(gone)}." if gone else "")
