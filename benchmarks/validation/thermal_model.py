@@ -34,10 +34,11 @@ def section(seeds: int) -> Iterator[str]:
         f"{seeds} virtual machines of each kind warm up three times for {BEGINS[-1] / 3600:g} h, without the control's "
         f"own compensation, and are probed every {BEGINS[1] / 60:g} minutes ({said}). A thermal model, all of its "
         "choices left to cross-validation, learns from the first two and predicts the third, which it has not seen. "
-        "`removed`: share of the RMS that the prediction takes away, of the measured errors and of the true ones; `held`: share "
-        "of times at which measured minus predicted, or true minus predicted, lies inside its 95 % interval. Of the "
-        "displacement the RMS is that of its length at the middle of the balls. The misfit of a model is one draw for "
-        "a whole warm-up, so `held` varies from machine to machine; the lowest machine is given beside the mean."
+        "`removed`: share of the RMS that the prediction takes away, of the measured errors and of the true ones; "
+        "`held`: share of times at which measured minus predicted, or true minus predicted, lies inside its 95 % "
+        "interval. Of the displacement the RMS is that of its length at the middle of the balls. The misfit of a model "
+        "is one draw for a whole warm-up, so `held` varies from machine to machine; the lowest machine is given beside "
+        "the mean."
     )
     yield from (
         "",
