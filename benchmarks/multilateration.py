@@ -203,8 +203,12 @@ def one(way: str, m: int, places, out: str) -> None:
 def measured(way: str, m: int, layout: str, out: str, limit: float):
     """Return figures and targets of a way; or what became of it, and None."""
     command = [sys.executable, "-m", "benchmarks.multilateration", "--one", way, str(m), layout, out]
+    # More threads than one make the peers' linear algebra slower, several times so on a busy machine.
+    threads = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "MKL")}
     try:
-        done = subprocess.run(command, check=False, timeout=limit + 120, capture_output=True, text=True)
+        done = subprocess.run(
+            command, check=False, timeout=limit + 120, capture_output=True, text=True, env=os.environ | threads
+        )
     except subprocess.TimeoutExpired:
         return f"longer than {limit:.0f} s", None
     if done.returncode:
@@ -218,7 +222,7 @@ def compare(layout: str, counts: list[int], limit: float) -> None:
     print(f"\nThe same readings for all, four stations {far * 1e3:.0f} mm from the cube's middle, 1 um of noise;")
     print("error: rms of the targets against the truth; off: the furthest target from the reference.")
     print("peak: of the process; rows of errormotion hold compiled code and a warm-up with 30 000 targets, too.")
-    print(f"Load when this began: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")
+    print(f"Load when this began: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; linear algebra with one thread.")
     print(
         f"{'targets':>9} {'way':>27} {'wall':>12} {'cpu':>11} {'times ours':>10} {'peak':>10} {'its':>5} {'done':>4} "
         f"{'error':>9} {'off':>9}"

@@ -65,7 +65,7 @@ def bound(
         d = np.where(np.asarray(seen, dtype=bool), d, np.nan)
     known = None if dead_path_uncertainty is None else (np.zeros(len(U)), dead_path_uncertainty)
     problem = state_problem(d, u, noise, known)
-    determinacy.refuse_too_few(*problem.counts, problem.unknown)
+    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
     place = np.ascontiguousarray(u.T)
     return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
 

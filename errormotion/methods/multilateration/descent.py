@@ -25,7 +25,7 @@ _FITTING = 10.0
 _DAMPED = 1e-8
 _UNDAMPED = 1e-11
 _LONG = 12
-_NEAR = 1e-7
+_NEAR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _ahead(size: float, last: float) -> float:
 
 def _rehearsed(problem: Problem, stations: Stations, Z: Array) -> Stations:
     """Return the stations that a sample of the targets leads to; those given where it leads nowhere."""
-    by_target, by_station = problem.counts
+    by_target, by_station = problem.by_target, problem.by_station
     unknown = len(problem.free) - 6
     if by_station.min() < 4 or np.maximum(by_target - 3, 0).sum() < 2 * unknown:
         return stations

@@ -91,13 +91,11 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     rough : ndarray (n, 3)
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
-    refuse_nowhere(information, basis)
-    centre = target.mean(axis=0)
-    distance = float(np.sqrt(np.mean(np.sum((stations.place - centre) ** 2, axis=1))))
-    values, motions, sigma = _freedoms(information, basis, 4 * len(stations.place))
-    loose = (values < DIGITS * values[-1]) | (sigma > LOOSE * distance)
+    refuse_nowhere(information)
+    values, motions, sigma, loose = _freedoms(information, basis, stations.place, target)
     if not loose.any():
         return values
+    centre = target.mean(axis=0)
     k = int(np.count_nonzero(loose))
     freedoms = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
@@ -110,12 +108,17 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
 
 @compiled()
 def _freedoms(
-    information: Array, basis: Array, places: int
-) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
-    """Return eigenvalues of the information, its diagonal made 1, what a deviation of each does, and how far it goes.
+    information: Array, basis: Array, place: Array, target: Array
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:  # pragma: no cover - compiled
+    """Return eigenvalues of the information, its diagonal made 1; what a deviation of each does, how far, and if loose.
 
-    Sizes are those of the first so many parameters.
+    How far is that of places and dead paths.
     """
+    distance = 0.0
+    for k in range(3):
+        middle = np.mean(target[:, k])
+        distance += np.mean((place[:, k] - middle) ** 2)
+    far = LOOSE * np.sqrt(distance)
     p = len(information)
     scale, scaled = np.empty(p), np.empty((p, p))
     for i in range(p):
@@ -131,9 +134,10 @@ def _freedoms(
             factor[i, j] = scale[i] * vectors[i, j] * size
     motions, sigma = basis @ factor, np.zeros(p)
     for j in range(p):
-        for i in range(places):
+        for i in range(4 * len(place)):
             sigma[j] += motions[i, j] ** 2
-    return values, motions, np.sqrt(sigma)
+    sigma = np.sqrt(sigma)
+    return values, motions, sigma, (values < DIGITS * values[-1]) | (sigma > far)
 
 
 def describe(motion: Array, stations: Stations, centre: Array) -> str:

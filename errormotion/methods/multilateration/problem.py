@@ -33,6 +33,8 @@ class Problem:
         Nominal targets, m: the datum.
     centre : ndarray (3,)
         Their mean, m.
+    by_target, by_station : ndarray (m,), (n,)
+        How many readings count.
     """
 
     reading: Array
@@ -42,12 +44,8 @@ class Problem:
     prior: Array
     nominal: Array
     centre: Array
-
-    @cached_property
-    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Readings that count, of each target (m,) and of each station (n,)."""
-        by_target, by_station = _count(self.weight)
-        return by_target, by_station
+    by_target: NDArray[np.int64]
+    by_station: NDArray[np.int64]
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -67,14 +65,19 @@ class Problem:
     def weighted(self, weight: Array) -> Problem:
         """Return the problem with other weights (n, m); a target with fewer than three readings has no place."""
         weight[:, _count(weight)[0] < 3] = 0.0
-        return replace(self, weight=weight)
+        by_target, by_station = _count(weight)
+        return replace(self, weight=weight, by_target=by_target, by_station=by_station)
 
     def sample(self, every: int) -> Problem:
         """Return the problem of every so many-th target."""
         part = slice(every // 2, None, every)
         reading, weight = (np.ascontiguousarray(a[:, part]) for a in (self.reading, self.weight))
         extra = np.ascontiguousarray(self.extra[:, :, part])
-        return replace(self, reading=reading, weight=weight, extra=extra, nominal=self.nominal[part].copy())
+        by_target, by_station = _count(weight)
+        return replace(
+            self, reading=reading, weight=weight, extra=extra, nominal=self.nominal[part].copy(),
+            by_target=by_target, by_station=by_station,
+        )  # fmt: skip
 
     def basis(self, stations: Stations, centre: Array) -> Array:
         """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
@@ -107,13 +110,6 @@ class Sums:
     square: float
     moved: float
 
-    def turned(self, R: Array, stations: int) -> Array:
-        """Return the information when the whole, with so many stations, has been turned by R (3, 3)."""
-        B = np.eye(len(self.h))
-        for j in range(0, 4 * stations, 4):
-            B[j : j + 3, j : j + 3] = R
-        return np.asarray(B @ self.H @ B.T)
-
 
 def state_problem(
     displacement: ArrayLike,
@@ -124,14 +120,15 @@ def state_problem(
     extra_prior: ArrayLike | None = None,
 ) -> Problem:
     """Check shapes and values, and turn them into a problem."""
-    d, u = np.asarray(displacement, dtype=float), np.array(target, dtype=float, order="C")
+    d, u = np.asarray(displacement, dtype=float), np.asarray(target, dtype=float)
     if d.ndim != 2 or u.shape != (d.shape[1], 3):
         raise MethodError(
             f"expected displacements (station, target) and targets (target, 3), found {d.shape} and {u.shape}; "
             "give a row of displacements for every station and a place for every target"
         )
     n, m = d.shape
-    if not np.isfinite(u).all():
+    u, centre = _copied(np.ascontiguousarray(u))
+    if not np.isfinite(centre).all():
         raise MethodError("expected a nominal place for every target, found NaN among them; leave such targets out")
     sigma = np.asarray(noise, dtype=float)
     if sigma.ndim == 1 and len(sigma) == n:
@@ -139,7 +136,7 @@ def state_problem(
     if sigma.shape not in ((), (n, 1), (n, m)):
         raise MethodError(f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; say whose it is")
     sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
-    reading, weight, positive = _weigh(np.ascontiguousarray(d), sigma)
+    reading, weight, positive, by_target, by_station = _weigh(np.ascontiguousarray(d), sigma)
     if not positive:
         raise MethodError("expected a positive standard deviation for every reading; state the instrument's noise, m")
     c = np.zeros((0, n, m)) if extra is None else np.nan_to_num(np.asarray(extra, dtype=float))
@@ -153,7 +150,7 @@ def state_problem(
         prior[3 : 4 * n : 4] = np.where(np.isfinite(value), value, 0.0)
     if extra_prior is not None:
         precision[4 * n :] = 1.0 / np.broadcast_to(np.asarray(extra_prior, dtype=float), (len(c),)) ** 2
-    return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, _mean(u))
+    return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, centre, by_target, by_station)
 
 
 @compiled()
@@ -188,11 +185,13 @@ def _complement(place: Array, centre: Array, free: NDArray[np.bool_], Z: Array) 
 
 
 @compiled()
-def _weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:  # pragma: no cover - compiled
-    """Return readings, their weights (n, m), and whether standard deviations ((n, 1) or (n, m)) are positive."""
+def _weigh(
+    d: Array, sigma: Array
+) -> tuple[Array, Array, bool, NDArray[np.int64], NDArray[np.int64]]:  # pragma: no cover - compiled
+    """Return readings, weights (n, m), whether standard deviations ((n, 1) or (n, m)) are positive, and counts."""
     n, m = d.shape
     reading, weight, positive = np.empty((n, m)), np.empty((n, m)), True
-    count = np.zeros(m, dtype=np.int64)
+    count, by_station = np.zeros(m, dtype=np.int64), np.zeros(n, dtype=np.int64)
     for j in range(n):
         if sigma.shape[1] == m:
             bad = 0
@@ -202,6 +201,7 @@ def _weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:  # pragma: no c
                 reading[j, i] = d[j, i] if there else np.nan
                 weight[j, i] = 1.0 / sigma[j, i] if there else 0.0
                 count[i] += there
+                by_station[j] += there
         else:
             w, some = 1.0 / sigma[j, 0], 0
             for i in range(m):
@@ -210,14 +210,16 @@ def _weigh(d: Array, sigma: Array) -> tuple[Array, Array, bool]:  # pragma: no c
                 weight[j, i] = w if there else 0.0
                 count[i] += there
                 some += there
-            bad = some if not sigma[j, 0] > 0.0 else 0
+            bad, by_station[j] = some if not sigma[j, 0] > 0.0 else 0, some
         positive = positive and bad == 0
     # A target with fewer than three readings has no place.
     for i in range(m):
         if count[i] < 3:
             for j in range(n):
+                by_station[j] -= weight[j, i] > 0.0
+                count[i] -= weight[j, i] > 0.0
                 weight[j, i] = 0.0
-    return reading, weight, positive
+    return reading, weight, positive, count, by_station
 
 
 @compiled()
@@ -235,11 +237,12 @@ def _count(weight: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # pra
 
 
 @compiled()
-def _mean(u: Array) -> Array:  # pragma: no cover - compiled
-    """Return the mean (3,) of places (m, 3)."""
-    x, y, z = 0.0, 0.0, 0.0
+def _copied(u: Array) -> tuple[Array, Array]:  # pragma: no cover - compiled
+    """Return places (m, 3) of one's own, and their mean (3,)."""
+    own, x, y, z = np.empty(u.shape), 0.0, 0.0, 0.0
     for i in range(len(u)):
+        own[i, 0], own[i, 1], own[i, 2] = u[i, 0], u[i, 1], u[i, 2]
         x += u[i, 0]
         y += u[i, 1]
         z += u[i, 2]
-    return np.array([x, y, z]) / len(u)
+    return own, np.array([x, y, z]) / max(len(u), 1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.methods.multilateration import determinacy, outliers
-from errormotion.methods.multilateration.compiling import Array
+from errormotion.methods.multilateration.compiling import Array, compiled
 from errormotion.methods.multilateration.descent import State, descend
 from errormotion.methods.multilateration.examination import datum_sums
 from errormotion.methods.multilateration.kernels import settle_targets
@@ -24,7 +24,7 @@ from errormotion.methods.multilateration.weakness import carriers
 
 TOLERANCE = 1e-12
 """What a further step may still move a target, m."""
-LOOKED_AT = 128
+LOOKED_AT = 64
 """Targets on whose datum a loose freedom is judged: an even choice of them does for all."""
 _HOPELESS = 100.0
 _ROUNDS = 12
@@ -81,7 +81,7 @@ def solve(
     L_j = |u_1 - U_j|, so that the noise of the first target stays its own.
     """
     problem = state_problem(displacement, target, noise, dead_path, extra, extra_prior)
-    determinacy.refuse_too_few(*problem.counts, problem.unknown)
+    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
     places = None if station is None else np.asarray(station, dtype=float)
     start = initial_stations(problem.reading, problem.weight, problem.nominal, places)
     stations = Stations(start.place, start.dead_path, np.zeros(len(problem.extra)))
@@ -116,7 +116,7 @@ def solve(
 def _without(problem: Problem, original: Array, found: outliers.Found) -> Problem:
     """Return the problem without readings that were found wrong; ``original`` are the weights (n, m) of all."""
     problem = problem.weighted(found.applied(original))
-    determinacy.refuse_too_few(*problem.counts, problem.unknown)
+    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
     return problem
 
 
@@ -150,7 +150,7 @@ def conclude(
     motion = Motion.of(sums, problem.centre)
     stations, target = motion.stations(free), moved(place, motion.a, motion.b, motion.R, openness)
     Z = problem.basis(stations, motion.b)
-    information = Z.T @ state.sums.turned(motion.R, len(start)) @ Z
+    information = _within(state.sums.H, Z, motion.R, len(start))
     # A loose freedom is judged in the datum of some of the targets.
     sample = np.flatnonzero(carries)[:: max(1, int(sums[0]) // LOOKED_AT)]
     GG, _, GF = datum_sums(
@@ -162,15 +162,30 @@ def conclude(
         motion.b,
     )
     determinacy.refuse_nowhere(GG, GF)
-    basis = Z - stations.motions(motion.b) @ np.linalg.lstsq(GG, GF @ Z)[0]
+    basis = _in_datum(Z, stations.motions(motion.b), GG, GF)
     values = determinacy.refuse_loose(information, basis, stations, target[sample], start)
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
-    by_target, by_station = problem.counts
     known = int(np.count_nonzero(problem.free & (problem.precision > 0)))
-    freedom = int(by_station.sum()) + known - 3 * int(np.count_nonzero(by_target >= 3)) - W.shape[1]
+    freedom = int(problem.by_station.sum()) + known - 3 * int(np.count_nonzero(problem.by_target >= 3)) - W.shape[1]
     sigma0 = float(np.sqrt(state.sums.square / freedom)) if freedom > 0 else np.nan
     found = found or outliers.Found.none(problem.weight)
     return Network(
         target, stations, problem.reading, problem.weight, found.left_out, found.undecided, sigma0, freedom,
         state.passes, state.converged, float(values[-1] / values[0]), problem.extra, carries, motion.b, W, rough,
     )  # fmt: skip
+
+
+@compiled()
+def _within(H: Array, Z: Array, R: Array, stations: int) -> Array:  # pragma: no cover - compiled
+    """Return the information H within the columns of Z when the whole, with so many stations, has been turned by R."""
+    B = np.eye(len(H))
+    for j in range(0, 4 * stations, 4):
+        B[j : j + 3, j : j + 3] = R
+    C = B.T @ Z
+    return C.T @ H @ C
+
+
+@compiled()
+def _in_datum(Z: Array, T: Array, GG: Array, GF: Array) -> Array:  # pragma: no cover - compiled
+    """Return Z less the motions T of the whole that its columns make of the targets."""
+    return Z - T @ np.linalg.lstsq(np.ascontiguousarray(GG), np.ascontiguousarray(GF) @ Z)[0]

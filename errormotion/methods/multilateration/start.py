@@ -29,6 +29,7 @@ FLAT = 1e-3
 """Targets thinner than this share of their extent lie in a plane, or on a line."""
 FITS = 0.01
 """A station whose readings fit the nominal targets worse than this share of their extent is not found."""
+_ENOUGH = 1e-3
 _STEPS = 30
 _REWEIGHTED = 8
 _DRAWS, _FEW = 60, 8
@@ -64,6 +65,8 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
         )
     normal = axes[:, 0] if spread[2] < FLAT else None
     places, dead_paths = np.empty((n, 3)), np.empty(n)
+    if normal is None and _at_once(reading, weight, target, centre, _ENOUGH * extent, places, dead_paths):
+        return Start(places, dead_paths)
     for j in range(n):
         d, u = _taken(reading[j], weight[j], target, centre, SOME)
         rough = None if station is None or not np.isfinite(station[j]).all() else station[j] - centre
@@ -91,18 +94,17 @@ def _some(count: int, most: int) -> slice:
 
 @compiled()
 def _shape(target: Array, every: int) -> tuple[Array, float, Array]:  # pragma: no cover - compiled
-    """Return the mean (3,) of targets (m, 3), their extent, m, and products (3, 3) about the mean of every so many."""
-    centre, low, high, products = np.zeros(3), target[0].copy(), target[0].copy(), np.zeros((3, 3))
-    for k in range(3):
-        total, least, most = 0.0, target[0, k], target[0, k]
-        for i in range(len(target)):
-            total += target[i, k]
-            least, most = min(least, target[i, k]), max(most, target[i, k])
-        centre[k], low[k], high[k] = total / len(target), least, most
-    for i in range(0, len(target), every):
+    """Return mean (3,), extent, m, and products (3, 3) about the mean of every so many-th of targets (m, 3)."""
+    some = target[::every]
+    centre, low, high, products = np.zeros(3), some[0].copy(), some[0].copy(), np.zeros((3, 3))
+    for i in range(len(some)):
+        for k in range(3):
+            centre[k] += some[i, k] / len(some)
+            low[k], high[k] = min(low[k], some[i, k]), max(high[k], some[i, k])
+    for i in range(len(some)):
         for k in range(3):
             for h in range(3):
-                products[k, h] += (target[i, k] - centre[k]) * (target[i, h] - centre[h])
+                products[k, h] += (some[i, k] - centre[k]) * (some[i, h] - centre[h])
     return centre, math.sqrt(np.sum((high - low) ** 2)), products
 
 
@@ -249,7 +251,7 @@ def _reversed(d: Array, u: Array, found: Array, normal: Array | None, scale: flo
 
 def _best(guesses: Iterable[Array], d: Array, u: Array) -> tuple[Array, float]:
     """Return the best (U, L) from some guesses, and the robust scale of its residuals, m."""
-    enough, found = 0.1 * FITS * _shape(u, len(u))[1], []
+    enough, found = _ENOUGH * _shape(u, 1)[1], []
     for guess in guesses:
         found.append(_sharpened(guess, d, u))
         if found[-1][1] < enough:
@@ -308,6 +310,26 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:  # pragma: 
         if settled:
             break
     return x, scale
+
+
+@compiled()
+def _at_once(
+    reading: Array, weight: Array, target: Array, centre: Array, enough: float, place: Array, dead_path: Array
+) -> bool:  # pragma: no cover - compiled
+    """Fill places (n, 3) and dead paths (n,) of stations that plain readings tell; whether they tell all."""
+    for j in range(len(reading)):
+        d, u = _taken(reading[j], weight[j], target, centre, SOME)
+        if len(d) < 5:
+            return False
+        x = _linear(d, u)
+        # A sign reversed is looked into where the distances would be negative.
+        if not x[3] + np.median(d) >= 0.0:
+            return False
+        x, scale = _sharpened(x, d, u)
+        if not scale < enough:
+            return False
+        place[j], dead_path[j] = x[:3] + centre, x[3]
+    return True
 
 
 def _scale(r: Array) -> float:

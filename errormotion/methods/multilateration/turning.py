@@ -25,10 +25,7 @@ class Motion:
 
         The rotation is that of Kabsch: from the singular vectors of the targets' cross products.
         """
-        n, a, b = moments[0], moments[1:4] / moments[0], moments[4:7] / moments[0]
-        U, _, Vt = np.linalg.svd(moments[7:].reshape(3, 3) - n * np.outer(b, a))
-        U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
-        return cls(centre + a, centre + b, U @ Vt)
+        return cls(*_fitted(moments, centre))
 
     def stations(self, stations: Stations) -> Stations:
         """Return the stations moved."""
@@ -44,6 +41,15 @@ def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.b
     motion = Motion.of(moments(place, nominal, used, centre), centre)
     everywhere = np.zeros(len(target))
     return motion.stations(stations), moved(place, motion.a, motion.b, motion.R, everywhere), motion.R
+
+
+@compiled()
+def _fitted(moments: Array, centre: Array) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
+    n, a, b = moments[0], moments[1:4] / moments[0], moments[4:7] / moments[0]
+    U, _, Vt = np.linalg.svd(moments[7:].copy().reshape(3, 3) - n * np.outer(b, a))
+    if np.linalg.det(U @ Vt) < 0.0:
+        U[:, 2] *= -1.0
+    return centre + a, centre + b, U @ Vt
 
 
 @compiled()
