@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -25,6 +25,7 @@ app.add_typer(bench_app, name="bench")
 model_app = typer.Typer(no_args_is_help=True, help="Thermal models: errors from temperatures.", rich_markup_mode=None)
 app.add_typer(model_app, name="model")
 
+Control = Literal["virtual", "linuxcnc"]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: what the campaign says.")]
 
@@ -51,9 +52,17 @@ def root(
 @guarded
 def demo(
     runs: Annotated[Path, typer.Option(help="Folder for the run folders.")] = Path("runs"),
+    controller: Annotated[
+        Control, typer.Option(help="What controls the machine; linuxcnc: the real one, which has to be installed.")
+    ] = "virtual",
     json_: Json = False,
 ) -> None:
-    """Measure the spindle drift of a virtual machine, and compare it to the truth."""
+    """Measure a virtual machine, and compare the result to the truth: spindle drift, or probing under LinuxCNC."""
+    if controller == "linuxcnc":
+        from errormotion.cli import probing_demonstration
+
+        probing_demonstration.run(runs, json_)
+        return
     from errormotion.cli import demonstration
 
     demonstration.run(runs, json_)
@@ -340,9 +349,10 @@ def model_predict(
 def model_check(
     model: Annotated[Path, typer.Argument(help="A thermal model.")],
     errors: Annotated[Path, typer.Argument(help="Measured errors that it was not made of: NetCDF or a run folder.")],
+    report: Annotated[Path | None, typer.Option(help="Write a page that shows the comparison, .html.")] = None,
     json_: Json = False,
 ) -> None:
     """Compare what a model predicts with what was measured."""
     from errormotion.cli import modelling
 
-    modelling.examine(model, errors, json_)
+    modelling.examine(model, errors, report, json_)

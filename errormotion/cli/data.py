@@ -140,15 +140,11 @@ def report(run: Path, out: Path | None, as_json: bool) -> None:
 
     if run.is_dir():
         folder = RunFolder.open(run)
+        path = write_run_report(run, out)
         if out is None:
-            path = write_run_report(run)
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
-        else:
-            raw = datasets.load(folder.raw) if folder.raw.exists() else None
-            files = sorted(run.glob("errors/*/errors.nc"))
-            path = write_report([datasets.load(file) for file in files], out, raw=raw, run=folder.data)
     else:
         path = write_report(datasets.load(run), out or run.with_suffix(".html"))
     if as_json:
