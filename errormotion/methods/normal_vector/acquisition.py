@@ -73,7 +73,7 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
             f"The spindle will turn at up to {fastest:g} /min with the probe in it. If the probe is not made for that, "
             "say in the settings by which lines of a program the tool is changed: to_probe, to_warm_up."
         )
-    measure = probe.measure if active else _ByProgram(probe, control, settings, record.tip_radius).measure
+    measure = probe.measure if active else _ByProgram(probe, control, record).measure
     yield from _driven(Warming(control, settings, done), measure, record)
 
 
@@ -103,6 +103,9 @@ def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.D
             yield record.dataset(contacts, begin, machine.now, machine.origin, history)
             number += 1
         machine.turn(0.0)
+    except GeneratorExit:  # nobody takes the cycles any more; the bench may be closed by now
+        machine.halt(anew=False)
+        raise
     except BaseException as error:
         why = machine.halt()
         if why and isinstance(error, InstrumentError):
@@ -130,7 +133,7 @@ def _listened(bench: Bench, probe: Any, control: Any, record: Record, done: xr.D
         broken: BaseException | None = None
         begin, history = part.number * settings.interval, cycle.planned_history(part, settings)
         try:
-            for contact in probe.measure(record.touches):
+            for contact in record.in_time(probe.measure(record.touches)):
                 if not contacts:
                     record.begin()
                     if done is not None and origin is None and not virtual:
@@ -183,9 +186,9 @@ def _any_good(contacts: list[Contact]) -> bool:
 class _ByProgram:
     """A probe that only listens, at a controller that runs a program for every cycle."""
 
-    def __init__(self, probe: Any, control: Any, settings: Settings, tip_radius: float) -> None:
-        self._probe, self._control = probe, control
-        self._text = programs.cycle_program(settings, tip_radius)
+    def __init__(self, probe: Any, control: Any, record: Record) -> None:
+        self._probe, self._control, self._record = probe, control, record
+        self._text = programs.cycle_program(record.settings, record.tip_radius)
 
     def measure(self, touches: list[Touch]) -> Iterator[Contact]:
         """Run the program of a cycle, and yield what it has printed; also where it ended in alarm."""
@@ -197,7 +200,7 @@ class _ByProgram:
         usual = self._probe.settings
         self._probe.configure(_impatient(usual))  # all lines are there, or on the wire
         try:
-            yield from self._probe.measure(touches)
+            yield from self._record.in_time(self._probe.measure(touches))
         except InstrumentError as error:
             raise failure or error from error
         finally:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +70,7 @@ class Record:
         self._temperature = np.full(len(self._columns), np.nan)
         self._invalid: Counter[str] = Counter()
         self._timed: bool | None = None if done is None else "touch_time" in done
+        self._latest = -math.inf  # contact, on the machine's clock, s
         self._start = ""
         self._attrs = None if done is None else {name: done.attrs[name] for name in OF_THE_RUN}
 
@@ -88,6 +89,24 @@ class Record:
                 self._temperature[self._columns.index((name, channel))] = value
                 if math.isnan(value):
                     self._invalid[f"{channel} unknown"] += 1
+
+    def in_time(self, contacts: Iterable[Contact]) -> Iterator[Contact]:
+        """Yield contacts that a machine prints.
+
+        Raises
+        ------
+        InstrumentError
+            One of them was not made behind those of the cycle before: it is a line that came late, or twice.
+        """
+        before = self._latest
+        for contact in contacts:
+            if contact.time <= before:
+                raise InstrumentError(
+                    f"Expected contacts of this cycle; the machine printed one of {contact.time:.3f} s, and the cycle "
+                    f"before ended at {before:.3f} s on its clock. Was an old line sent again, or the clock set back?"
+                )
+            self._latest = contact.time if math.isfinite(contact.time) else self._latest
+            yield contact
 
     def refuse_unknown_balls(self, contacts: Sequence[Contact]) -> None:
         """Refuse a cold cycle with a ball of which too little is known to compare anything with it.

@@ -124,18 +124,20 @@ class Warming:
         self._since, self._turned, self._way = now, 0.0, 0.0
         return means
 
-    def halt(self) -> str:
-        """Stop axes and spindle, over a new connection if need be; return why that failed, if it did."""
+    def halt(self, *, anew: bool = True) -> str:
+        """Stop axes and spindle, ``anew`` over a new connection if need be; return why that failed, if it did."""
         try:
             self.control.stop(spindle=True)
-        except InstrumentError:
+        except InstrumentError as error:
+            if not anew:
+                return str(error)
             try:
                 self.control.close()
                 self.control.open()
                 self.control.stop(spindle=True)
-            except InstrumentError as error:
-                log.error("axes and spindle could not be stopped: %s", error)
-                return str(error)
+            except InstrumentError as again:
+                log.error("axes and spindle could not be stopped: %s", again)
+                return str(again)
         return ""
 
     def _fit_state(self) -> dict[str, Any]:
