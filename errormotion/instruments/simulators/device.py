@@ -44,6 +44,8 @@ class SimulatedDevice:
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         pace = address.number("pace", 0.0)
         self.world.attach(self, pace or None)
+        if clock := address.number("clock", 0.0):
+            self.world.tick(clock)
         try:
             self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
         except BaseException:

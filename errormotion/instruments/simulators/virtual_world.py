@@ -106,7 +106,7 @@ class VirtualWorld(Motion):
             raise InstrumentError(f"Time passes forwards only; found {seconds} s")
         with self._change:
             self._refuse_while_streaming("let time pass")
-            self._set_clock(self._front + seconds)
+            self._set_clock(self.time + seconds)
 
     def spindle(self, speed: float) -> None:
         """Turn the spindle at a speed, 1/min, from now on; 0 stops it. It heats the machine accordingly."""

@@ -1,6 +1,7 @@
 """The clock of a virtual world, and the thread that makes the samples of all channels in lockstep.
 
-The clock advances only while samples stream, evenly spaced or wherever a moving axis triggers them, or when it is set.
+The clock advances only while samples stream, evenly spaced or wherever a moving axis triggers them, or when it is set;
+unless it is asked to tick, for those who watch a machine that nobody orders about.
 Nobody waits for real time unless a pace is asked for: a block of samples is made for every streaming channel, then
 sent, and sending waits for the readers. The time of the world is that of the last sample that its readers have handed
 over, so that what else is asked (a temperature) belongs to it, although the samples under way are further on; and when
@@ -34,12 +35,16 @@ class SampleClock:
         Of the world.
     pace : float or None
         Simulated seconds per second; None = as fast as the readers.
+    ticking : float or None
+        Simulated seconds per second by which time goes on while nothing streams; None = it stands still.
     """
 
     name: str
 
     def __init__(self) -> None:
         self.pace: float | None = None
+        self.ticking: float | None = None
+        self._wound = time.monotonic()  # when the ticks were counted last
         self._front = 0.0  # time up to which samples have been made
         self._making = 0.0  # time up to which they are being made
         self._settings_of_clock = 0
@@ -55,10 +60,25 @@ class SampleClock:
         with self._change:
             seen = [(each.start + each.taken) / each.rate for each in self._streams if each.taken is not None]
             seen += [each.seen for each in self._triggered if each.seen is not None]
+            if not self.streaming:
+                self._count_ticks()
             return min(seen, default=self._front)
 
-    def _set_clock(self, time: float) -> None:
-        self._front = self._making = time
+    def _count_ticks(self) -> None:
+        now = time.monotonic()
+        if self.ticking is not None:
+            self._front += (now - self._wound) * self.ticking
+            self._making = self._front
+        self._wound = now
+
+    def tick(self, rate: float) -> None:
+        """Let time go on by itself from now on, in simulated seconds per second."""
+        with self._change:
+            self._wound, self.ticking = time.monotonic(), rate
+
+    def _set_clock(self, instant: float) -> None:
+        self._front = self._making = instant
+        self._wound = time.monotonic()
         self._settings_of_clock += 1
 
     def _next_instant(self) -> float:
@@ -100,8 +120,9 @@ class SampleClock:
             starting = [stream]
             if stream.sync == "MASTER":
                 starting, self._armed = [*self._armed, stream], []
+            now = self.time if not self.streaming else self._front
             for each in starting:
-                each.start = each.position = _first_sample(self._front, each.rate)
+                each.start = each.position = _first_sample(now, each.rate)
                 each.taken = None
             self._streams.extend(starting)
             if self._thread is None:
