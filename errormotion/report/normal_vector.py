@@ -48,9 +48,9 @@ _BEHIND = (
 _TOUCHES = "touches of the cycle itself"
 _KINDS = (
     (MISSING, "missing"),
-    (WRONG, "wrong, left out"),
-    (MOVED, "ball had moved"),
-    (UNDETERMINED, "cycle not determined"),
+    (WRONG, "wrong"),
+    (MOVED, "of a ball that had moved"),
+    (UNDETERMINED, "of a cycle that is not determined"),
 )
 
 
@@ -77,17 +77,14 @@ def part(source: Source, key: str) -> Part:
     )
 
 
-def _strongest(seen: Probing, first: int) -> tuple[int, float, float] | None:
-    """Return cycle, length and its standard uncertainty of the largest displacement (0) or rotation (3)."""
+def _strongest(seen: Probing, first: int) -> tuple[int, float] | None:
+    """Return cycle and length, SI, of the largest displacement (0) or rotation (3)."""
     some = seen.values[:, first : first + 3]
-    length = np.sqrt(np.nansum(some**2, axis=1))
-    length = np.where(np.isfinite(some).any(axis=1), length, np.nan)
+    length = np.where(np.isfinite(some).any(axis=1), np.sqrt(np.nansum(some**2, axis=1)), np.nan)
     if not np.isfinite(length).any() or not np.nanmax(length) > 0:
         return None
     k = int(np.nanargmax(length))
-    along = np.nan_to_num(some[k]) / length[k]
-    # Without the covariance between the three, the larger of the two ways to add them up.
-    return k, float(length[k]), float(np.nansum(np.abs(along) * seen.sigma[k, first : first + 3]))
+    return k, float(length[k])
 
 
 def _when(seen: Probing, cycle: int) -> str:
@@ -126,7 +123,7 @@ def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> 
     for first, what, (unit, size) in ((0, "displacement", unit_at(0)), (3, "rotation", unit_at(3))):
         strongest = _strongest(seen, first)
         if strongest is not None:
-            k, length, _ = strongest
+            k, length = strongest
             words.append(f"The largest {what} is {fixed(length / size, 2)} {unit}, {_when(seen, k)}.")
     speed = errors["spindle_speed"].values if "spindle_speed" in errors else np.array([])
     if np.isfinite(speed).any():
@@ -181,9 +178,9 @@ def _balls(seen: Probing) -> Block:
     if not seen.balls:
         return Text("The result names no balls.", "note")
     rows: list[list[Cell | str]] = []
-    size = np.linalg.norm(seen.displacement, axis=2)
+    size = np.where(seen.sound, np.linalg.norm(seen.displacement, axis=2), np.nan)
     for i, name in enumerate(seen.balls):
-        known = np.flatnonzero(np.isfinite(size[:, i]))
+        known = np.flatnonzero(seen.sound[:, i])
         lost = Cell("—", reason="never determined")
         if not known.size:
             rows.append([name, *[lost] * 7, "no cycle"])
@@ -233,8 +230,9 @@ def _residuals(seen: Probing, key: str) -> list[Block]:
         )
     found.append(
         Table(
-            f"The {seen.what} by ball, and the residuals of those that were used.",
-            ["ball", "used", *(name for _, name in _KINDS), "rms / µm", "largest / µm"],
+            f"The {seen.what} by ball: those used and their residuals, and those left out because they are missing or "
+            "wrong, the ball had moved, or the cycle is not determined.",
+            ["ball", "used", "missing", "wrong", "ball moved", "cycle lost", "rms / µm", "largest / µm"],
             rows,
             [("", 1), (seen.what, 5), ("residual", 2)],
         )

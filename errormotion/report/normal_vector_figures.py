@@ -26,7 +26,7 @@ def balls(seen: Probing, key: str) -> Block:
     """Return the balls in space with their displacement since the cold cycle, enlarged, coloured by time."""
     cold = _cold(seen)
     there = np.flatnonzero(np.isfinite(cold).all(axis=1))
-    size = np.linalg.norm(seen.displacement, axis=2)
+    size = np.where(seen.sound, np.linalg.norm(seen.displacement, axis=2), np.nan)
     if not there.size or not np.nan_to_num(size[:, there]).any():
         return Text("The result holds no displacements of balls, and there is nothing to draw.", "note")
     longest = finite(np.max, size[:, there])
@@ -52,6 +52,7 @@ def balls(seen: Probing, key: str) -> Block:
         parts.append(Dots(ends, canvas.BLACK, 1.6))
     k, i = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(size), size, -1.0))), size.shape)
     gone = [seen.balls[j] for j in seen.moved_balls]
+    poor = int((np.isfinite(seen.displacement).all(axis=2) & ~seen.sound).sum())
     caption = (
         f"Balls on the table where they were cold (grey), and where the machine saw them go: displacements "
         f"{integer(factor)} times enlarged, pale in the first quarter of the record, dark in the last, with a black "
@@ -62,6 +63,7 @@ def balls(seen: Probing, key: str) -> Block:
             if gone
             else ""
         )
+        + (f" Not drawn: {integer(poor)} centres that lost touches leave nearly free." if poor else "")
         + " The buttons turn it, as do the arrow keys after a click on one."
     )
     alt = f"Balls {listed(seen.balls)} in space with their displacements, {integer(factor)} times enlarged."
@@ -80,7 +82,7 @@ def _cold(seen: Probing) -> np.ndarray:
 
 
 def _last(seen: Probing, ball: int) -> int | None:
-    known = np.flatnonzero(np.isfinite(seen.displacement[:, ball]).all(axis=1))
+    known = np.flatnonzero(seen.sound[:, ball])
     return int(known[-1]) if known.size else None
 
 
@@ -102,7 +104,7 @@ def _ways(seen: Probing, cold: np.ndarray, factor: int) -> tuple[list[np.ndarray
     own: list[np.ndarray] = []
     begin, span = seen.time[0], max(float(np.ptp(seen.time)), 1e-9)
     for i in range(len(seen.balls)):
-        known = np.flatnonzero(np.isfinite(seen.displacement[:, i]).all(axis=1))
+        known = np.flatnonzero(seen.sound[:, i])
         known = known[np.unique(np.linspace(0, known.size - 1, _CYCLES).astype(int))] if known.size else known
         place = cold[i] + factor * seen.displacement[known, i]
         for a, b, k in zip(place, place[1:], known[1:], strict=False):
@@ -140,7 +142,7 @@ def residuals(seen: Probing, key: str) -> Block:
     out = np.array([int((seen.left_out == kind).sum()) for kind in (MISSING, WRONG, MOVED, UNDETERMINED)])
     marks = ((0, "red bars at the foot: missing"), (1, "crosses: wrong, left out"), (2, "squares: the ball had moved"))
     words = [word for k, word in marks if out[k]] + (["triangles: cycle not determined"] if out[3] else [])
-    told = f" {'; '.join(words).capitalize()}; at the edge where they lie beyond it." if words else ""
+    told = f" {'; '.join(words).capitalize()}; at the upper edge where no residual is known." if words else ""
     fewer = f" The first {_MANY} of {len(seen.balls)} balls are drawn." if len(seen.balls) > _MANY else ""
     band = " Band: twice the noise of a touch." if np.isfinite(seen.noise) else ""
     caption = f"Residuals of the {seen.what} by ball over time: measured minus fitted distance.{band}{told}{fewer}"
@@ -162,10 +164,11 @@ def _residuals_of(axes: Axes, seen: Probing, ball: int, time: np.ndarray, top: f
         (MOVED, "s", canvas.VERMILLION),
         (UNDETERMINED, "^", canvas.PURPLE),
     ):
-        where = (kind == what) & np.isfinite(y)
+        where = kind == what
+        height = np.clip(np.nan_to_num(y[where], nan=top), -top, top)
         axes.plot(
-            across[where], np.clip(y[where], -top, top), look, color=colour, markersize=3.6, markerfacecolor="none",
-            markeredgewidth=0.8, clip_on=False,
+            across[where], height, look, color=colour, markersize=3.6, markerfacecolor="none", markeredgewidth=0.8,
+            clip_on=False,
         )  # fmt: skip
     lost = across[(kind == MISSING)]
     axes.plot(lost, np.full(lost.size, -top), "|", color=timeline.UNKNOWN, markersize=6, clip_on=False)
@@ -179,7 +182,11 @@ def normals(seen: Probing, key: str) -> Block:
     """Return the published construction less the fit of all touches, and its cost, over time."""
     shown = [i for i in range(6) if np.isfinite(seen.normals[:, i]).any() and np.isfinite(seen.loss[:, i]).any()]
     if not shown:
-        return Text("What the published normals make of the balls is not part of this result.", "note")
+        return Text(
+            "What the published normals make of the balls is not part of this result; the remarks on the data's "
+            "quality say why.",
+            "note",
+        )
     panels = []
     if not seen.by_normals:
         for title, first, (unit, size) in (("displacements", 0, UM), ("rotations", 3, SECOND_OF_ARC)):
@@ -199,7 +206,9 @@ def normals(seen: Probing, key: str) -> Block:
         timeline.Line(FREEDOMS[i], seen.loss[:, i], None, canvas.COLOURS[i % 3], None if i < 3 else (4, 2))
         for i in shown
     ]
-    panels.append(timeline.Panel("Cost: standard uncertainty by the normals over that of the fit", "", cost, 1.1))
+    panels.append(
+        timeline.Panel("Cost: standard uncertainty by the normals over that of the fit", "", cost, 1.1, legend=True)
+    )
     spans = "; ".join(panel.in_words() for panel in panels)
     caption = (
         "The published construction, the turn of the normals of two planes through four balls, beside the fit of all "

@@ -26,6 +26,10 @@ def is_normal_vector(errors: xr.Dataset) -> bool:
     return errors.attrs.get("method") == "normal_vector" and errors["EX"].dims == ("time",)
 
 
+_POOR = 5.0
+"""Times the median uncertainty of the centres, beyond which one is no longer drawn."""
+
+
 @dataclass(frozen=True)
 class Probing:
     """A warm-up seen by probing, SI; NaN where something is not known.
@@ -83,6 +87,15 @@ class Probing:
         return np.asarray(self.left_out == USED)
 
     @property
+    def sound(self) -> NDArray[np.bool_]:
+        """Centres that are known about as well as others, (t, ball): a lost touch can leave one nearly free."""
+        worst = np.max(self.centre_u, axis=2) if self.centre_u.size else np.empty(self.displacement.shape[:2])
+        known = worst[np.isfinite(worst)]
+        limit = _POOR * float(np.median(known)) if known.size else np.inf
+        there = np.isfinite(self.displacement).all(axis=2)
+        return np.asarray(there & ~(worst > limit))
+
+    @property
     def moved_balls(self) -> list[int]:
         """Balls that moved on their own at any time."""
         return [i for i in range(len(self.balls)) if bool(self.moved[:, i].any())]
@@ -102,8 +115,8 @@ class Probing:
         """Return why a freedom is unknown throughout."""
         if self.tool_axes and self.tool_axes != "XYZ" and index >= 3:
             return (
-                f"not seen: only {' and '.join(self.tool_axes)} carry the tool, and the balls do not show this "
-                "rotation of the frame of axes"
+                f"not seen: of the axes only {' and '.join(self.tool_axes)} move the tool, and the balls do not "
+                "show this rotation of the frame of axes"
             )
         return "not observed by this method"
 

@@ -24,6 +24,7 @@ _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
 _WIDE, _HIGH = 110.0, 18.0
 _GAPS = 60
+_LEAST = 0.5  # K: changes below it are not coloured
 
 
 @dataclass(frozen=True)
@@ -152,19 +153,19 @@ def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, beside: tuple[
     parts.append(Lines(np.stack([every, every * (1, 1, 0) + (0, 0, floor)], axis=1), _FAINT, 0.5, dash="2 2"))
     if len(others):
         parts.append(Dots(others, _STILL, 2.2, names))
+    shade = max(largest / len(_WARMER), _LEAST)
     for sensor in placed:
         label = (
             f"{sensor.name} {fixed(sensor.change, 1, signed=True)} K" if _known(sensor) else f"{sensor.name} unknown"
         )
-        parts.append(Dots(sensor.place[None], _colour(sensor, largest), 3.2, [label]))
-    shade = largest / len(_WARMER)
+        parts.append(Dots(sensor.place[None], _colour(sensor, shade), 3.2, [label]))
     caption = (
         "Sensors at their places on the machine, with the largest change from the first known temperature. "
         + (
             f"Grey: within {fixed(shade, 1)} K; ochre, orange and dark red: warmer by more than {fixed(shade, 1)}, "
             f"{fixed(2 * shade, 1)} and {fixed(3 * shade, 1)} K; blue: cooler. "
-            if largest > 0
-            else ""
+            if largest >= _LEAST
+            else f"No sensor changed by {fixed(_LEAST, 1)} K. "
         )
         + "Broken lines lead to the ground of the drawing."
         + (f" Grey points: {listed(list(names))}." if len(names) else "")
@@ -179,13 +180,11 @@ def _known(sensor: Sensor) -> bool:
     return math.isfinite(sensor.change)
 
 
-def _colour(sensor: Sensor, largest: float) -> str:
+def _colour(sensor: Sensor, shade: float) -> str:
     if not _known(sensor):
         return canvas.BLACK
-    share = sensor.change / largest if largest > 0 else 0.0
-    if share < -1 / len(_WARMER):
-        return _COOLER
-    return _WARMER[int(np.clip(len(_WARMER) * share, 0, len(_WARMER) - 1))]
+    steps = sensor.change / shade
+    return _COOLER if steps <= -1 else _WARMER[int(np.clip(steps, 0, len(_WARMER) - 1))]
 
 
 def _floor(points: Array, height: float) -> Array:
@@ -201,7 +200,7 @@ def table(sensors: Sequence[Sensor]) -> Table:
     never = "no valid reading"
     for sensor in sensors:
         where = ", ".join(fixed(1e3 * value, 0) for value in sensor.place) if sensor.placed else DASH
-        missing = f"{percent(1 - sensor.known)} of the instants" + (f": {sensor.why}" if sensor.why else "")
+        missing = Cell(percent(1 - sensor.known), reason=f"of {sensor.name}: {sensor.why}" if sensor.why else "")
         rows.append(
             [
                 sensor.name,

@@ -105,8 +105,8 @@ def _summary(numbers: Mapping[str, np.ndarray], model: xr.Dataset, out: np.ndarr
     removed, held = numbers["removed"], numbers["held"]
     least, fewest = (min(seen, key=lambda i: float(v[i])) for v in (removed, held))
     words = [
-        f"The model takes away {_share(removed[least])} % of the error's RMS or more (least: {FREEDOMS[least]}).",
-        f"Its 95 % intervals hold {_share(held[fewest])} % of the instants or more (least: {FREEDOMS[fewest]}).",
+        f"The model takes away at least {_share(removed[least])} % of an error's RMS (least of {FREEDOMS[least]}).",
+        f"Its 95 % intervals hold at least {_share(held[fewest])} % of the instants (least of {FREEDOMS[fewest]}).",
         f"It was made of {integer(float(model.attrs.get('campaigns', math.nan)))} campaigns, variant "
         f"'{model.attrs.get('variant', DASH)}', from {listed(_sources(model)) or 'no sensor'}.",
     ]
@@ -246,7 +246,7 @@ def _model(model: xr.Dataset, found: Mapping[str, Any]) -> list[Block]:
             f"Variant '{model.attrs.get('variant', DASH)}', from {listed(_sources(model)) or 'no sensor'}. "
             "Temperatures count in K since the start; there is no constant."
         ),
-        _coefficients(model),
+        *_coefficients(model),
     ]
     tried = _tried(found)
     if tried is None:
@@ -264,25 +264,29 @@ def _unit(model: xr.Dataset, k: int) -> str:
     return _UNITS.get((source, power), "")
 
 
-def _coefficients(model: xr.Dataset) -> Block:
+def _coefficients(model: xr.Dataset) -> list[Block]:
     if not model.sizes.get("feature", 0):
-        return Text("The model has no feature: it predicts nothing.", "warning")
+        return [Text("The model has no input: it predicts nothing.", "warning")]
+    return [_coefficients_of(model, range(3), "displacements"), _coefficients_of(model, range(3, 6), "rotations")]
+
+
+def _coefficients_of(model: xr.Dataset, freedoms: range, what: str) -> Table:
     coefficient = np.asarray(model["coefficient"].transpose("dof", "feature").values, float)
     C = np.asarray(model["coefficient_covariance"].transpose("dof", "feature", "feature_").values, float)
     variance = np.diagonal(C, axis1=1, axis2=2)
     rows: list[list[Cell | str]] = []
     for k, name in enumerate(model["feature"].values):
         cells = []
-        for i in range(6):
+        for i in freedoms:
             size = unit_at(i)[1]
             sigma = math.sqrt(variance[i, k]) if variance[i, k] >= 0 else math.nan
             cells.append(estimate(coefficient[i, k] / size, 2 * sigma / size, reason=_UNSEEN))
         low, high = (significant(float(model[side].values[k]), 3) for side in ("feature_low", "feature_high"))
         rows.append([str(name), _unit(model, k), f"{low} to {high}", *cells])
     return Table(
-        "Coefficients: error per unit of each input. After ±: expanded uncertainty, k = 2; the coefficients of "
-        "one error are not independent. Range: what the input covered in training.",
-        ["input", "unit", "range", *(f"{name} / {unit_at(i)[0]}" for i, name in enumerate(FREEDOMS))],
+        f"Coefficients of the {what}: error per unit of each input. After ±: expanded uncertainty, k = 2; the "
+        "coefficients of one error are not independent. Range: what the input covered in training.",
+        ["input", "unit", "range", *(f"{FREEDOMS[i]} / {unit_at(i)[0]}" for i in freedoms)],
         rows,
     )
 

@@ -27,6 +27,7 @@ DOTTED = 80
 UNKNOWN = "#B3261E"
 _HOUR, _DAY = 3600.0, 86400.0
 _SHADE = "#f3c9a8"
+_LEAST = 1.0  # K: no axis of temperatures spans less, and its noise does not look like warming
 _LEGEND_ROW = 0.135  # inch
 _LOOKS = tuple((colour, dash) for dash in canvas.DASHES for colour in canvas.COLOURS)
 
@@ -235,6 +236,9 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
             axes.plot(time[single], line.values[single], "o", color=line.colour, markersize=1.8, markeredgewidth=0)
     axes.margins(y=0.08)
     if panel.legend:
+        low, high = axes.get_ylim()
+        if high - low < _LEAST:
+            axes.set_ylim((low + high - _LEAST) / 2, (low + high + _LEAST) / 2)
         curves = [drawn for drawn in axes.get_lines() if drawn.get_linestyle() != "None"]
         axes.legend(
             curves, [" " + line.name for line in panel.lines], loc="center left", bbox_to_anchor=(1.005, 0.5),

@@ -21,6 +21,7 @@ from errormotion.report import (
     crossbeam,
     crossbeam_pose,
     generic,
+    monitor,
     multilateration,
     normal_vector,
     provenance,
@@ -51,7 +52,7 @@ def write_report(
     Parameters
     ----------
     errors : Dataset or sequence of Dataset
-        Error datasets, one chapter each.
+        Error datasets, one chapter each; the log of a monitor is a chapter too.
     out : Path
         The file; an older one is replaced in one step.
     raw : Dataset, optional
@@ -75,13 +76,15 @@ def write_report(
     if not datasets:
         raise DatasetError("A report needs at least one error dataset, and none was given.")
     for dataset in datasets:
+        if monitor.is_log(dataset):
+            continue
         missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
         if missing:
             raise DatasetError(
-                f"A report is made from error datasets; this one lacks {', '.join(missing)}. "
+                f"A report is made from error datasets, or from a monitor's log; this one lacks {', '.join(missing)}. "
                 "Identify the raw dataset first."
             )
-    sources = [Source(dataset, raw, dict(run or {}), provenance.read(dataset)) for dataset in datasets]
+    sources = [Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {})) for dataset in datasets]
     parts = [_builder(source.errors)(source, f"p{i + 1}") for i, source in enumerate(sources)]
     return _write(_page(sources, parts, title), Path(out))
 
@@ -111,7 +114,7 @@ def write_model_report(
     """
     source = Source(predicted, None, {}, provenance.read(model))
     made = thermal_model_check.part(source, "p1", model, measured, figures)
-    known = [source, Source(measured, None, {}, provenance.read(measured))]
+    known = [Source(measured, None, {}, provenance.read(measured)), source]
     return _write(_page(known, [made], None), Path(out))
 
 
@@ -126,8 +129,15 @@ def _write(page: str, out: Path) -> Path:
     return out
 
 
-def write_run_report(run_folder: Path) -> Path:
-    """Write ``report.html`` into a run folder from its error datasets, its raw dataset and ``run.json``.
+def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
+    """Write the report of a run folder from its error datasets, its raw dataset and ``run.json``.
+
+    Parameters
+    ----------
+    run_folder : Path
+        Of a test, or of a monitor.
+    out : Path, optional
+        The file; without it, ``report.html`` in the folder.
 
     Raises
     ------
@@ -142,7 +152,9 @@ def write_run_report(run_folder: Path) -> Path:
     if not folder.is_dir():
         raise RunError(f"Expected a run folder, and there is none at {folder}.")
     files = sorted(folder.glob("errors/*/errors.nc"))
-    if not files:
+    raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
+    log = raw if raw is not None and not files and monitor.is_log(raw) else None
+    if not files and log is None:
         raise RunError(
             f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
         )
@@ -154,11 +166,22 @@ def write_run_report(run_folder: Path) -> Path:
             raise RunError(
                 f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
             ) from error
-    raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
-    return write_report([load(path) for path in files], folder / "report.html", raw=raw, run=run)
+    target = Path(out) if out is not None else folder / "report.html"
+    if log is not None:
+        return write_report(log, target, run=run)
+    return write_report([load(path) for path in files], target, raw=raw, run=run)
+
+
+def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return where a dataset comes from; of a log, what its run says."""
+    if monitor.is_log(dataset):
+        return {name: run[name] for name in ("instruments", "settings", "software") if run.get(name)}
+    return provenance.read(dataset)
 
 
 def _builder(errors: xr.Dataset) -> Builder:
+    if monitor.is_log(errors):
+        return monitor.part
     if crossbeam.is_campaign(errors):
         return crossbeam.part
     if crossbeam_pose.is_pose(errors):
@@ -189,7 +212,8 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
     templates.tests["table"] = lambda block: isinstance(block, Table)
     templates.tests["cell"] = lambda value: isinstance(value, Cell)
     templates.filters["kind"] = lambda block: type(block).__name__.lower()
-    identity = sha256("".join(str(s.errors.attrs.get("provenance", "")) for s in sources).encode()).hexdigest()[:12]
+    identity = sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
+    logs = all(monitor.is_log(source.errors) for source in sources)
     return templates.get_template("report.html.j2").render(
         title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
         heading=title or parts[0].title,
@@ -198,10 +222,19 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
         replayed=provenance.replayed(everything),
         parts=parts,
         several=len(parts) > 1,
+        kind="Log" if logs else "Test report",
+        stated=not logs,
         identity=identity,
         version=errormotion.__version__,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
+
+
+def _identity(source: Source) -> str:
+    if monitor.is_log(source.errors):
+        attributes = source.errors.attrs
+        return f"{source.run.get('id')} {attributes.get('start')} {source.errors.sizes['time']}"
+    return str(source.errors.attrs.get("provenance", ""))
 
 
 def _truth(sources: Sequence[Source]) -> str:
@@ -222,14 +255,17 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
         return DASH
 
     attributes, test = errors.attrs, known("test", "name")
+    method = [
+        ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
+        ("Reference state", str(attributes.get("reference", DASH))),
+    ]
     instruments = provenance.instruments(source.provenance)
     return [
         ("Machine", machine),
         ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
         ("Measured", _moment(known("started", "start", "created"))),
         ("Operator", known("operator")),
-        ("Method", f"{attributes.get('method', DASH)}, version {attributes.get('method_version', DASH)}"),
-        ("Reference state", str(attributes.get("reference", DASH))),
+        *([] if monitor.is_log(errors) else method),
         ("Run", known("id", "run")),
         ("Instruments", "; ".join(_instrument(row) for row in instruments) or DASH),
     ]
