@@ -20,6 +20,9 @@ _TURNS = 12
 _ELEVATION = np.radians(24.0)
 _FIXED = ((0.0, np.pi / 2, "from above"), (0.0, 0.0, "along Y"), (np.pi / 2, 0.0, "along X"))
 _INK = "#222222"
+_LETTER, _LINE = 5.2, 9.5  # width of a letter and height of a line of the names, points
+
+_Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -109,17 +112,20 @@ def draw(scene: Scene, key: str) -> Markup:
 
 
 def _picture(scene: Scene, R: Array, centre: Array, scale: float, name: str) -> str:
-    drawn = [_triad(R)]
+    drawn, taken = [_triad(R)], list[_Box]()
 
     def flat(places: Array) -> Array:
         seen = (places - centre) @ R[:2].T * scale
         return np.asarray(seen * (1, -1) + (WIDE / 2, HIGH / 2))
 
     for part in scene.parts:
+        if isinstance(part, Dots) and part.names:
+            taken += [_around(float(x), float(y), part.radius) for x, y in flat(part.places)]
+    for part in scene.parts:
         if isinstance(part, Lines):
             drawn.append(_lines(part, flat(part.ends)))
         elif isinstance(part, Dots):
-            drawn.append(_dots(part, flat(part.places)))
+            drawn.append(_dots(part, flat(part.places), taken))
         else:
             drawn.append(_ellipses(part, flat(part.places), R, scale))
     return f"<svg id='{name}' viewBox='0 0 {WIDE:g} {HIGH:g}' aria-hidden='true'>{''.join(drawn)}</svg>"
@@ -141,15 +147,39 @@ def _lines(part: Lines, ends: Array) -> str:
     return f"<path d='{path}' fill='none' stroke='{part.colour}' stroke-width='{part.width:g}'{dash}/>"
 
 
-def _dots(part: Dots, places: Array) -> str:
+def _dots(part: Dots, places: Array, taken: list[_Box]) -> str:
+    """Draw points; names are set where they hide none of those that are ``taken`` already, if there is such a place."""
     r = part.radius
     path = "".join(f"M{x - r:.1f} {y:.1f}a{r} {r} 0 1 0 {2 * r} 0a{r} {r} 0 1 0 {-2 * r} 0" for x, y in places)
-    names = "".join(
-        f"<text x='{x + r + 3:.1f}' y='{y - r - 2:.1f}' font-size='8.5' font-weight='bold' fill='{part.colour}'>"
-        f"{escape(name)}</text>"
-        for (x, y), name in zip(places, part.names, strict=False)
-    )
+    names = ""
+    for (x, y), name in zip(places, part.names, strict=False):
+        box = _free(float(x), float(y), r, _LETTER * len(name), taken)
+        taken.append(box)
+        names += (
+            f"<text x='{box[0]:.1f}' y='{box[3] - 2:.1f}' font-size='8.5' font-weight='bold' fill='{part.colour}'>"
+            f"{escape(name)}</text>"
+        )
     return f"<path d='{path}' fill='{part.colour}'/>{names}"
+
+
+def _around(x: float, y: float, r: float) -> _Box:
+    return x - r, y - r, x + r, y + r
+
+
+def _free(x: float, y: float, r: float, width: float, taken: Sequence[_Box]) -> _Box:
+    """Return where a name of this width goes beside a point: left, top, right and bottom of its box."""
+    beside = [
+        (left, y + down, left + width, y + down + _LINE)
+        for down in (-r - _LINE, r, -_LINE / 2, -r - 2 * _LINE, r + _LINE)
+        for left in (x + r + 3, x - r - 3 - width)
+    ]
+    for box in beside:
+        inside = box[0] > 0 and box[1] > 0 and box[2] < WIDE and box[3] < HIGH
+        if inside and not any(
+            box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3] for other in taken
+        ):
+            return box
+    return beside[0]
 
 
 def _ellipses(part: Ellipsoids, places: Array, R: Array, scale: float) -> str:
