@@ -77,26 +77,31 @@ def foresee(model: Path, data: Path, out: Path, as_json: bool) -> None:
         show(f"  note: {note}")
 
 
-def examine(model: Path, errors: Path, as_json: bool) -> None:
+def examine(model: Path, errors: Path, report: Path | None, as_json: bool) -> None:
     """Compare what the model predicts of a campaign with what was measured in it.
 
     Raises
     ------
     DatasetError
-        The model or the errors cannot be read, or do not belong together.
+        The model or the errors cannot be read, or do not belong together, or the page is to have another name.
     """
-    found = check(ThermalModel.load(model), errors_of(errors))
+    if report is not None and report.suffix != ".html":
+        raise DatasetError(f"{report}: expected a name that ends in .html (a page)")
+    used, measured = ThermalModel.load(model), errors_of(errors)
+    found = check(used, measured)
+    figures = {name: getattr(found, name) for name in ("rms", "remaining", "removed", "held")}
+    if report is not None:
+        from errormotion.report import write_model_report
+
+        write_model_report(used.dataset, measured, report, predicted=found.predicted, figures=figures)
     if as_json:
-        names = ("rms", "remaining", "removed", "held")
-        show_json(
-            {
-                "ok": True,
-                "outside": found.outside,
-                **{n: dict(zip(DOF, getattr(found, n).tolist(), strict=True)) for n in names},
-            }
-        )
+        numbers = {name: dict(zip(DOF, values.tolist(), strict=True)) for name, values in figures.items()}
+        page = {"report": str(report)} if report is not None else {}
+        show_json({"ok": True, "outside": found.outside, **numbers, **page})
         return
     show(text(found))
+    if report is not None:
+        show(str(report))
 
 
 def text(found: Check) -> str:
