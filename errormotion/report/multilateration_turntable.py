@@ -155,8 +155,9 @@ def _dots(part: Dots, places: Array, taken: list[_Box]) -> str:
     for (x, y), name in zip(places, part.names, strict=False):
         box = _free(float(x), float(y), r, _LETTER * len(name), taken)
         taken.append(box)
+        start = f"x='{box[0]:.1f}'" if box[0] > x else f"x='{box[2]:.1f}' text-anchor='end'"
         names += (
-            f"<text x='{box[0]:.1f}' y='{box[3] - 2:.1f}' font-size='8.5' font-weight='bold' fill='{part.colour}'>"
+            f"<text {start} y='{box[3] - 2:.1f}' font-size='8.5' font-weight='bold' fill='{part.colour}'>"
             f"{escape(name)}</text>"
         )
     return f"<path d='{path}' fill='{part.colour}'/>{names}"
