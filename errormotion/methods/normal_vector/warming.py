@@ -161,7 +161,9 @@ class Warming:
         if not self.control.identify().simulated:
             self.origin = clock - age(done)
             self.warm_from = cold
-        elif clock - float(done.attrs["clock_origin"]) > ends[-1]:  # the same virtual machine, still there
+        elif (
+            clock - float(done.attrs["clock_origin"]) >= ends[-1] - cycle.SHORTEST
+        ):  # the same virtual machine, still there
             self.origin = float(done.attrs["clock_origin"])
             self.warm_from = cold
         else:
