@@ -1,0 +1,80 @@
+"""`errormotion model check --report` and `errormotion report` of a monitor: pages from the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from errormotion import datasets
+from errormotion.cli.app import app
+from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.twin import Event, VirtualMachine
+
+OFF = {"X": False, "Y": False, "Z": False}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A model of two warm-ups, and a third one."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    machine, found = VirtualMachine("cframe", 5), []
+    for early, late in ((6000.0, 12000.0), (15000.0, 4000.0), (10000.0, 14000.0)):
+        machine.start((Event(0.0, early, OFF), Event(3600.0, late)))
+        found.append(machine.truth_spindle(np.arange(0.0, 7201.0, 300.0)).load())
+    fit(found[:2], Settings(variant="lagged", sensors=("spindle_front",), lags=())).save(tmp_path / "m.nc")
+    datasets.save(found[2], tmp_path / "third.nc")
+    return tmp_path
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(app, list(arguments))
+
+
+def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
+    told = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
+    assert told.exit_code == 0, told.output
+    assert told.stdout.splitlines()[-1] == "page.html"
+    assert "Thermal model against measurement" in (folder / "page.html").read_text(encoding="utf-8")
+    answer = json.loads(run("model", "check", "m.nc", "third.nc", "--report", "page.html", "--json").stdout)
+    assert answer["report"] == "page.html"
+    assert answer["removed"]["EZ"] > 0
+
+
+def test_a_page_is_not_written_over_something_else(folder: Path) -> None:
+    told = run("model", "check", "m.nc", "third.nc", "--report", "third.nc")
+    assert told.exit_code == 1
+    assert "third.nc: expected a name that ends in .html" in told.output
+
+
+def test_without_the_option_there_is_no_page(folder: Path) -> None:
+    assert run("model", "check", "m.nc", "third.nc").exit_code == 0
+    assert not list(folder.glob("*.html"))
+
+
+def test_a_monitor_gets_its_page_where_it_is_wanted(folder: Path) -> None:
+    address = "sim://cframe/t?seed=21&sensors=spindle_front,column"
+    bench = f"""\
+schema = "errormotion.bench/1"
+name = "Shop"
+machine = "Mill 5"
+[instruments.modules]
+driver = "dcon_temperature"
+address = "{address}"
+channels = ["spindle", "column"]
+places = {{ spindle = ["0 mm", "0 mm", "400 mm"] }}
+"""
+    (folder / "bench.toml").write_text(bench)
+    watched = run("monitor", "bench.toml", "--interval", "500 ms", "--duration", "2 s", "--json")
+    assert watched.exit_code == 0, watched.output
+    log = next((folder / "runs").glob("*monitor*"))
+    told = run("report", str(log), "--out", "log.html")
+    assert told.exit_code == 0, told.output
+    text = (folder / "log.html").read_text(encoding="utf-8")
+    assert "Log of a monitor" in text
+    assert "SIMULATED DATA" in text
+    assert "0, 0, 400" in text
+    assert run("report", str(log)).exit_code == 0
+    assert json.loads((log / "run.json").read_text())["report"] == "report.html"
