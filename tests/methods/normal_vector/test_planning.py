@@ -78,7 +78,6 @@ def test_touches_lie_around_the_ball_and_on_top():
         ({"balls": ({"centre": (0, 0, 0), "name": "A"}, {"centre": (1, 0, 0), "name": "A"})}, "names that differ"),
         ({"schedule": ({"at": 60.0, "spindle_speed": 1e3}, {"at": 0.0, "spindle_speed": 0.0})}, "times that rise"),
         ({"normals_balls": ("1", "2", "3", "3")}, "four different balls"),
-        ({"travel": {"X": (1.0, 0.0)}}, "lowest place of X before the highest"),
         ({"touches": 3}, "greater than or equal to 4"),
     ],
 )
