@@ -12,6 +12,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.campaign import runner
+from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.store import committed_length
@@ -96,6 +97,14 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
 
     yield write
     reset()
+
+
+def without_control(plan: CampaignPlan) -> CampaignPlan:
+    """Take the control off the bench."""
+    bench = plan.folder / "bench.toml"
+    before, _, rest = bench.read_text().partition("[instruments.control]")
+    bench.write_text(before + "[instruments.probe]" + rest.partition("[instruments.probe]")[2])
+    return load_campaign(plan.folder / "campaign.toml")
 
 
 def here(kind: str = "gantry") -> VirtualWorld:
@@ -408,3 +417,38 @@ def test_a_lost_line_costs_its_touch(lab: Lab) -> None:
     flags = raw_of(run)["touch_flag"].values
     assert np.argwhere(flags).tolist() == [[1, 0, 2]]
     assert run.data["status"] == "finished"
+
+
+def test_a_machine_without_a_control_on_the_bench_warms_up_by_the_program_that_its_operator_starts(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, runs = lab(driver="dprnt")
+    plan = without_control(plan)
+    monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
+    machine, asked = here().machine, []
+    with VirtualController("sim://gantry/controller?seed=5") as at_the_machine:
+
+        def start(message: str) -> None:
+            asked.append(message)
+            program = NormalVector().programs(plan.tests[0].settings)["warm_up.nc"]
+            at_the_machine.elapse(at_the_machine.run_program(program)["duration"] + 3.0)
+
+        (run,) = runner.run(plan, runs=runs, ask=start)
+    assert len(asked) == 1
+    assert asked[0].startswith("Start the program warm_up.nc on the machine")
+    raw, errors = raw_of(run), datasets.load(run.errors)
+    assert (raw["touch_flag"].values == 0).all()
+    np.testing.assert_allclose(raw["time"].values, [0.0, 1200.0, 2400.0], atol=45)
+    # Times count from first touch to first touch; warm cycles begin with the way from the last ball, 3 m at 5 m/min.
+    times = errors["time"].values + float(raw.attrs["clock_origin"])
+    truth = machine.truth_probing(times, errors.attrs["functional_point"])
+    for name in DOF[:3]:
+        np.testing.assert_allclose(errors[name], truth[name] - truth[name][0], atol=1e-6)
+    assert float(abs(errors["EZ"][-1])) > 3e-6
+
+
+def test_a_probe_that_has_the_machine_moved_is_refused_without_a_control(lab: Lab) -> None:
+    plan, runs = lab()
+    plan = without_control(plan)
+    with pytest.raises(RunError, match=r"'controller_probe' has the machine moved.*the bench has none"):
+        runner.run(plan, runs=runs)

@@ -28,6 +28,8 @@ TIP_RADIUS = 3e-3
 """Taken where neither the settings nor the probe say, m."""
 SHORTEST = 1e-3
 """Waits and moves below this are none, s."""
+EARLY = 0.1
+"""By so much of an interval a cycle may be early: one that is printed begins with its first touch."""
 _HERE = 1e-9  # m
 
 
@@ -248,8 +250,8 @@ def due(settings: Settings, number: int, now: float) -> int:
 
 
 def following(settings: Settings, last: float) -> int:
-    """Return which cycle follows one that began at a time since the cold one began, s."""
-    return int((last + SHORTEST) // settings.interval) + 1
+    """Return which cycle follows one that began at a time since the cold one began, s; perhaps a little early."""
+    return int(last / settings.interval + EARLY) + 1
 
 
 def planned_history(part: Part, settings: Settings) -> tuple[float, float]:
