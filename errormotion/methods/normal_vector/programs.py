@@ -8,6 +8,7 @@ in milliseconds on others: the settings choose, and the head of each program say
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -99,10 +100,9 @@ def _cycle(settings: Settings, here: cycle.Place | None, tip_radius: float | Non
     for item in cycle.itinerary(_touches(settings, tip_radius), settings.clearance, here):
         if isinstance(item, Touch):
             number += 1
-            if item.item != ball:
-                ball = item.item
-                yield f"(ball {names[ball]})"
-            yield f"G31 {_place(item.target)} F{_feed(settings.probing_feed)}"
+            comment = f" ({_plain(names[item.item])})" if item.item != ball else ""
+            ball = item.item
+            yield f"G31 {_place(item.target)} F{_feed(settings.probing_feed)}{comment}"
             yield _PRINT.format(number=number)
             yield f"G1 {_place(item.start)} F{feed}"
             here = item.start
@@ -110,6 +110,11 @@ def _cycle(settings: Settings, here: cycle.Place | None, tip_radius: float | Non
             yield f"G1 {_place(item)} F{feed}"
             here = item
     yield "PCLOS"
+
+
+def _plain(name: str) -> str:
+    """Return a name as a control's comment can have it."""
+    return re.sub(r"[^ -~]|[()]", "?", name)
 
 
 def _warm_up(settings: Settings, steps: list[Step]) -> Iterator[str]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.methods.normal_vector import NormalVector, Settings, cycle, touching
+from errormotion.methods.normal_vector import NormalVector, Settings, cycle
 from errormotion.methods.normal_vector.programs import CYCLE, WARM_UP, cycle_program
 from errormotion.twin import VirtualMachine
 
@@ -151,12 +151,12 @@ def test_the_tool_is_changed_while_the_spindle_stands() -> None:
     assert orders == [*cold, *["T1 M6", "M3 S9000", *cold] * 2]
 
 
-def test_balls_are_named_in_the_program() -> None:
-    chosen = settings()
-    assert [f"({name})" for name in ("ball 1", "ball 2", "ball 3")] == [
-        line for line in cycle_program(chosen).splitlines() if line.startswith("(ball")
-    ][:3]
-    assert touching.names(chosen) == ["1", "2", "3"]
+def test_the_first_touch_of_a_ball_names_it_as_a_control_can_read_it() -> None:
+    names = ("front", "Süd", "rear (left)")
+    balls = [ball | {"name": name} for ball, name in zip(BALLS, names, strict=False)]
+    lines = cycle_program(settings(balls=balls)).splitlines()
+    named = [line.partition(" (")[2] for line in lines if line.startswith("G31") and "(" in line]
+    assert named == ["front)", "S?d)", "rear ?left?)", "S?d)", "front)"]
 
 
 def test_without_balls_there_is_no_program() -> None:
