@@ -293,7 +293,7 @@ def _normals(seen: Probing, key: str) -> list[Block]:
         Table(
             "The published normals. Cost: standard uncertainty by the normals over that of the fit of all "
             "touches. After ±: expanded uncertainty, k = 2.",
-            ["error", "unit", "in the last cycle", "rms, less the fit", "cost, median", "cost, largest"],
+            ["error", "unit", "last known", "rms, less the fit", "cost, median", "cost, largest"],
             rows,
         )
     )
