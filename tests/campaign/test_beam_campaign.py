@@ -1,5 +1,6 @@
 """The example of a beam calibration, from the wires to a beam with the truth in its uncertainty, with either sensor."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -91,8 +92,11 @@ def test_raw_data_say_how_they_came_about(measured):
     assert low < readings.min() < raw["mid_range"] < readings.max() < high
 
 
-def test_a_calibration_that_is_missing_stops_the_test_before_it_measures(tmp_path):
+def test_a_calibration_that_goes_after_the_campaign_was_read_stops_the_test_before_it_measures(tmp_path):
+    there = shutil.copytree(EXAMPLE / "calibrations", tmp_path / "lab" / "calibrations")
+    gone = shutil.copy(there / "lk-h050.nc", there / "lk-h080.nc")
     plan = write(tmp_path / "lab", campaign=[('compensation = "lk-h050"', 'compensation = "lk-h080"')])
+    gone.unlink()
     with pytest.raises(RunError, match=r"'lk-h080': not found.*Calibrations there: lk-h050"):
         runner.run(plan, runs=tmp_path / "runs", ask=never)
     (folder,) = (tmp_path / "runs").glob("*-beam-*")

@@ -18,7 +18,8 @@ from errormotion.campaign.store import committed_length
 from errormotion.datasets.provenance import of
 
 RATE = 1000
-REAL_TIME = 'real_time = true\nrate = "1 kHz"\nblock = 50'
+COUNT = 40_000
+"""Samples of the run that is ended: 40 s of them, so that none is over before a slow machine ends it."""
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
@@ -33,6 +34,19 @@ def wait_for(tmp_path: Path, process: "subprocess.Popen[str]", samples: int) -> 
     raise AssertionError(f"{samples} samples did not come")
 
 
+@pytest.fixture
+def pace(tmp_path: Path) -> Path:
+    """While this file exists samples come in real time; the run that goes on takes what is left all at once."""
+    file = tmp_path / "pace"
+    file.touch()
+    return file
+
+
+@pytest.fixture
+def bench(pace: Path) -> str:
+    return f'real_time = "{pace}"\nrate = "1 kHz"\nblock = 50\n'
+
+
 def held(folder: RunFolder) -> int:
     """Return how many samples are on disk; all of them are what they should be."""
     with datasets.load(folder.raw) as raw:
@@ -41,18 +55,19 @@ def held(folder: RunFolder) -> int:
     return count
 
 
+@pytest.mark.timeout(300)  # two processes start: a minute each where six others want the processors
 def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
-    tmp_path: Path, write: Callable[..., Path], command: Start, lab: None
+    tmp_path: Path, write: Callable[..., Path], command: Start, lab: None, pace: Path, bench: str
 ) -> None:
-    campaign = write(
-        'name = "first"\nsettings = {count = 100}', 'name = "long"\nsettings = {count = 4000}', bench=REAL_TIME
-    )
+    long = f'name = "long"\nsettings = {{count = {COUNT}}}'
+    campaign = write('name = "first"\nsettings = {count = 100}', long, bench=bench)
     process = command("run", campaign)
     folder = wait_for(tmp_path, process, 1500)
     before = committed_length(folder.raw, "time")
     time.sleep(1.0)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
+    pace.unlink()
     kept = held(folder)
     # a second later at most a second is missing: what was there a second before the end is there
     assert kept >= before
@@ -65,20 +80,27 @@ def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
     found = json.loads(out)
     assert [test["status"] for test in found["tests"]] == ["finished", "finished"]
     assert found["tests"][1]["folder"] == str(folder.path)
-    assert held(folder) == 4000
-    assert of(datasets.load(Path(found["tests"][1]["errors"])))["settings"]["count"] == 4000
+    assert held(folder) == COUNT
+    assert of(datasets.load(Path(found["tests"][1]["errors"])))["settings"]["count"] == COUNT
     starts = [step["samples"] for step in RunFolder.open(folder.path).data["steps"] if step["outcome"] == "started"]
     assert starts == [0, kept]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopping_leaves_a_run_folder_that_is_whole_and_resumes(
-    tmp_path: Path, write: Callable[..., Path], command: Start, lab: None, number: signal.Signals
+    tmp_path: Path,
+    write: Callable[..., Path],
+    command: Start,
+    lab: None,
+    pace: Path,
+    bench: str,
+    number: signal.Signals,
 ) -> None:
-    process = command("run", write('name = "long"\nsettings = {count = 2500}', bench=REAL_TIME))
+    process = command("run", write(f'name = "long"\nsettings = {{count = {COUNT}}}', bench=bench))
     folder = wait_for(tmp_path, process, 700)
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
+    pace.unlink()
     assert process.returncode == 130
     assert "Interrupted" in err
     assert "Traceback" not in err
@@ -87,4 +109,4 @@ def test_stopping_leaves_a_run_folder_that_is_whole_and_resumes(
     assert folder.data["samples"]["count"] == held(folder) >= 700
     (folder,) = runner.resume(runs=tmp_path / "runs")
     assert folder.finished
-    assert held(folder) == 2500
+    assert held(folder) == COUNT

@@ -116,6 +116,7 @@ def test_temperatures_and_parameters_are_logged_on_one_clock(tmp_path: Path) -> 
         np.testing.assert_allclose(log.position, 0.0)
         np.testing.assert_allclose(log.spindle_speed, 0.0)
         assert log.attrs["machine"] == "Mill 5"
+        assert [each["identity"]["simulated"] for each in json.loads(log.attrs["instruments"])] == [True, True]
 
 
 def test_a_thermometer_that_is_unplugged_and_comes_back_leaves_a_marked_gap(tmp_path: Path) -> None:
@@ -193,15 +194,15 @@ def test_the_log_of_a_monitor_is_no_campaign_to_resume(tmp_path: Path) -> None:
 
 
 def test_the_memory_of_a_long_log_stays_where_it_is(tmp_path: Path) -> None:
-    """Three thousand rows against six hundred: what grows with the rows would be five times as much."""
+    """Twelve hundred rows against three hundred: what grows with the rows would be four times as much."""
     with Monitor(bench(CONTROL), tmp_path, 1e-3) as monitor:
         watched = monitor.watch()
         tracemalloc.start()
         try:
-            next(islice(watched, 600, None))
+            next(islice(watched, 300, None))
             early = tracemalloc.get_traced_memory()[0]
-            next(islice(watched, 2400, None))
+            next(islice(watched, 900, None))
             late = tracemalloc.get_traced_memory()[0]
         finally:
             tracemalloc.stop()
-    assert late - early < 300_000  # bytes; one row kept as it is handed over would be some 5 kB
+    assert late - early < 300_000  # bytes; rows kept as they are handed over would be 4.5 MB, at 5 kB each

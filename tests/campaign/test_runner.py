@@ -125,7 +125,7 @@ def test_resume_steps_over_finished_tests(plan: Plan, tmp_path: Path) -> None:
 def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = plan('name = "a"\nsettings = {count = 4000}', bench="real_time = false")
+    made = plan('name = "a"\nsettings = {count = 4000}', bench='rate = "1 kHz"')
     append, room = RawStore.append, 10
 
     def append_until_full(self: RawStore, chunk: object) -> None:

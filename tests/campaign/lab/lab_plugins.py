@@ -23,7 +23,8 @@ STEP = 1e-6
 class CounterSettings(PluginSettings):
     rate: Frequency = 1000.0
     block: int = 100
-    real_time: bool = False
+    real_time: Path | None = None
+    """While this file exists, samples come as fast as the rate says; otherwise all at once."""
     simulated: bool = True
     refuses: bool = False
     breaks: Path | None = None
@@ -60,7 +61,7 @@ class Counter:
             at = first + block * self.settings.block
             if broken and at >= 1000:
                 raise InstrumentError("the counter fell off the table")
-            if self.settings.real_time:
+            if self.settings.real_time is not None and self.settings.real_time.exists():
                 time.sleep(max(0.0, start + (block + 1) * self.settings.block / self.settings.rate - time.monotonic()))
             values = np.arange(at, at + self.settings.block)[None] * STEP
             yield Samples(values, at, self.settings.rate, time.monotonic(), dropped=1, invalid={"dark": 2})
