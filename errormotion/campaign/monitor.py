@@ -23,6 +23,7 @@ from uuid import uuid4
 import numpy as np
 import xarray as xr
 
+from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import RunFolder, now
 from errormotion.campaign.journal import journal
@@ -121,6 +122,7 @@ class Monitor:
         self._columns = _columns([source for source in self.sources if source is not self.controller])
         self.sensors = tuple(self._columns.values())
         self._gaps: Counter[str] = Counter()
+        self._noted: tuple[Answer, ...] = ()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -132,7 +134,7 @@ class Monitor:
             for source in self.sources:
                 source.start()
             attrs = {"schema": SCHEMA, "machine": self.plan.machine, "start": now(), "interval": self.interval}
-            attrs |= {"flag_meanings": json.dumps(list(FLAGS))}
+            attrs |= {"flag_meanings": json.dumps(list(FLAGS)), "instruments": "[]"}
             self._recorder = stack.enter_context(Recorder(self.folder.raw, "time", BLOCK, attrs))
             self._stack = stack.pop_all()
         return self
@@ -180,9 +182,18 @@ class Monitor:
                 time.sleep(ahead)
             snapshot = self._snapshot(time.monotonic() - began, tick + 1)
             self._recorder.put(self._row(snapshot))
+            self._note_instruments()
             yield snapshot
             # Ticks that a sleeping computer has missed are no rows: the times of the log show it.
             tick = max(tick + 1, math.ceil((time.monotonic() - began) / self.interval))
+
+    def _note_instruments(self) -> None:
+        """Say in the log who measures, once all have come up and whenever one comes up anew."""
+        answers = tuple(source.answer for source in self.sources if source.answer)
+        attrs = self._recorder.attrs  # those of the store, which the next commit writes
+        if "instruments" in attrs and answers != self._noted:
+            attrs["instruments"] = json.dumps(provenance.plain([answer.record() for answer in answers]))
+            self._noted = answers
 
     def _snapshot(self, at: float, logged: int) -> Snapshot:
         oldest = time.monotonic() - FRESH * self.interval

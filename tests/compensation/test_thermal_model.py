@@ -57,6 +57,16 @@ def test_the_prediction_is_an_error_dataset_with_sources(model: ThermalModel, pa
         assert float(predicted[name][0]) == 0.0
 
 
+def test_what_was_simulated_does_not_pass_for_measured(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+    behind = json.loads(pair[0].attrs["provenance"])["instruments"]
+    assert behind
+    for ds in (model.dataset, model.predict(pair[0])):
+        assert json.loads(ds.attrs["provenance"])["instruments"] == behind
+    log = pair[0].drop_vars(["EX"]).assign_attrs(provenance="{}", instruments=json.dumps([{"address": "sim://x"}]))
+    told = json.loads(model.predict(log).attrs["provenance"])["instruments"]
+    assert told == [{"address": "sim://x"}, *behind]
+
+
 def test_times_beyond_the_training_are_flagged(model: ThermalModel, pair: list[xr.Dataset]) -> None:
     hot = pair[0].copy(deep=True)
     hot["temperature"] = hot["temperature"] + 5.0 * (hot["time"] > 7200.0)

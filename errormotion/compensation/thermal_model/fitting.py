@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from errormotion.compensation.thermal_model import regression
 from errormotion.compensation.thermal_model.features import Feature, dynamics, lagged
 from errormotion.compensation.thermal_model.model import Parts, ThermalModel
-from errormotion.compensation.thermal_model.record import read_record
+from errormotion.compensation.thermal_model.record import instruments_of, read_record
 from errormotion.compensation.thermal_model.settings import Settings
 from errormotion.datasets import provenance
 from errormotion.errors import DatasetError
@@ -234,5 +234,5 @@ def _made(
         "validated": "campaigns left out whole" if len(campaigns) > 1 else "blocks in time of one campaign",
     }
     hashes = [provenance.hash_dataset(ds) for ds in campaigns]
-    where = provenance.make(settings, None, [], steps=[{"campaigns": hashes}, {"tried": table}])
+    where = provenance.make(settings, None, instruments_of(campaigns), steps=[{"campaigns": hashes}, {"tried": table}])
     return ThermalModel.of(parts, attrs, where)

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.compensation.thermal_model.features import Feature, matrix
-from errormotion.compensation.thermal_model.record import read_inputs
+from errormotion.compensation.thermal_model.record import instruments_of, read_inputs
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.schemas import DOF, Row
@@ -215,7 +215,10 @@ class ThermalModel:
             method="thermal_model",
             method_version=VERSION,
             provenance=provenance.make(
-                {"variant": ds.attrs["variant"]}, None, [], steps=[{"model": provenance.hash_dataset(ds)}]
+                {"variant": ds.attrs["variant"]},
+                None,
+                instruments_of([data, ds]),
+                steps=[{"model": provenance.hash_dataset(ds)}],
             ),
             influence=influence,
             sources=names,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -106,3 +109,14 @@ def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
     covariance = ds["covariance"].transpose("time", "dof", "dof_").values
     variance = np.diagonal(covariance, axis1=1, axis2=2).copy()
     return Record(inputs, errors, variance)
+
+
+def instruments_of(datasets: Iterable[xr.Dataset]) -> list[Any]:
+    """Return the instruments behind datasets, each once: what was simulated must not pass for measured."""
+    found: list[Any] = []
+    for ds in datasets:
+        told = json.loads(str(ds.attrs.get("provenance", "{}"))).get("instruments")
+        for instrument in told or json.loads(str(ds.attrs.get("instruments", "[]"))):
+            if instrument not in found:
+                found.append(instrument)
+    return found
