@@ -1,0 +1,151 @@
+"""Every example in the README and the docs runs as written, from top to bottom of its page, in an empty folder.
+
+``python`` blocks are executed; with ``>>>`` their output is compared. ``console`` blocks: each line that starts with
+``$`` is run, must succeed, and what follows it is compared with what it prints (``...`` stands for anything). A
+``code-block`` with a ``:caption:`` is a file and is written. Other languages (``text``, ``sh``) are only shown.
+``% skip: next`` leaves out one block.
+
+A call of ``errormotion`` runs in this process, which has its libraries loaded already: that takes seconds a command.
+Anything else runs in a shell, as does every command of the README. Workers share the pages by files of tests.
+"""
+
+import doctest
+import glob
+import os
+import re
+import shlex
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from sybil import Document, Example
+from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser, SkipParser
+from sybil.parsers.myst.lexers import DirectiveLexer
+from sybil.region import Region
+from typer.testing import CliRunner
+
+from errormotion.cli.app import app
+from errormotion.instruments import simulators
+
+ROOT = Path(__file__).parents[2]
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def _line_of_make(command: str) -> str:
+    """Return the command to run: ``make TARGET`` becomes what the Makefile does, here instead of in the repository."""
+    if not command.startswith("make "):
+        return command
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+    recipe = subprocess.run(
+        ["make", "-n", "-s", *command.split()[1:]], cwd=ROOT, env=outside, capture_output=True, text=True, check=True
+    ).stdout
+    return recipe.splitlines()[-1].replace(".venv/bin/", "")
+
+
+def _in_a_shell(command: str) -> tuple[int, str]:
+    done = subprocess.run(
+        command,
+        shell=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        text=True,
+    )
+    return done.returncode, done.stdout
+
+
+def _here(command: str) -> tuple[int, str]:
+    """Run a call of errormotion in this process; the next one finds no simulated world, as in a process of its own."""
+    words = [name for word in shlex.split(command)[1:] for name in sorted(glob.glob(word)) or [word]]
+    try:
+        result = CliRunner().invoke(app, words)
+    finally:
+        simulators.reset()
+    output = result.output
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        output += "".join(traceback.format_exception(result.exception))
+    return result.exit_code, output
+
+
+def _run(command: str, page: Path) -> tuple[int, str]:
+    plain = re.match(r"errormotion [^|&;<>$`]*$", command)
+    return _here(command) if plain and page.name != "README.md" else _in_a_shell(command)
+
+
+def run_console(example: Example) -> str | None:
+    """Run every ``$`` line of a console block; return what went wrong."""
+    first, *parts = re.split(r"^\$ ", example.parsed, flags=re.MULTILINE)
+    if first.strip() or not parts:
+        return "A console block starts with '$ ' and a command."
+    for part in parts:
+        command, _, want = part.replace("\\\n", "").partition("\n")
+        code, output = _run(_line_of_make(command), Path(example.path))
+        if code:
+            return f"$ {command}\nended with exit code {code}:\n{output}"
+        if want.strip() and not doctest.OutputChecker().check_output(want.strip(), output.strip(), FLAGS):
+            return f"$ {command}\nshould print\n{want}\nbut printed\n{output}"
+    return None
+
+
+def captioned_files(document: Document) -> list[Region]:
+    """Find the ``code-block`` directives with a caption: files that the reader is asked to write."""
+    regions = []
+    for region in DirectiveLexer("code-block")(document):
+        if name := region.lexemes["options"].get("caption"):
+            region.parsed = name, region.lexemes["source"]
+            region.evaluator = write_file
+            regions.append(region)
+    return regions
+
+
+def write_file(example: Example) -> None:
+    """Write a captioned block into the current folder."""
+    name, source = example.parsed
+    Path(name).parent.mkdir(parents=True, exist_ok=True)
+    Path(name).write_text(source)
+
+
+def parse(page: Path) -> Document:
+    """Return the page with its examples in order."""
+    parsers = [PythonCodeBlockParser(doctest_optionflags=FLAGS), CodeBlockParser("console", run_console)]
+    return Document.parse(str(page), *parsers, captioned_files, SkipParser())
+
+
+def home(page: Path) -> str:
+    """Return the file of tests that runs a page: each takes one worker about as long as the others."""
+    if page.parent.name != "how-to":
+        return "test_docs"
+    return "test_docs_measuring" if page.stem.startswith(("measure-", "calibrate-")) else "test_docs_how_to"
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "documented" not in metafunc.fixturenames:
+        return
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    file = Path(metafunc.module.__file__).stem
+    mine = [page for page in pages if page.exists() and home(page) == file and list(parse(page))]
+    metafunc.parametrize("documented", [pytest.param(page, id=str(page.relative_to(ROOT))) for page in mine])
+
+
+@pytest.fixture
+def examples() -> Callable[[Path], Document]:
+    """Return what parses a page."""
+    return parse
+
+
+@pytest.fixture
+def run_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+    """Return what runs the examples of a page in order, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def run(page: Path) -> None:
+        for example in parse(page):
+            example.evaluate()
+
+    return run

@@ -1,0 +1,14 @@
+"""Examples of the how-to pages that neither measure nor calibrate.
+
+How examples are written and run is told in conftest.py.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.timeout(400)
+def test_examples_run_as_written(documented: Path, run_examples: Callable[[Path], None]) -> None:
+    run_examples(documented)
