@@ -5,14 +5,14 @@ The equations are those of `network`. Chunks of targets and their order are thos
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from errormotion.methods.multilateration.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
+from errormotion.methods.multilateration.four_examined import Flags, datum_four, examine_four
 from errormotion.methods.multilateration.kernels import sight
-
-Flags = NDArray[np.bool_]
 
 
 @compiled()
@@ -61,10 +61,13 @@ def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover 
 def _datum_part(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, part: int, sums: Array
 ) -> None:  # pragma: no cover - compiled
-    n = len(station)
+    n, first, last = len(station), part * CHUNK, min(len(target), (part + 1) * CHUNK)
+    if n == 4 and len(extra) == 0:
+        datum_four(weight, station, target, carries, centre, first, last, sums)
+        return
     w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
     v, DG = np.empty(6), np.empty((3, 6))
-    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
+    for i in range(first, last):
         for j in range(n):
             w[j] = weight[j, i]
         if not carries[i] or not sight(w, station, target[i], e, distance, D):
@@ -142,10 +145,16 @@ def _examine_part(
     part: int,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
     stations, p = len(station), W.shape[1]
+    first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
+    if stations == 4 and len(extra) == 0:
+        examine_four(
+            weight, station, target, carries, centre, W, shift, H, K, first, last, covariance, redundancy
+        )  # fmt: skip
+        return
     w, distance, c = np.empty(stations), np.empty(stations), np.empty(3)
     e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
     DG, G, room = np.empty((3, 6)), np.zeros((3, 6)), np.empty((3, 6))
-    for i in range(part * CHUNK, min(len(target), (part + 1) * CHUNK)):
+    for i in range(first, last):
         for j in range(stations):
             w[j], redundancy[j, i] = weight[j, i], np.nan
         if not sight(w, station, target[i], e, distance, D):
@@ -235,3 +244,20 @@ def examine(
     work = _examine_shared if m > MANY else _examine_alone
     work(weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy)
     return covariance, redundancy
+
+
+@compiled()
+def residuals(
+    reading: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array
+) -> Array:  # pragma: no cover - compiled
+    """Return readings (n, m) less what stations and targets (m, 3) make of them, m."""
+    left = np.empty(reading.shape)
+    for j in range(len(station)):
+        x, y, z, d, out = station[j, 0], station[j, 1], station[j, 2], reading[j], left[j]
+        for i in range(len(target)):
+            a, b, c = target[i, 0] - x, target[i, 1] - y, target[i, 2] - z
+            out[i] = d[i] + dead_path[j] - math.sqrt(a * a + b * b + c * c)
+        for k in range(len(value)):
+            for i in range(len(target)):
+                out[i] -= value[k] * extra[k, j, i]
+    return left

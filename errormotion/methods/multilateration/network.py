@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from errormotion.methods.multilateration import determinacy, outliers
 from errormotion.methods.multilateration.compiling import Array
-from errormotion.methods.multilateration.examination import datum_sums, examine
-from errormotion.methods.multilateration.model import Stations, directions, motions, readings
+from errormotion.methods.multilateration.examination import datum_sums, examine, residuals
+from errormotion.methods.multilateration.model import Stations, directions, motions
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,8 @@ class Network:
         NaN for all others. A reading that was left out has had no say in its target's place, so that its residual
         shows its whole error.
         """
-        return self.reading - readings(self.target, self.stations, self.extra)
+        s = self.stations
+        return residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
