@@ -99,3 +99,14 @@ def test_cold_cycle_in_which_all_is_wrong_is_refused(probed):
     raw["touch"][0, 1:] = np.nan
     with pytest.raises(MethodError, match="cold cycle alone does not determine"):
         METHOD.identify(raw)
+
+
+@pytest.mark.parametrize("draw", [40, 42])
+def test_touches_that_are_missing_make_no_ball_move(probed, off, draw):
+    """A cycle that shows next to nothing of a ball along an axis accuses it of no shift of millimetres along it."""
+    machine, raw = probed("cframe", seed=1)
+    raw = machine.raw_normal_vector(raw["time"].values, seed=draw, cycle=120.0, missing=0.2)
+    errors = METHOD.identify(raw)
+    assert not moves(errors)
+    assert np.isfinite(errors["EX"].values).all()
+    assert np.nanmax(np.abs(off(machine, errors))) < 4
