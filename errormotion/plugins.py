@@ -223,10 +223,11 @@ class Method(Protocol):
     """What is measured and how it becomes an error dataset.
 
     A method may also have ``follow(settings)``: it returns a function that takes each acquired dataset and returns a
-    line of text for the person at the machine. It may have ``programs(settings)``: the NC programs with which a
-    machine makes the test, the name of each file to its text. And ``motions(settings, instruments)``: every `Step` that
-    the machine will make, with the settings of the bench's instruments by kind; they are held against the limits of
-    the bench before anything moves.
+    line of text for the person at the machine. It may have ``programs(settings, instruments)``: the NC programs with
+    which a machine makes the test, the name of each file to its text. And ``motions(settings, instruments)``: every
+    `Step` that the machine will make; they are held against the limits of the bench before anything moves. Both get
+    the settings of the bench's instruments by kind. And ``check(settings)``: what is wrong with files that settings
+    name, by setting, told when a campaign is read.
     """
 
     info: ClassVar[MethodInfo]

@@ -1,6 +1,10 @@
 """``errormotion program``."""
 
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
+from typer.testing import Result
 
 ROOT = Path(__file__).parents[2]
 GANTRY = ROOT / "examples" / "virtual_gantry" / "campaign.toml"
@@ -53,3 +57,17 @@ def test_a_program_out_of_travel_writes_nothing(run, tmp_path):
     found = run("program", tmp_path / "campaign.toml", "--out", tmp_path / "nc", code=1)
     assert "would go from Y-633.000" in found.stderr
     assert not (tmp_path / "nc").exists()
+
+
+def test_programs_of_probing_know_the_tip_of_the_bench(run: Callable[..., Result], tmp_path: Path) -> None:
+    source = Path(__file__).parents[2] / "examples" / "virtual_probing"
+    bench, campaign = ((source / name).read_text() for name in ("bench.toml", "monday.toml"))
+    targets = []
+    for radius in ("3 mm", "2 mm"):
+        (tmp_path / "bench.toml").write_text(bench.replace('tip_radius = "3 mm"', f'tip_radius = "{radius}"'))
+        (tmp_path / "campaign.toml").write_text(campaign)
+        run("program", "campaign.toml", "--out", radius)
+        lines = (tmp_path / radius / "cycle.nc").read_text().splitlines()
+        targets.append(next(line for line in lines if line.startswith("G31")))
+    first, second = (float(line.split()[1].removeprefix("X")) for line in targets)
+    assert first - second == pytest.approx(1.0)  # mm: touched from +X

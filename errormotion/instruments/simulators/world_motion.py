@@ -193,7 +193,7 @@ class Motion(SampleClock):
             elif now < self.path.end:
                 self.path = self.path.cut(now)
                 self.machine.forget(self._program_events, now)
-                self.printed = [(time, line) for time, line in self.printed if time <= now]
+                self.printed = [each for each in self.printed if each[0] <= now]  # the same ones: a printer knows them
                 if self._warm_up is not None and self._warm_up > now:
                     self._warm_up = None
             self.program = ""

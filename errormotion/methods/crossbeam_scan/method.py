@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import xarray as xr
 
@@ -67,7 +67,11 @@ class CrossbeamScan:
 
         return LiveScans(settings).update
 
-    def programs(self, settings: ScanSettings) -> Mapping[str, str]:
+    def programs(
+        self,
+        settings: ScanSettings,
+        instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
+    ) -> Mapping[str, str]:
         """Return the NC programs of a campaign, name to text."""
         from errormotion.methods.crossbeam_scan.schedule import program_texts
 

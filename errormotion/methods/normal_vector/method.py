@@ -52,11 +52,15 @@ class NormalVector:
 
         return acquisition.acquire(bench, settings, done)
 
-    def programs(self, settings: BallSettings) -> Mapping[str, str]:
-        """Return the NC programs with which a machine makes the test by itself, the name of each file to its text."""
+    def programs(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> Mapping[str, str]:
+        """Return the NC programs with which a machine makes the test by itself, the name of each file to its text.
+
+        The tip is that of the settings, else that of the bench's touch probe.
+        """
         from errormotion.methods.normal_vector.programs import programs
 
-        return programs(settings)
+        tip = getattr((instruments or {}).get("touch_probe"), "tip_radius", None)
+        return programs(settings if settings.tip_radius or not tip else settings.model_copy(update={"tip_radius": tip}))
 
     def motions(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
         """Return every step that the machine will make, for its limits and for a dry run."""
