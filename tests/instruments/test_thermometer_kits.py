@@ -11,7 +11,7 @@ class TestAdam(InstrumentConformance):
     subject = InstrumentSubject(
         ModbusTemperature,
         "sim://cframe/adam?seed=3&map=adam-6018&thermocouples=K",
-        settings={"map": "adam-6018", "thermocouples": ("K",)},
+        settings={"map": "adam-6018", "thermocouples": ("K",), "timeout": 0.7},
         name="adam",
         dead_address="modbus+tcp://127.0.0.1:9?unit=1",
     )
@@ -23,7 +23,7 @@ class TestLogger(InstrumentConformance):
     subject = InstrumentSubject(
         ModbusTemperature,
         "sim://cframe/logger?seed=3&map=logger-16&wire=pty&open=1",
-        settings={"map": "logger-16"},
+        settings={"map": "logger-16", "timeout": 0.7},
         name="logger",
         dead_address="modbus+rtu:///dev/no_such_line?unit=1",
     )
@@ -35,6 +35,7 @@ class TestNode(InstrumentConformance):
     subject = InstrumentSubject(
         CanTemperature,
         "sim://cframe/node?seed=3&open=0&shorted=1",
+        settings={"timeout": 0.7},
         name="node",
         dead_address="can://virtual/nobody?node=5",
     )

@@ -1,7 +1,7 @@
 """The driver and the bridge against the real LinuxCNC, without hardware.
 
 A computer has room for one LinuxCNC. It is started once, lingers from test to test, and ends after the last one; that
-is why the kit tries this driver here, and not beside all others.
+is why the kit and the touch probe try this driver here, and not beside all others.
 """
 
 import math
@@ -17,12 +17,15 @@ import pytest
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.linuxcnc import LinuxCNC, LinuxCNCSettings
 from errormotion.instruments.simulators import linuxcnc, linuxcnc_process, world
+from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
+from errormotion.plugins import Touch
 from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import subjects_of
 
 ADDRESS = "sim://cframe/linuxcnc?seed=3&linger=30"
 CYCLE = 1e-3  # s, of the servo thread
+TOUCH_FEED = 0.03 / 60  # m/s
 FAST = 0.3  # m/s
 # A place near the first ball, and one 60 mm from it.
 HERE, THERE = [-0.24, -0.2, 0.12], [-0.18, -0.2, 0.12]
@@ -415,6 +418,27 @@ def test_passes_the_kit(check: object) -> None:
 
 
 # ---------------------------------------------------------------------- another machine: these restart LinuxCNC
+
+
+def test_a_ball_is_touched_through_linuxcnc() -> None:
+    settings = ControllerProbeSettings(controller="linuxcnc", repeats=2, touch_feed=TOUCH_FEED, clearance=18e-3)
+    with ControllerProbe(ADDRESS, settings) as probe:
+        here = world("cframe", 3)
+        centre = here.machine.balls.nominal[0]
+        reach = here.machine.balls.nominal_radius + here.machine.probe.nominal_tip_radius
+        touches = [
+            Touch(*(tuple(centre + (reach + way) * np.array(n)) for way in (1e-3, -0.5e-3)))
+            for n in ((1, 0, 0), (0, 0, 1))
+        ]
+        nothing = Touch(*(tuple(centre + np.array([0.0, 0.0, height])) for height in (0.034, 0.032)), 1)
+        contacts = list(probe.measure([*touches, nothing]))
+        assert [contact.flag for contact in contacts] == ["", "", "no trip"]
+        for touch, contact in zip(touches, contacts, strict=False):
+            true, _ = here.machine.contact(touch.start, touch.target, contact.time, noise=False)
+            off = np.subtract(contact.position, true)
+            # latched up to two cycles late; the trigger scatters by 0.25 um, the mean of two by 0.18 um
+            assert np.linalg.norm(off) < 2 * CYCLE * TOUCH_FEED + 5 * 0.18e-6
+        assert probe.control.state()["alarms"] == []
 
 
 def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
