@@ -175,12 +175,13 @@ class Monitor:
         """
         for source in self.sources:
             source.wait(LONGEST_START)
-        began, tick = time.monotonic(), 0
+        began, tick, rows = time.monotonic(), 0, 0
         while tick * self.interval <= duration:
             due = began + tick * self.interval
             if (ahead := due - time.monotonic()) > 0:
                 time.sleep(ahead)
-            snapshot = self._snapshot(time.monotonic() - began, tick + 1)
+            rows += 1
+            snapshot = self._snapshot(time.monotonic() - began, rows)
             self._recorder.put(self._row(snapshot))
             self._note_instruments()
             yield snapshot

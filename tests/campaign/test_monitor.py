@@ -206,3 +206,13 @@ def test_the_memory_of_a_long_log_stays_where_it_is(tmp_path: Path) -> None:
         finally:
             tracemalloc.stop()
     assert late - early < 300_000  # bytes; rows kept as they are handed over would be 4.5 MB, at 5 kB each
+
+
+def test_ticks_that_were_missed_are_not_counted_as_rows(tmp_path):
+    with module() as server:
+        monitor = Monitor(bench(dcon("front", f"tcp://127.0.0.1:{server.server_address[1]}")), tmp_path, TICK)
+        with monitor:
+            for last in islice(monitor.watch(), 3):
+                told = last.logged
+                time.sleep(2.5 * TICK)
+    assert told == 3 == RunFolder.open(monitor.folder.path).data["samples"]["count"]
