@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+import math
+from itertools import combinations, pairwise
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -135,4 +136,9 @@ class Settings(PluginSettings):
             raise ValueError(f"schedule: expected times that rise; found {times} s")
         if self.normals_balls is not None and len(set(self.normals_balls)) < 4:
             raise ValueError(f"normals_balls: expected four different balls; found {', '.join(self.normals_balls)}")
+        if self.balls and (unknown := sorted(set(self.normals_balls or ()) - set(names))):
+            raise ValueError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(unknown)}")
+        for (a, first), (b, second) in combinations(zip(names, self.balls, strict=True), 2):
+            if math.dist(first.centre, second.centre) < first.radius + second.radius:
+                raise ValueError(f"balls: expected places apart; {a} and {b} would be within one another")
         return self

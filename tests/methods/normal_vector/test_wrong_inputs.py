@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from pydantic import ValidationError
 
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.normal_vector import NormalVector, Settings
@@ -156,3 +157,17 @@ def test_normals_where_they_say_nothing(probed):
 def test_data_of_another_method(probed):
     raw = probed()[1].assign_attrs(schema="errormotion.raw.other/1")
     refused(raw, "raw.other", DatasetError)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"normals_balls": ("1", "2", "3", "5")}, "normals_balls: expected names of 1, 2, 3, 4; found 5"),
+        ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected places apart; 2 and 4 would be within one another"),
+    ],
+)
+def test_balls_that_cannot_be_are_refused_before_anything_is_touched(settings, said):
+    places = [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.0, 0.3, 0.0), settings.pop("centre_of_4", (0.4, 0.3, 0.2))]
+    balls = [{"centre": [f"{x * 1e3} mm" for x in place]} for place in places]
+    with pytest.raises(ValidationError, match=said):
+        Settings(balls=balls, **settings)
