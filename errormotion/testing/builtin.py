@@ -46,8 +46,8 @@ def builtin_subjects(
         return (InstrumentSubject(cls, str(scan_file())),)
     if (group, plugin_id) == ("instruments", "mtconnect"):
         return (mtconnect(cls),)
-    if (group, plugin_id) == ("instruments", "controller_probe"):
-        return (controller_probe(cls),)
+    if (group, plugin_id) in (("instruments", "controller_probe"), ("instruments", "virtual_controller")):
+        return (on_virtual_machine(cls),)
     if (group, plugin_id) == ("instruments", "dprnt"):
         return (InstrumentSubject(cls, "sim://cframe/printer", faults=()),)  # they show in lines, and nobody prints
     if (group, plugin_id) == ("instruments", "tracker_table"):
@@ -55,8 +55,8 @@ def builtin_subjects(
     return ()
 
 
-def controller_probe(cls: Any) -> InstrumentSubject:
-    """Return ``controller_probe``; what is wrong with machine or probe shows when it touches, not when it is read."""
+def on_virtual_machine(cls: Any) -> InstrumentSubject:
+    """Return what moves the virtual machine; what is wrong with it shows when it moves, not when it is read."""
     machine = ("alarm", "estop", "no_trip", "tripped")
     return InstrumentSubject(cls, "sim://cframe/controller", harmless=("split", *machine))
 

@@ -64,6 +64,7 @@ class SimulatedLJX(SimulatedDevice):
         self._position = 0  # number of the next profile
         self._sent = self._taken = 0  # profiles of the running stream
         self._stream: threading.Thread | None = None
+        self._starting = threading.Lock()
         self._ended = threading.Event()
         self._mute = False
         kernels.pack(  # compiled before anybody waits for it
@@ -119,8 +120,9 @@ class SimulatedLJX(SimulatedDevice):
                 return
             frame, self._buffer = self._buffer[:size], self._buffer[size:]
             self.reply(self.answer(frame))
-            if self._stream is not None and self._stream.ident is None:
-                self._stream.start()  # after the answer: a stream that breaks at once must not swallow it
+            with self._starting:
+                if self._stream is not None and self._stream.ident is None:
+                    self._stream.start()  # after the answer: a stream that breaks at once must not swallow it
 
     def reply(self, data: bytes) -> None:
         """Send an answer; garbage comes in the stream only."""
@@ -205,7 +207,8 @@ class SimulatedLJX(SimulatedDevice):
         return self._stream is not None and not self._ended.is_set()
 
     def _join(self) -> None:
-        stream, self._stream = self._stream, None
+        with self._starting:  # a thread that is half started cannot be joined
+            stream, self._stream = self._stream, None
         if stream is not None and stream is not threading.current_thread():
             if stream.ident is not None:
                 stream.join()
