@@ -142,6 +142,23 @@ def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset
         fit(pair, Settings(sensors=("nose",)))
 
 
+def test_the_same_campaign_twice_is_no_second_one(pair: list[xr.Dataset]) -> None:
+    with pytest.raises(DatasetError, match="Campaign 2 is campaign 1 again"):
+        fit([pair[0], pair[0].copy()])
+
+
+def test_a_sensor_that_one_campaign_never_knew_is_not_taken(pair: list[xr.Dataset]) -> None:
+    """A broken one: it is NaN from the begin to the end. Where all are, the campaign is refused."""
+    deaf = pair[1].copy(deep=True)
+    deaf["temperature"].loc[{"sensor": "head"}] = np.nan
+    model = fit([pair[0], deaf], Settings(variant="lagged", most_sensors=2))
+    assert len(model.sensors) == 2
+    assert "head" not in model.sensors
+    deaf["temperature"][:] = np.nan
+    with pytest.raises(DatasetError, match="needs a temperature that all campaigns have"):
+        fit([pair[0], deaf], Settings(variant="lagged"))
+
+
 def test_a_check_needs_the_same_component(model: ThermalModel, pair: list[xr.Dataset]) -> None:
     with pytest.raises(DatasetError, match="Expected errors of component 'spindle'; found 'tool'"):
         check(model, changed(pair[0], component="tool"))
