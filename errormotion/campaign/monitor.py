@@ -29,6 +29,7 @@ from errormotion.campaign.folder import RunFolder, now
 from errormotion.campaign.journal import journal
 from errormotion.campaign.recorder import Recorder
 from errormotion.campaign.sources import Source
+from errormotion.campaign.store import RawStore
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError
 
@@ -135,6 +136,11 @@ class Monitor:
                 source.start()
             attrs = {"schema": SCHEMA, "machine": self.plan.machine, "start": now(), "interval": self.interval}
             attrs |= {"flag_meanings": json.dumps(list(FLAGS)), "instruments": "[]"}
+            # The store is made before the clock starts: that takes longer than a short interval.
+            empty = self._row(
+                Snapshot(0.0, dict.fromkeys(self.sensors, math.nan), dict.fromkeys(self.sensors, ""), {}, {}, 0)
+            )
+            RawStore.create(self.folder.raw, empty.assign_attrs(attrs), "time", BLOCK)
             self._recorder = stack.enter_context(Recorder(self.folder.raw, "time", BLOCK, attrs))
             self._stack = stack.pop_all()
         return self

@@ -93,3 +93,34 @@ def test_the_extent_is_what_the_steps_say() -> None:
     assert (found.feed, found.spindle_speed) == (0.2, 6000.0)
     assert violations(found, Limits()) == []
     assert violations(extent([]), Limits(X=(0.0, 1.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            '    { centre = ["3500 mm", "700 mm", "200 mm"] },\n',
+            "",
+            r"test\[0\]\.settings\.balls: expected .* three balls",
+        ),
+        (
+            'duration = "20 min"',
+            'duration = "5 min"',
+            r"test\[0\]\.settings\.interval: expected no more than the duration",
+        ),
+        (
+            'duration = "20 min"',
+            'duration = "20 min"\ninterval = "1 min"',
+            r"test\[0\]: interval: expected more than the \d",
+        ),
+    ],
+    ids=["two balls", "no cycle", "no time to warm up"],
+)
+def test_a_campaign_that_cannot_be_made_is_refused_when_it_is_read(
+    tmp_path: Path, old: str, new: str, told: str
+) -> None:
+    path = campaign(tmp_path, "")
+    assert old in CAMPAIGN
+    path.write_text(CAMPAIGN.replace(old, new))
+    with pytest.raises(BenchError, match=told):
+        load_campaign(path)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.errors import MethodError
 from errormotion.methods.normal_vector import touching
 from errormotion.plugins import Step, Touch
 
@@ -191,9 +192,20 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
     settings : Settings
     instruments : mapping of str to settings, optional
         Settings of the bench's instruments by their kind.
+
+    Raises
+    ------
+    MethodError
+        A cycle takes longer than the interval from one to the next.
     """
     steps: list[Step] = []
     for part in parts(settings, (instruments or {}).get("touch_probe")):
+        length = math.fsum(step.seconds for step in part.cycle) + part.settle
+        if length >= settings.interval:
+            raise MethodError(
+                f"interval: expected more than the {length:.0f} s that a cycle takes, so that the machine warms up in "
+                f"between; found {settings.interval:g} s"
+            )
         steps += part.warm_up
         if part.settle:
             steps.append(Step("rest", None, math.nan, part.settle, 0.0))

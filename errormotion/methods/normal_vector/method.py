@@ -68,6 +68,18 @@ class NormalVector:
 
         return campaign_steps(settings, instruments)
 
+    def check(self, settings: BallSettings) -> dict[str, str]:
+        """Return what a campaign cannot be made with: too few balls, or no cycle behind the cold one."""
+        found = {}
+        if len(settings.balls) < 3:
+            found["balls"] = f"expected the rough places of three balls or more; found {len(settings.balls)}"
+        if settings.interval > settings.duration:
+            found["interval"] = (
+                f"expected no more than the duration, {settings.duration:g} s, so that a cycle follows the cold one; "
+                f"found {settings.interval:g} s"
+            )
+        return found
+
     def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``time``."""
         return "time"

@@ -69,6 +69,7 @@ def _text(name: str, purpose: str, body: list[str], settings: Settings, seconds:
         "%",
         f"({name}: {purpose}, about {seconds / 60:.1f} min)",
         f"(mm, mm/min, dwells G4 {settings.dwell})",
+        "(places of the tip in machine coordinates: work offset all zero, no tool length offset)",
         "G90 G94 G21",
     ]
     return "\n".join([*head, *body, "M30", "%", ""])
