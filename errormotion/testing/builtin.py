@@ -260,6 +260,7 @@ def multilateration(cls: Any) -> MethodSubject:
         optional=("station_nominal", "reflector", "reading_time"),
         measured=("displacement",),
         seeds=100,
+        compiles=True,
     )
 
 

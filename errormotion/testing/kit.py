@@ -91,6 +91,7 @@ def require(condition: bool, message: str) -> None:
 def run_check(check: Check[Subject], subject: Subject) -> CheckResult:
     """Run one check in a thread of its own and return its result; a check that hangs fails at its time limit."""
     box: list[CheckResult] = []
+    getattr(subject, "warm_up", lambda: None)()
     start = time.perf_counter()
 
     def result(ok: bool, message: str, **more: Any) -> CheckResult:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import import_module
@@ -49,6 +51,12 @@ def load_object(path: str) -> Any:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise PluginError(f"'{path}' does not load: {error}") from error
+
+
+LONGEST_WARM_UP = 240.0
+"""For which the kit waits while a method compiles, s."""
+
+_WARM: set[type] = set()
 
 
 @dataclass(frozen=True)
@@ -166,6 +174,8 @@ class MethodSubject:
     seeds : int, optional
         How many seeds the checks of coverage take; default: 60, or as many as it takes to see a covariance that is
         30 % off.
+    compiles : bool
+        Whether the method compiles parts of itself at first use: that is done before the first check.
     """
 
     plugin: Any
@@ -178,6 +188,7 @@ class MethodSubject:
     measured: tuple[str, ...] = ()
     motion: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.3, -0.2, 0.5), (0.1, -0.2, 0.05))
     seeds: int | None = None
+    compiles: bool = False
 
     def __hash__(self) -> int:
         return id(self)
@@ -192,6 +203,20 @@ class MethodSubject:
         return errors
 
     @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
+    def warm_up(self) -> None:
+        """Let the plugin compile what it compiles at first use: that is no part of a check's time. Once a process."""
+        if not self.compiles or self.plugin in _WARM:
+            return
+        _WARM.add(self.plugin)
+
+        def work() -> None:
+            with suppress(Exception):  # the checks tell what is wrong
+                self.identify(self.make(0)[0])
+
+        worker = threading.Thread(target=work, name="warm-up", daemon=True)
+        worker.start()
+        worker.join(LONGEST_WARM_UP)
+
     def outcome(self, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return the result and the truth of one seed."""
         raw, truth = self.make(seed)
