@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.datasets.text.import_map import Format
+from errormotion.datasets.text.log_format import Format
 from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 

@@ -28,7 +28,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from errormotion.datasets.schemas import RAW_SCHEMAS, Row, variants
+from errormotion.datasets.schemas import Row, raw_schemas, variants
 from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.text.log_reader import Complaints
 from errormotion.datasets.tomlfile import nearest
@@ -69,7 +69,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
     header, tables = blocks(path)
     complaints = Complaints(path)
     if "schema" not in header:
-        known = ", ".join(sorted({raw.id for raw in RAW_SCHEMAS}))
+        known = ", ".join(sorted({raw.id for raw in raw_schemas()}))
         raise DatasetError(
             f"{path}: expected a line '# schema = ...' that names one of {known}; found none. "
             "Logs of other software come in by 'errormotion import'."
@@ -78,7 +78,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
     names = _Names.of(schema)
     if names is None:
         raise DatasetError(
-            f"{path}, line {line}: schema '{schema}' is not known; {nearest(schema, {raw.id for raw in RAW_SCHEMAS})}"
+            f"{path}, line {line}: schema '{schema}' is not known; {nearest(schema, {raw.id for raw in raw_schemas()})}"
         )
     found = _Found()
     for key, (line, text) in header.items():

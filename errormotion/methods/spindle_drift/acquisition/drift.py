@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import InstrumentError, MethodError
+from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
 from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
 from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

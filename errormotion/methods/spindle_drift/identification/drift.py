@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis
@@ -37,6 +36,7 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
     reading_sources,
     twist,
 )
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
 from errormotion.methods.spindle_drift.identification.turning import turns
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

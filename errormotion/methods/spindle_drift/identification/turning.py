@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.methods.spindle_drift.identification.bar import PARAMETERS, state_jacobian
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,21 +10,21 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from errormotion.datasets.schemas import CHANNELS, RAW_SCHEMAS
 from errormotion.datasets.storage import save
-from errormotion.datasets.text.import_map import (
-    TIMESTAMP,
+from errormotion.datasets.text.log_format import TIMESTAMP
+from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
+from errormotion.datasets.tomlfile import load_model
+from errormotion.datasets.units import convert
+from errormotion.datasets.validation import validate
+from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.log_import.import_map import (
     Channel,
     ImportMap,
     SpeedColumn,
     TemperatureColumn,
     TimeColumn,
 )
-from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
-from errormotion.datasets.tomlfile import load_model
-from errormotion.datasets.units import convert
-from errormotion.datasets.validation import validate
-from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
 
 _DRIFT = RAW_SCHEMAS[0]
 _ROWS = {row.name: row for row in _DRIFT.rows}
@@ -45,7 +45,7 @@ def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwr
         Text with one line an instant. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON,
         key of the map to count).
     map_file : str or Path
-        TOML; see `errormotion.datasets.text.import_map.ImportMap`.
+        TOML; see `errormotion.methods.spindle_drift.log_import.import_map.ImportMap`.
     out : str or Path
         ``.nc`` or ``.zarr``.
     overwrite : bool
