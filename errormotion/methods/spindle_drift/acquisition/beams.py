@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.kinematics.beams import across
 from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS, SCHEMA
@@ -22,11 +23,9 @@ from errormotion.plugins import Bench
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.spindle_drift.identification.record import Record
 
-    Array = NDArray[np.float64]
+    Array = Array
     Mask = NDArray[np.bool_]
 
 _SAME_SPEED = 0.02

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.storage import save
 from errormotion.datasets.text.log_format import TIMESTAMP
 from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
@@ -121,7 +121,7 @@ def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | Temperature
     return settings.spindle_speed if table == "spindle_speed" and settings.spindle_speed else settings.time
 
 
-def _inside(key: str, values: NDArray[np.float64], settings: ImportMap) -> NDArray[np.float64]:
+def _inside(key: str, values: Array, settings: ImportMap) -> Array:
     """Return a column in inside units."""
     column = _column(key, settings)
     if column.unit == TIMESTAMP:
@@ -167,7 +167,7 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
     return xr.Dataset(variables, coords, attrs)
 
 
-def _beam_covariance(settings: ImportMap, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _beam_covariance(settings: ImportMap, direction: Array) -> Array:
     """Return (channel, 6, 6): equal in each coordinate of the origin, and across the beam in the direction."""
     C = np.zeros((len(CHANNELS), 6, 6))
     for k, name in enumerate(CHANNELS):
