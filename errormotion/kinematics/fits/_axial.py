@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.kinematics.fits._shapes import Group, Shape, about_axis, complement, signed
 
 __all__ = ["Cone", "Cylinder"]

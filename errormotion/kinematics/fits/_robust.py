@@ -17,6 +17,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.kinematics.fits._shapes import Shape
 from errormotion.kinematics.fits._solver import EPS, Frame, design, levenberg

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.kinematics.fits._shapes import Shape, norms
 

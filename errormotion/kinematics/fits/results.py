@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from errormotion.arrays import Array
+
 __all__ = ["CircleFit", "ConeFit", "CylinderFit", "Fit", "LineFit", "PlaneFit", "SphereFit"]
 
 
