@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xarray as xr
 
-from errormotion.datasets import calibration
+from errormotion.datasets.calibrations import inclination as calibration
 from errormotion.datasets.error_dataset import error_violations
 from errormotion.datasets.raw import raw_violations, variant_of
 from errormotion.datasets.schemas import RAW_SCHEMAS, SCHEMA

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, or_dash
-from errormotion.report.multilateration_turntable import Dots, Ellipsoids, Lines, Scene, draw
 from errormotion.report.text import DASH, finite, fixed, integer, listed, percent
 from errormotion.report.timeline import UNKNOWN, sensor_names
+from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
+from errormotion.methods.spindle_drift.report.series import Event
 from errormotion.report import canvas
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.series import Event
 from errormotion.report.text import DASH, SECOND_OF_ARC, UM, finite, fixed, integer
 
 Array = NDArray[np.float64]

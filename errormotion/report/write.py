@@ -14,21 +14,18 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
+from errormotion.campaign.monitor.report import chapter as monitor
+from errormotion.compensation.thermal_model.report import chapter as thermal_model
+from errormotion.compensation.thermal_model.report import check as thermal_model_check
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import (
-    beam,
-    beam_direction,
-    crossbeam,
-    crossbeam_pose,
-    generic,
-    monitor,
-    multilateration,
-    normal_vector,
-    provenance,
-    spindle,
-    thermal_model,
-    thermal_model_check,
-)
+from errormotion.methods.beam_direction.report import chapter as beam_direction
+from errormotion.methods.crossbeam_scan.report import chapter as crossbeam
+from errormotion.methods.crossbeam_scan.report import pose as crossbeam_pose
+from errormotion.methods.multilateration.report import chapter as multilateration
+from errormotion.methods.normal_vector.report import chapter as normal_vector
+from errormotion.methods.spindle_drift.report import beams as beam
+from errormotion.methods.spindle_drift.report import chapter as spindle
+from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.datasets.importer import import_log
+from errormotion.datasets.text.importer import import_log
 from errormotion.errors import DatasetError
 
 PLACES = {

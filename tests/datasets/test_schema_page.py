@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.datasets import calibration
-from errormotion.datasets.import_map import Channel, Format, ImportMap, SpeedColumn, TemperatureColumn, TimeColumn
+from errormotion.datasets.calibrations import inclination as calibration
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RAW_SCHEMAS, Row
+from errormotion.datasets.text.import_map import Channel, Format, ImportMap, SpeedColumn, TemperatureColumn, TimeColumn
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "reference" / "schemas.md").read_text()

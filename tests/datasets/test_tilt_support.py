@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from errormotion.datasets.tilt_support import TiltSupport
+from errormotion.datasets.calibrations.tilt_support import TiltSupport
 from errormotion.kinematics.beams import tilt_vector
 
 Array = NDArray[np.float64]

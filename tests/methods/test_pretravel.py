@@ -8,9 +8,21 @@ import pytest
 from numpy.typing import NDArray
 
 from errormotion.datasets import save
-from errormotion.datasets.pretravel import ROWS, SCHEMA, PretravelMap, harmonics, terms_up_to, unit, violations
+from errormotion.datasets.calibrations.pretravel import (
+    ROWS,
+    SCHEMA,
+    PretravelMap,
+    harmonics,
+    terms_up_to,
+    unit,
+    violations,
+)
 from errormotion.errors import DatasetError, FitError
-from errormotion.methods.normal_vector.pretravel import PretravelSettings, calibrating_touches, fit_pretravel
+from errormotion.methods.normal_vector.identification.pretravel import (
+    PretravelSettings,
+    calibrating_touches,
+    fit_pretravel,
+)
 from errormotion.twin import VirtualMachine
 from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
-from errormotion.methods.beam_direction import design
+from errormotion.methods.beam_direction.planning import design
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

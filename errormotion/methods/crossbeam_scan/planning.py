@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import transform_covariance
-from errormotion.methods.crossbeam_scan import calibration, strain
-from errormotion.methods.crossbeam_scan.carriage import Rig
-from errormotion.methods.crossbeam_scan.chain import carriage_adjoint, carriage_errors, pose_twists
-from errormotion.methods.crossbeam_scan.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.identification import strain
+from errormotion.methods.crossbeam_scan.identification.carriage import Rig
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:

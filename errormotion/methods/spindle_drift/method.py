@@ -8,10 +8,10 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.acquisition import SCHEMA
-from errormotion.methods.spindle_drift.detection import identify_beams
-from errormotion.methods.spindle_drift.drift import identify_drift
-from errormotion.methods.spindle_drift.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.acquisition.drift import SCHEMA
+from errormotion.methods.spindle_drift.identification.detection import identify_beams
+from errormotion.methods.spindle_drift.identification.drift import identify_drift
+from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
 
@@ -50,8 +50,9 @@ class SpindleDrift:
 
         For a drift ``inputs`` may hold the ``beams`` of a detection, or single ones by the name of their channel.
         """
-        from errormotion.methods.spindle_drift import acquisition, scanning
-        from errormotion.methods.spindle_drift.given_beams import given_beams
+        from errormotion.methods.spindle_drift.acquisition import beams as scanning
+        from errormotion.methods.spindle_drift.acquisition import drift as acquisition
+        from errormotion.methods.spindle_drift.acquisition.given_beams import given_beams
 
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
@@ -71,7 +72,7 @@ class SpindleDrift:
         """Return what tells, chunk by chunk while measuring, how far things are."""
         if settings.procedure == "beam_detection":
             return _beam_text
-        from errormotion.methods.spindle_drift.live import LiveDrift
+        from errormotion.methods.spindle_drift.acquisition.live import LiveDrift
 
         return LiveDrift(settings).update
 

@@ -6,11 +6,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.datasets import hash_dataset, provenance
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
-from errormotion.methods.beam_direction.inclination import Settings, calibrate
-from errormotion.methods.beam_direction.inclination_surface import degrees_to
+from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate
+from errormotion.methods.beam_direction.identification.inclination.surface import degrees_to
 from errormotion.twin import VirtualMachine
 
 Array = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""Report chapter: crossbeam scans."""

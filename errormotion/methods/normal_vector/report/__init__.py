@@ -1,0 +1,1 @@
+"""Report chapter: probed balls."""
