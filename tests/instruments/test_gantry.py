@@ -13,8 +13,8 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
+from errormotion.instruments.readings import Profiles
 from errormotion.instruments.simulators import world
 from errormotion.kinematics.poses import displaced
 from errormotion.twin import VirtualMachine

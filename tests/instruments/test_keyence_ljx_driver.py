@@ -16,7 +16,7 @@ from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSet
 from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamDecoder, StreamEndedError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import QUIET_INTERVAL, STREAM
-from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.readings import Profiles
 from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.simulators.keyence_ljx import SimulatedLJX, packed
 from errormotion.instruments.simulators.profile_sources import Lines, SweptSurface

@@ -8,7 +8,8 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_emscon import EmSconSettings, LeicaEmScon
-from errormotion.instruments.laser_tracker.measurement import BeamBrokenError, Environment
+from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError
+from errormotion.instruments.readings import Environment
 from errormotion.instruments.simulators.tracker_scene import refraction_index
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 

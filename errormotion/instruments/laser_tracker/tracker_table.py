@@ -13,8 +13,8 @@ from pydantic import Field
 
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
-from errormotion.instruments.laser_tracker.measurement import Environment
 from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
+from errormotion.instruments.readings import Environment
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
 
 UNITS = {"displacement": "m", "temperature": "degC", "pressure": "Pa", "humidity": "%"}

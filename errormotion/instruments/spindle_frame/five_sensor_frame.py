@@ -20,7 +20,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.point_lds.optoncdt.codec import LOST, OFFSET, OVERRUN, SCALE
 from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT, count_reasons
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
-from errormotion.instruments.spindle_frame.geometry import FrameGeometry
+from errormotion.instruments.spindle_frame.geometry import frame_geometry
 from errormotion.instruments.spindle_frame.settings import CHANNELS, FrameSettings
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.recording import read_index, write_index
@@ -56,7 +56,7 @@ class FiveSensorFrame:
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
         self.address = address
         self.settings = FrameSettings() if settings is None else settings
-        self.geometry = FrameGeometry.of(self.settings)
+        self.geometry = frame_geometry(self.settings)
         self._record = record
         self._sensors: dict[str, OptoNCDT] = {}
         self._streaming = False
@@ -174,7 +174,7 @@ class FiveSensorFrame:
         for sensor in self._open_sensors().values():
             sensor.configure(single)
         self.settings = settings
-        self.geometry = FrameGeometry.of(settings)
+        self.geometry = frame_geometry(settings)
 
     @property
     def warm(self) -> bool:

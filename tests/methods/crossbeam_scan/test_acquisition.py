@@ -16,7 +16,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodEr
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles
-from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.readings import Profiles
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition import moving

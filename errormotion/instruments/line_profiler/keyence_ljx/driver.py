@@ -24,7 +24,7 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
     StreamLayout,
 )
 from errormotion.instruments.line_profiler.keyence_ljx.settings import LJXSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.readings import Profiles
 from errormotion.instruments.transports import Transport
 from errormotion.plugins import Identity, InstrumentInfo
 

@@ -14,9 +14,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from errormotion.errors import InstrumentError, ReplayError
-from errormotion.instruments.line_profiler.profile_files.readers import READERS, Scan, read_scan
+from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.readings import Profiles, Scan
 from errormotion.plugins import Identity, InstrumentInfo
 
 FORMAT = "errormotion-scans/1"

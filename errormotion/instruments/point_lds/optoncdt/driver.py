@@ -12,6 +12,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.point_lds.optoncdt.codec import (
     LINE_END,
+    LOST,
     OVERRUN,
     PROMPT,
     REASONS,
@@ -58,6 +59,8 @@ class OptoNCDT(Driver):
     Settings: ClassVar[type[OptoSettings]] = OptoSettings
     settings: OptoSettings
     name = "optoncdt"
+    reasons: tuple[str, ...] = REASONS
+    lost: tuple[int, ...] = (LOST, OVERRUN)
     _reader: Reader | None = None
     _lost: InstrumentError | None = None
 
