@@ -59,12 +59,15 @@ class Synchronised(Protocol):
 
     Attributes
     ----------
+    name : str
+        Of the channel, for messages; set by whoever starts it.
     reasons : tuple of str
         Why a sample has no value, by the code that `fill` gives; code 0 stands for a value.
     lost : tuple of int
         Codes of samples that were lost on the way.
     """
 
+    name: str
     reasons: tuple[str, ...]
     lost: tuple[int, ...]
 

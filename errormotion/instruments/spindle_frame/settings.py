@@ -1,16 +1,23 @@
-"""Settings of the five-sensor frame: where the sensors are connected, and how they stand around the bar."""
+"""Settings of the five-sensor frame: its sensors, their addresses, and their positions around the bar."""
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from errormotion import plugins
+from errormotion.datasets import tomlfile
 from errormotion.datasets.units import Expansion, Length, Temperature
+from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.point_lds.optoncdt.settings import SensorSettings
+from errormotion.instruments.transports import parse_address
 
+KIND = "point_lds"
+HIGHEST_POLLING_RATE = 1e3
+"""Of sensors that are read one by one, Hz."""
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 Vector = tuple[float, float, float]
 Place = tuple[Length, Length, Length]
@@ -33,8 +40,29 @@ NOMINAL_DIRECTION: dict[str, Vector] = {
 }
 
 
+class SensorTable(BaseModel):
+    """One sensor: its driver, of kind ``point_lds``, its address, and the driver's own settings beside them."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str
+    address: str
+
+    @property
+    def settings(self) -> Any:
+        """Settings of the driver."""
+        return plugins.get("instruments", self.driver).Settings(**(self.model_extra or {}))
+
+
 class FrameSettings(SensorSettings):
-    """Settings of the frame; those of its sensors are the same for all five."""
+    """Settings of the frame.
+
+    Without ``sensors`` the channels are five optoNCDT sensors, all with the settings that the frame shares with them.
+    """
+
+    sensors: dict[str, SensorTable] = Field(
+        default_factory=dict,
+        description="sensor of each channel: driver, address and settings; default: five optoncdt sensors",
+    )
 
     addresses: dict[str, str] = Field(
         default_factory=dict, description="URL of each sensor; default: made from the frame's own address"
@@ -56,7 +84,7 @@ class FrameSettings(SensorSettings):
         default=None, description="when the sensors were switched on, for sensors that do not tell; with time zone"
     )
 
-    @field_validator("addresses", "origin", "direction")
+    @field_validator("addresses", "sensors", "origin", "direction")
     @classmethod
     def _known_channels(cls, value: dict[str, object]) -> dict[str, object]:
         wrong = ", ".join(sorted(set(value) - set(CHANNELS)))
@@ -68,6 +96,56 @@ class FrameSettings(SensorSettings):
                 + (f"; missing: {missing}" if missing else "")
             )
         return value
+
+    @field_validator("sensors")
+    @classmethod
+    def _known_sensors(cls, value: dict[str, SensorTable], info: ValidationInfo) -> dict[str, SensorTable]:
+        """Check the settings of each driver, and keep them in SI units."""
+        checked, mistakes = {}, []
+        for name, table in value.items():
+            try:
+                driver = plugins.get("instruments", table.driver)
+            except PluginError as error:
+                mistakes.append(f"{name}.driver: {error}")
+                continue
+            if driver.info.kind != KIND:
+                mistakes.append(f"{name}.driver: expected an instrument of kind {KIND}; found {driver.info.kind}")
+                continue
+            try:
+                parse_address(table.address)
+            except InstrumentError as error:
+                mistakes.append(f"{name}.address: {error}")
+            edge = bool((info.context or {}).get("edge"))
+            settings, found = tomlfile.check(table.model_extra or {}, driver.Settings, prefix=(name,), edge=edge)
+            mistakes += found
+            if settings is not None:
+                known = settings.model_dump(mode="json", exclude_unset=True)
+                checked[name] = SensorTable(driver=table.driver, address=table.address, **known)
+        if mistakes:
+            raise ValueError("; ".join(mistakes))
+        return checked
+
+    @model_validator(mode="after")
+    def _fits_the_model(self) -> Self:
+        """Check the shared settings against the sensors' model; those of ``sensors`` have been checked."""
+        if not self.sensors:
+            super()._fits_the_model()
+        elif self.addresses:
+            raise ValueError(
+                "expected the address of each sensor in its own table 'sensors'; found 'addresses' as well"
+            )
+        elif not self.synchronised and self.rate > HIGHEST_POLLING_RATE:
+            raise ValueError(
+                f"rate: these sensors are read one by one, at {HIGHEST_POLLING_RATE:g} Hz at most; "
+                f"found {self.rate:g} Hz"
+            )
+        return self
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether all sensors are of one driver that samples on one clock."""
+        drivers = {table.driver for table in self.sensors.values()}
+        return not drivers or (len(drivers) == 1 and hasattr(plugins.get("instruments", drivers.pop()), "fill"))
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
