@@ -125,11 +125,10 @@ class FrameSettings(SensorSettings):
             raise ValueError("; ".join(mistakes))
         return checked
 
-    @model_validator(mode="after")
-    def _fits_the_model(self) -> Self:
+    def _check_model(self) -> None:
         """Check the shared settings against the sensors' model; those of ``sensors`` have been checked."""
         if not self.sensors:
-            super()._fits_the_model()
+            super()._check_model()
         elif self.addresses:
             raise ValueError(
                 "expected the address of each sensor in its own table 'sensors'; found 'addresses' as well"
@@ -139,7 +138,6 @@ class FrameSettings(SensorSettings):
                 f"rate: these sensors are read one by one, at {HIGHEST_POLLING_RATE:g} Hz at most; "
                 f"found {self.rate:g} Hz"
             )
-        return self
 
     @property
     def synchronised(self) -> bool:
