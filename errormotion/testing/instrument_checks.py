@@ -16,11 +16,18 @@ import numpy as np
 from pydantic import ValidationError
 
 from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.instruments import kinds
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings, Samples, Status
+from errormotion.plugins import (
+    Identity,
+    InstrumentInfo,
+    InstrumentSubject,
+    PluginSettings,
+    Samples,
+    Status,
+    kind_registry,
+    load_object,
+)
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
-from errormotion.testing.subjects import InstrumentSubject, load_object
 
 INSTRUMENT_CHECKS: Checks[InstrumentSubject] = Checks()
 
@@ -38,7 +45,7 @@ def _no_bounds(subject: InstrumentSubject) -> str:
 
 
 def _no_contract(subject: InstrumentSubject) -> str:
-    return "" if kinds.kind(subject.plugin.info.kind) else f"no kind '{subject.plugin.info.kind}' is registered"
+    return "" if kind_registry.kind(subject.plugin.info.kind) else f"no kind '{subject.plugin.info.kind}' is registered"
 
 
 def _no_splitting(subject: InstrumentSubject) -> str:
@@ -74,9 +81,9 @@ def info_complete(subject: InstrumentSubject) -> str:
 def kind_contract(subject: InstrumentSubject) -> str:
     """The driver has every member that the contract of its kind demands, and each takes the contract's arguments."""
     kind = subject.plugin.info.kind
-    found = kinds.deviations(subject.build(), kinds.kind(kind))
+    found = kind_registry.deviations(subject.build(), kind_registry.kind(kind))
     require(not found, f"{kind}: {'; '.join(found)}")
-    return f"{kind}: {len(kinds.members(kinds.kind(kind)))} members"
+    return f"{kind}: {len(kind_registry.members(kind_registry.kind(kind)))} members"
 
 
 @INSTRUMENT_CHECKS.add()

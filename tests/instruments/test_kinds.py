@@ -9,7 +9,7 @@ import pytest
 
 from errormotion import plugins
 from errormotion.errors import PluginError
-from errormotion.instruments import kinds
+from errormotion.plugins import kind_registry as kinds
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "kinds.md").read_text()
 OF_EVERY_INSTRUMENT = kinds.members(plugins.Instrument).keys()

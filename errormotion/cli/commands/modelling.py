@@ -91,7 +91,7 @@ def examine(model: Path, errors: Path, report: Path | None, as_json: bool) -> No
     found = check(used, measured)
     figures = {name: getattr(found, name) for name in ("rms", "remaining", "removed", "held")}
     if report is not None:
-        from errormotion.report import write_model_report
+        from errormotion.compensation.thermal_model.report import write_model_report
 
         write_model_report(used.dataset, measured, report, predicted=found.predicted, figures=figures)
     if as_json:

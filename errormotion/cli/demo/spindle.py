@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from errormotion import datasets
+from errormotion.arrays import Array
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.commands.running import describe, work
@@ -19,8 +19,6 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.instruments.transports import parse_address
 from errormotion.kinematics.twists import move
 from errormotion.twin import Event, VirtualMachine
-
-Array = NDArray[np.float64]
 
 CAMPAIGN = Path(__file__).parent / "campaign.toml"
 

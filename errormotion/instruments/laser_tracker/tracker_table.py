@@ -14,8 +14,8 @@ from pydantic import Field
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
 from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
-from errormotion.instruments.readings import Environment
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins.readings import Environment
 
 UNITS = {"displacement": "m", "temperature": "degC", "pressure": "Pa", "humidity": "%"}
 

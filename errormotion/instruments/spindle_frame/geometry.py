@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from errormotion.instruments.readings import FrameGeometry
 from errormotion.instruments.spindle_frame.settings import CHANNELS, FrameSettings
+from errormotion.plugins.readings import FrameGeometry
 
 
 def frame_geometry(settings: FrameSettings) -> FrameGeometry:

@@ -24,9 +24,9 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
     StreamLayout,
 )
 from errormotion.instruments.line_profiler.keyence_ljx.settings import LJXSettings
-from errormotion.instruments.readings import Profiles
 from errormotion.instruments.transports import Transport
 from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins.readings import Profiles
 
 if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader

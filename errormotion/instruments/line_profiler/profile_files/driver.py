@@ -16,8 +16,8 @@ import numpy as np
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
-from errormotion.instruments.readings import Profiles, Scan
 from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins.readings import Profiles, Scan
 
 FORMAT = "errormotion-scans/1"
 BLOCK = 100

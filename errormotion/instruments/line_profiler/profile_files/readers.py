@@ -11,7 +11,7 @@ import numpy as np
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError, InstrumentError
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
-from errormotion.instruments.readings import Scan
+from errormotion.plugins.readings import Scan
 
 Array = np.ndarray[Any, Any]
 

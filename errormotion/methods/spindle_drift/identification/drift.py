@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis
@@ -37,6 +37,7 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
     reading_sources,
     twist,
 )
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.record import Record
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from errormotion.plugins import Samples
+from errormotion.arrays import Array
+from errormotion.plugins.contracts import Samples
 
-Array = np.ndarray[Any, Any]
 NAN = math.nan
 
 
@@ -39,9 +39,9 @@ class Profiles(Samples):
     """
 
     x: Array
-    trigger: Array
+    trigger: NDArray[np.int64]
     encoder: Array
-    intensity: Array | None = None
+    intensity: NDArray[np.uint16] | None = None
     y: Array | None = None
 
     @property

@@ -7,15 +7,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit, urlunsplit
 
 import xarray as xr
 
-from errormotion.errors import PluginError
-from errormotion.instruments import kinds
+from errormotion.plugins import kind_registry
+from errormotion.plugins.lazy import load_object
 
 #: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.
 Vector = Literal["pose", "point", "direction", "x", "y", "z", "covariance"]
@@ -26,23 +25,6 @@ def with_query(address: str, query: str) -> str:
     parts = urlsplit(address)
     joined = "&".join(part for part in (parts.query, query) if part)
     return urlunsplit(parts._replace(query=joined))
-
-
-def load_object(path: str) -> Any:
-    """Return the object that ``module:name`` names.
-
-    Raises
-    ------
-    PluginError
-        The text has not this form, the module is not there, or has no such name.
-    """
-    module, colon, name = path.partition(":")
-    if not colon:
-        raise PluginError(f"expected 'module:name', found '{path}'")
-    try:
-        return getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise PluginError(f"'{path}' does not load: {error}") from error
 
 
 LONGEST_WARM_UP = 240.0
@@ -126,7 +108,7 @@ class InstrumentSubject:
     @property
     def bounds(self) -> tuple[float, float] | None:
         """Lowest and highest plausible reading."""
-        return self.plausible or kinds.plausible(self.plugin.info.kind)
+        return self.plausible or kind_registry.plausible(self.plugin.info.kind)
 
     @property
     def streams(self) -> bool:
@@ -194,7 +176,6 @@ class MethodSubject:
         errors: xr.Dataset = self.plugin().identify(raw, self.effective_settings())
         return errors
 
-    @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
     def warm_up(self) -> None:
         """Let the plugin compile what it compiles at first use: that is no part of a check's time. Once a process."""
         if not self.compiles or self.plugin in _WARM:
@@ -209,6 +190,7 @@ class MethodSubject:
         worker.start()
         worker.join(LONGEST_WARM_UP)
 
+    @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
     def outcome(self, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return the result and the truth of one seed."""
         raw, truth = self.make(seed)
