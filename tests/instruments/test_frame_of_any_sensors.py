@@ -151,8 +151,8 @@ def test_a_bench_file_gives_each_sensor_a_driver_an_address_and_settings() -> No
     (frame,) = parse_bench(text, Path("bench.toml")).instruments
     stored = FrameSettings.model_validate_json(frame.settings.model_dump_json())
     assert stored == frame.settings
-    assert stored.sensors["Z"].settings.noise == pytest.approx(0.2e-6)
-    assert stored.sensors["X1"].settings.head == "LK-H020"
+    assert stored.sensor("Z")[1].noise == pytest.approx(0.2e-6)
+    assert stored.sensor("X1")[1].head == "LK-H020"
     assert FiveSensorFrame("", stored).addresses["Y2"] == "serial:///dev/ttyY2"
 
 

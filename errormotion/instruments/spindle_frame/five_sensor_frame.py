@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from errormotion import plugins
 from errormotion.errors import InstrumentError
 from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
@@ -75,7 +74,7 @@ class FiveSensorFrame:
     @property
     def addresses(self) -> dict[str, str]:
         """URL of each sensor."""
-        stated = self.settings.addresses or {name: each.address for name, each in self.settings.sensors.items()}
+        stated = self.settings.addresses or {name: each["address"] for name, each in self.settings.sensors.items()}
         if self.address.startswith("replay://"):
             return {
                 name: f"replay://{path}" for name, path in read_index(Path(parse_address(self.address).path)).items()
@@ -236,8 +235,7 @@ class FiveSensorFrame:
     def _choice(self, name: str, settings: FrameSettings) -> tuple[Any, Any]:
         """Return the driver of a channel and its settings."""
         if settings.sensors:
-            table = settings.sensors[name]
-            return plugins.get("instruments", table.driver), table.settings
+            return settings.sensor(name)
         return OptoNCDT, OptoSettings(**{key: getattr(settings, key) for key in SensorSettings.model_fields})
 
     def _open_sensors(self) -> dict[str, Any]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from errormotion import plugins
 from errormotion.datasets import tomlfile
@@ -40,28 +41,15 @@ NOMINAL_DIRECTION: dict[str, Vector] = {
 }
 
 
-class SensorTable(BaseModel):
-    """One sensor: its driver, of kind ``point_lds``, its address, and the driver's own settings beside them."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-    driver: str
-    address: str
-
-    @property
-    def settings(self) -> Any:
-        """Settings of the driver."""
-        return plugins.get("instruments", self.driver).Settings(**(self.model_extra or {}))
-
-
 class FrameSettings(SensorSettings):
     """Settings of the frame.
 
     Without ``sensors`` the channels are five optoNCDT sensors, all with the settings that the frame shares with them.
     """
 
-    sensors: dict[str, SensorTable] = Field(
+    sensors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,
-        description="sensor of each channel: driver, address and settings; default: five optoncdt sensors",
+        description="driver, address and settings of each sensor; default: five optoncdt",
     )
 
     addresses: dict[str, str] = Field(
@@ -99,31 +87,33 @@ class FrameSettings(SensorSettings):
 
     @field_validator("sensors")
     @classmethod
-    def _known_sensors(cls, value: dict[str, SensorTable], info: ValidationInfo) -> dict[str, SensorTable]:
+    def _known_sensors(cls, value: dict[str, dict[str, Any]], info: ValidationInfo) -> dict[str, dict[str, Any]]:
         """Check the settings of each driver, and keep them in SI units."""
+        edge = bool((info.context or {}).get("edge"))
         checked, mistakes = {}, []
         for name, table in value.items():
             try:
-                driver = plugins.get("instruments", table.driver)
+                driver = _driver(table)
             except PluginError as error:
                 mistakes.append(f"{name}.driver: {error}")
                 continue
-            if driver.info.kind != KIND:
-                mistakes.append(f"{name}.driver: expected an instrument of kind {KIND}; found {driver.info.kind}")
-                continue
             try:
-                parse_address(table.address)
+                parse_address(str(table.get("address", "")))
             except InstrumentError as error:
                 mistakes.append(f"{name}.address: {error}")
-            edge = bool((info.context or {}).get("edge"))
-            settings, found = tomlfile.check(table.model_extra or {}, driver.Settings, prefix=(name,), edge=edge)
+            settings, found = tomlfile.check(_own(table), driver.Settings, prefix=(name,), edge=edge)
             mistakes += found
             if settings is not None:
-                known = settings.model_dump(mode="json", exclude_unset=True)
-                checked[name] = SensorTable(driver=table.driver, address=table.address, **known)
+                own = settings.model_dump(mode="json", exclude_unset=True)
+                checked[name] = {"driver": table["driver"], "address": table.get("address", ""), **own}
         if mistakes:
             raise ValueError("; ".join(mistakes))
         return checked
+
+    def sensor(self, name: str) -> tuple[Any, Any]:
+        """Return the driver of a channel's sensor and its settings, where ``sensors`` states them."""
+        driver = _driver(self.sensors[name])
+        return driver, driver.Settings(**_own(self.sensors[name]))
 
     def _check_model(self) -> None:
         """Check the shared settings against the sensors' model; those of ``sensors`` have been checked."""
@@ -142,7 +132,7 @@ class FrameSettings(SensorSettings):
     @property
     def synchronised(self) -> bool:
         """Whether all sensors are of one driver that samples on one clock."""
-        drivers = {table.driver for table in self.sensors.values()}
+        drivers = {table["driver"] for table in self.sensors.values()}
         return not drivers or (len(drivers) == 1 and hasattr(plugins.get("instruments", drivers.pop()), "fill"))
 
     @model_validator(mode="after")
@@ -158,3 +148,15 @@ class FrameSettings(SensorSettings):
         if self.powered_since is not None and self.powered_since.tzinfo is None:
             raise ValueError("powered_since needs a time zone, such as 2025-03-01T08:00:00+01:00")
         return self
+
+
+def _driver(table: Mapping[str, Any]) -> Any:
+    driver = plugins.get("instruments", str(table.get("driver", "")))
+    if driver.info.kind != KIND:
+        raise PluginError(f"expected an instrument of kind {KIND}; found {driver.info.kind}")
+    return driver
+
+
+def _own(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the driver in a sensor's table."""
+    return {key: value for key, value in table.items() if key not in ("driver", "address")}
