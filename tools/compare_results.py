@@ -80,6 +80,8 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
 LEFT_OUT = {
     "provenance.software.*": "versions of Python and of packages; the version of errormotion changes",
     "@start": "time stamp of a campaign over the wire",
+    "provenance.steps.*.campaigns.*": "hash of an error dataset, versions included; the dataset itself is compared",
+    "provenance.steps.*.model": "hash of a thermal model, versions included; the model itself is compared",
 }
 PROSE = (
     *("notes", "notes.*", "reference", "comment", "description", "title"),
