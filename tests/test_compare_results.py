@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import io
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -42,12 +44,21 @@ def store(folder: Path, ds: xr.Dataset) -> Path:
     return folder
 
 
-def compared(old: Path, new: Path, *options: str) -> tuple[int, str]:
+def script() -> ModuleType:
+    """Return the script as a module."""
+    spec = importlib.util.spec_from_file_location(SCRIPT.stem, SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def compared(old: Path, new: Path, *, within: float | None = None, wording: bool = False) -> tuple[int, str]:
     """Return exit code and output of the comparison."""
-    command = [sys.executable, str(SCRIPT), "compare", str(old), str(new), *options]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert not done.stderr
-    return done.returncode, done.stdout
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        code = script().compare(old, new, within, [], wording, 5)
+    return code, text.getvalue()
 
 
 def changed(what: str) -> xr.Dataset:
@@ -98,14 +109,14 @@ def test_one_change_is_found(tmp_path: Path, what: str) -> None:
 def test_within_is_a_fraction_of_the_standard_uncertainty(tmp_path: Path, fraction: float, code: int) -> None:
     new = errors()
     new["EB"][3] += fraction * U
-    assert compared(store(tmp_path / "old", errors()), store(tmp_path / "new", new), "--within", "1e-9")[0] == code
+    assert compared(store(tmp_path / "old", errors()), store(tmp_path / "new", new), within=1e-9)[0] == code
 
 
 @pytest.mark.parametrize(("notes", "code"), [("left out: 4 readings", 0), ("left out: 5 readings", 1)])
 def test_another_wording_is_accepted_with_the_same_numbers_only(tmp_path: Path, notes: str, code: int) -> None:
     old, new = store(tmp_path / "old", errors()), store(tmp_path / "new", errors().assign_attrs(notes=notes))
     assert compared(old, new)[0] == 1
-    assert compared(old, new, "--wording")[0] == code
+    assert compared(old, new, wording=True)[0] == code
 
 
 def test_a_missing_dataset_and_another_input_are_differences(tmp_path: Path) -> None:

@@ -83,6 +83,13 @@ LEFT_OUT = {
     "provenance.steps.*.campaigns.*": "hash of an error dataset, versions included; the dataset itself is compared",
     "provenance.steps.*.model": "hash of a thermal model, versions included; the model itself is compared",
 }
+NOT_REPRODUCIBLE = {
+    "errors/crossbeam_scan-scan-0-variant2.nc": 1e-6,
+    "errors/crossbeam_scan-scan-0-variant3.nc": 1e-6,
+}
+"""Datasets that one version does not reproduce to the last bit, and within which fraction of a standard uncertainty
+they are compared instead: Open3D registers with several threads and adds in another order each time. Two runs differ by
+up to 2e-8; one that is not within this fraction is different."""
 PROSE = (
     *("notes", "notes.*", "reference", "comment", "description", "title"),
     *("*.long_name", "*.description", "*.comment", "provenance.steps.*"),
@@ -415,7 +422,7 @@ def compare(old: Path, new: Path, within: float | None, ignore: list[str], wordi
         left_out += difference.left_out
         reworded += len(difference.reworded)
         counts = f"{difference.compared:8} {difference.left_out.total():8} {len(difference.reworded):8}"
-        equal = "equal" if within is None else f"within {within:g}"
+        equal = "equal" if difference.within is None else f"within {difference.within:g}"
         print(f"{name:58} {counts} {difference.largest:10.2g}  {'DIFFERENT' if difference.found else equal}")
         for line in difference.found[:details]:
             print(f"    {line}")
@@ -443,6 +450,8 @@ def pairs(old: Path, new: Path, *difference: Any) -> Iterator[tuple[str, Differe
         files = [{str(file.relative_to(path)) for file in (path / folder).rglob("*.nc")} for path in (old, new)]
         for name in sorted(files[0] | files[1]):
             result = kind(*options)
+            if name in NOT_REPRODUCIBLE:
+                result.within = max(result.within or 0.0, NOT_REPRODUCIBLE[name])
             if name in files[0] & files[1]:
                 with opened(old / name) as x, opened(new / name) as y:
                     result.datasets(x, y)
@@ -486,6 +495,9 @@ def main() -> int:
         warnings.simplefilter("ignore")
         make(given.out, given.raw, given.generate, given.measure)
         return 0
+    for folder in (given.old, given.new):
+        if not (folder / "digests.json").exists():
+            parser.error(f"{folder}: expected a folder that 'make' has finished; found no digests.json")
     return compare(given.old, given.new, given.within, given.ignore, given.wording, given.details)
 
 
