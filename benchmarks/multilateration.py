@@ -31,11 +31,11 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.alternating import alternate
-from errormotion.methods.multilateration.bound import bound, relative_bound
-from errormotion.methods.multilateration.model import Stations, directions, jacobian, readings
-from errormotion.methods.multilateration.solver import solve
-from errormotion.methods.multilateration.turning import fitted
+from errormotion.methods.multilateration.network.alternating import alternate
+from errormotion.methods.multilateration.network.model import Stations, directions, jacobian, readings
+from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.network.turning import fitted
+from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
 PARTS = ("compare", "coverage", "layout")
 NOISE = 1e-6

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import clouds, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration import clouds, prepare, register
 
 PITCH_X, PITCH_Y, NOISE = 12.5e-6, 70e-6, 0.5e-6
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])

@@ -19,8 +19,8 @@ import numba
 import numpy as np
 from scipy.optimize import least_squares
 
-from errormotion.methods.spindle_drift.averaging import window_sums
-from errormotion.methods.spindle_drift.bar import fit_axis
+from errormotion.methods.spindle_drift.identification.averaging import window_sums
+from errormotion.methods.spindle_drift.identification.bar import fit_axis
 
 R = 5e-3
 LEVELS = np.array([0.01, 0.05])

@@ -11,8 +11,8 @@ import numpy as np
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import error_jacobian
 from errormotion.methods.beam_direction import BeamDirection, Settings
-from errormotion.methods.beam_direction.inclination import calibrate
-from errormotion.methods.beam_direction.propagation import expected_beam
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
+from errormotion.methods.beam_direction.identification.propagation import expected_beam
 from errormotion.twin import VirtualMachine
 
 TITLE = "Beam direction"

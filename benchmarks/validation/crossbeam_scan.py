@@ -13,11 +13,11 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.datasets import DOF
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import CrossbeamScan
-from errormotion.methods.crossbeam_scan.calibration import PARAMETERS, parameters
-from errormotion.methods.crossbeam_scan.registration import prepare, register
-from errormotion.methods.crossbeam_scan.registrations import bound
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import PARAMETERS, parameters
+from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
+from errormotion.methods.crossbeam_scan.identification.registrations import bound
+from errormotion.methods.crossbeam_scan.identification.strain import FEED as FEED_NAMES
 from errormotion.methods.crossbeam_scan.settings import Layout, PoseSettings, Settings
-from errormotion.methods.crossbeam_scan.strain import FEED as FEED_NAMES
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import swept
 from errormotion.twin.crossbeam import LEVER, LIFT

@@ -10,9 +10,9 @@ from numpy.polynomial.legendre import leggauss
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import move
 from errormotion.methods.multilateration import Multilateration, Settings
-from errormotion.methods.multilateration.bound import bound
-from errormotion.methods.multilateration.model import motions
-from errormotion.methods.multilateration.volume import grid, volumetric_errors
+from errormotion.methods.multilateration.identification.volume import grid, volumetric_errors
+from errormotion.methods.multilateration.network.model import motions
+from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.twin import VirtualMachine
 from errormotion.twin.multilateration_rawdata import NOISE, REFLECTOR
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector, Settings
-from errormotion.methods.normal_vector.bound import bound
-from errormotion.methods.normal_vector.freedoms import Motion
+from errormotion.methods.normal_vector.identification.bound import bound
+from errormotion.methods.normal_vector.identification.freedoms import Motion
 from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.probing_rawdata import touch_normals
 

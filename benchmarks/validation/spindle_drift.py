@@ -7,7 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from errormotion.methods.spindle_drift import SpindleDrift
-from errormotion.methods.spindle_drift.beams import circles_and_line, fisher_bound, likelihood_fit, sphere_reading
+from errormotion.methods.spindle_drift.identification.beams import (
+    circles_and_line,
+    fisher_bound,
+    likelihood_fit,
+    sphere_reading,
+)
 from errormotion.twin import Event, VirtualMachine
 
 TITLE = "Spindle drift"

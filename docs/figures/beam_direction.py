@@ -12,11 +12,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.kinematics.beams import across
 from errormotion.methods.beam_direction import BeamDirection
-from errormotion.methods.beam_direction.check_bar import measure_bar
-from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.twin import VirtualMachine
 

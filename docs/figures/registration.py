@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from scipy.spatial import cKDTree
 
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import clouds, prepare, register
-from errormotion.methods.crossbeam_scan.registration.solver import Problem, State
+from errormotion.methods.crossbeam_scan.identification.registration import clouds, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
 BLUE, ORANGE, GREEN, GREY = "#1f5a96", "#d9822b", "#2e8b57", "#8a8f98"
 PITCH_X, PITCH_Y, NOISE = 12.5e-6, 70e-6, 0.5e-6

@@ -59,11 +59,11 @@ def demo(
 ) -> None:
     """Measure a virtual machine, and compare the result to the truth: spindle drift, or probing under LinuxCNC."""
     if controller == "linuxcnc":
-        from errormotion.cli import probing_demonstration
+        from errormotion.cli.demo import probing as probing_demonstration
 
         probing_demonstration.run(runs, json_)
         return
-    from errormotion.cli import demonstration
+    from errormotion.cli.demo import spindle as demonstration
 
     demonstration.run(runs, json_)
 
@@ -86,7 +86,7 @@ def run(
 ) -> None:
     """Make the tests of a campaign: acquire, identify, report."""
     if dry_run:
-        from errormotion.cli import dry_run as dry
+        from errormotion.cli.commands import dry_run as dry
 
         if campaign is None:
             typer.echo("--dry-run needs a campaign file.", err=True)
@@ -96,7 +96,7 @@ def run(
     if out is not None:
         typer.echo("--out belongs to --dry-run.", err=True)
         raise typer.Exit(USAGE)
-    from errormotion.cli import running
+    from errormotion.cli.commands import running
 
     running.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)
 
@@ -124,7 +124,7 @@ def identify(
     json_: Json = False,
 ) -> None:
     """Turn a raw dataset into an error dataset; or many of them."""
-    from errormotion.cli import data
+    from errormotion.cli.commands import data
 
     data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
 
@@ -139,7 +139,7 @@ def calibrate(
     json_: Json = False,
 ) -> None:
     """Make a calibration of a sensor's inclination error."""
-    from errormotion.cli import calibrating
+    from errormotion.cli.commands import calibrating
 
     calibrating.run(data, out, set_ or [], settings, json_)
 
@@ -153,7 +153,7 @@ def import_(
     json_: Json = False,
 ) -> None:
     """Turn a log that a lab already has into a raw dataset."""
-    from errormotion.cli import data
+    from errormotion.cli.commands import data
 
     data.import_log(log, map_, out, json_)
 
@@ -168,7 +168,7 @@ def monitor(
     json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each row.")] = False,
 ) -> None:
     """Show all temperatures and working parameters live, and log them."""
-    from errormotion.cli import monitoring
+    from errormotion.cli.commands import monitoring
 
     monitoring.run(bench, runs, interval, duration, json_)
 
@@ -182,7 +182,7 @@ def plan(
     json_: Json = False,
 ) -> None:
     """Say what uncertainty to expect of the tests of a campaign, and how to make it smaller."""
-    from errormotion.cli import planning
+    from errormotion.cli.commands import planning
 
     planning.expect(campaign, test, out, json_)
 
@@ -196,7 +196,7 @@ def program(
     json_: Json = False,
 ) -> None:
     """Write the NC programs with which a machine makes the tests of a campaign."""
-    from errormotion.cli import programs
+    from errormotion.cli.commands import programs
 
     programs.write(campaign, test, out, json_)
 
@@ -209,7 +209,7 @@ def report(
     json_: Json = False,
 ) -> None:
     """Write the report of a run anew."""
-    from errormotion.cli import data
+    from errormotion.cli.commands import data
 
     data.report(run, out, json_)
 
@@ -221,7 +221,7 @@ def validate(
     json_: Json = False,
 ) -> None:
     """Check that a file follows its schema, and tell every violation."""
-    from errormotion.cli import data
+    from errormotion.cli.commands import data
 
     mistakes = data.validate(file)
     if json_:
@@ -236,7 +236,7 @@ def validate(
 @guarded
 def doctor(json_: Json = False) -> None:
     """Check that this machine has what errormotion needs."""
-    from errormotion.cli import examination
+    from errormotion.cli.commands import examination
 
     findings = examination.examine()
     if json_:
@@ -251,7 +251,7 @@ def doctor(json_: Json = False) -> None:
 @guarded
 def plugins_list(json_: Json = False) -> None:
     """List all plugins, those that do not load included."""
-    from errormotion.cli import plugging
+    from errormotion.cli.commands import plugging
 
     plugging.list_plugins(json_)
 
@@ -260,7 +260,7 @@ def plugins_list(json_: Json = False) -> None:
 @guarded
 def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: Json = False) -> None:
     """Show what a plugin says of itself, and its settings."""
-    from errormotion.cli import plugging
+    from errormotion.cli.commands import plugging
 
     plugging.show_plugin(plugin, json_)
 
@@ -273,7 +273,7 @@ def plugins_check(
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
-    from errormotion.cli import plugging
+    from errormotion.cli.commands import plugging
 
     if not plugging.check_plugin(plugin, address, json_):
         raise typer.Exit(INVALID)
@@ -309,7 +309,7 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
 @guarded
 def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
     """Open every instrument, ask who it is, and read it once."""
-    from errormotion.cli import probing
+    from errormotion.cli.commands import probing
 
     if not probing.probe(file, json_):
         raise typer.Exit(ERROR)
@@ -325,7 +325,7 @@ def model_fit(
     json_: Json = False,
 ) -> None:
     """Make a thermal model of the errors of warm-ups."""
-    from errormotion.cli import modelling
+    from errormotion.cli.commands import modelling
 
     modelling.make(campaigns, out, set_ or [], settings, json_)
 
@@ -339,7 +339,7 @@ def model_predict(
     json_: Json = False,
 ) -> None:
     """Predict errors from temperatures and working parameters."""
-    from errormotion.cli import modelling
+    from errormotion.cli.commands import modelling
 
     modelling.foresee(model, data, out, json_)
 
@@ -353,6 +353,6 @@ def model_check(
     json_: Json = False,
 ) -> None:
     """Compare what a model predicts with what was measured."""
-    from errormotion.cli import modelling
+    from errormotion.cli.commands import modelling
 
     modelling.examine(model, errors, report, json_)

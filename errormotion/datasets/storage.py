@@ -54,7 +54,7 @@ def load(path: str | Path) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        NetCDF-4 file or Zarr folder; or ``.csv``, as `errormotion.datasets.readings_csv` reads it.
+        NetCDF-4 file or Zarr folder; or ``.csv``, as `errormotion.datasets.text.readings_csv` reads it.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def load(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
-        from errormotion.datasets.readings_csv import read_csv
+        from errormotion.datasets.text.readings_csv import read_csv
 
         return read_csv(path)
     engine = _engine_of(path)

@@ -16,10 +16,17 @@ import numpy as np
 from pydantic import ValidationError
 
 from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings, Samples, Status
+from errormotion.plugins import (
+    Identity,
+    InstrumentInfo,
+    InstrumentSubject,
+    PluginSettings,
+    Samples,
+    Status,
+    load_object,
+)
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
-from errormotion.testing.subjects import InstrumentSubject, load_object
 
 INSTRUMENT_CHECKS: Checks[InstrumentSubject] = Checks()
 

@@ -19,7 +19,7 @@ from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.files import BenchPlan, parse_bench
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.monitor import FLAGS, Monitor
+from errormotion.campaign.monitor.watch import FLAGS, Monitor
 from errormotion.errors import BenchError, RunError
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Shop"\nmachine = "Mill 5"\n'

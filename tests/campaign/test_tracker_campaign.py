@@ -14,7 +14,7 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.leica_emscon import SimulatedEmScon
 from errormotion.methods.multilateration import Multilateration
-from errormotion.methods.multilateration.layout import serpentine
+from errormotion.methods.multilateration.planning.layout import serpentine
 from errormotion.twin import VirtualMachine
 
 STATIONS = np.array([(-0.75, -0.6, -0.1), (0.8, -0.55, 0.0), (0.7, 0.65, -0.05), (-0.6, 0.5, 0.8)])

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.twin import VirtualMachine
 
 HEAD = """# schema = errormotion.raw.inclination/1

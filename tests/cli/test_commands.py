@@ -222,7 +222,7 @@ def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> N
 def test_doctor_finds_this_machine_well_and_says_what_is_not(
     run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from errormotion.cli import examination
+    from errormotion.cli.commands import examination
 
     monkeypatch.setattr(examination, "LEAST_DISK", 0)
     assert answer("doctor")["ok"] is True

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
-from errormotion.cli import demonstration
+from errormotion.cli.demo import spindle as demonstration
 
 SHORTER = {
     'procedure = "beam_detection"': 'procedure = "beam_detection"\nsteps = 21\nscan_length = "1.6 mm"',

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
-from errormotion.cli import probing_demonstration
+from errormotion.cli.demo import probing as probing_demonstration
 from errormotion.instruments.simulators import linuxcnc, linuxcnc_process
 
 if reason := linuxcnc_process.why_not():

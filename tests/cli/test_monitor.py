@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from errormotion.campaign.monitor import Snapshot
+from errormotion.campaign.monitor.watch import Snapshot
 from errormotion.cli.app import app
-from errormotion.cli.monitoring import Screen, bars, clock
+from errormotion.cli.commands.monitoring import Screen, bars, clock
 
 BENCH = """\
 schema = "errormotion.bench/1"

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errormotion import datasets
-from errormotion.datasets.calibration import SCHEMA, InclinationCalibration, build, hole_texts, violations
-from errormotion.datasets.tilt_support import TiltSupport
+from errormotion.datasets.calibrations.inclination import SCHEMA, InclinationCalibration, build, hole_texts, violations
+from errormotion.datasets.calibrations.tilt_support import TiltSupport
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errormotion import datasets
-from errormotion.datasets.readings_csv import read_csv
+from errormotion.datasets.text.readings_csv import read_csv
 from errormotion.errors import DatasetError
 
 HEAD = """# schema = errormotion.raw.beam_direction/1

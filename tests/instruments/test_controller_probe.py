@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from errormotion.datasets.pretravel import PretravelMap, assemble, terms_up_to, unit
+from errormotion.datasets.calibrations.pretravel import PretravelMap, assemble, terms_up_to, unit
 from errormotion.errors import DatasetError, InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world

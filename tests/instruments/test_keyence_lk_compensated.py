@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from errormotion.datasets.calibration import InclinationCalibration, build, half_tilt, terms
+from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, terms
 from errormotion.errors import DatasetError, InstrumentError, MethodError
 from errormotion.instruments.point_lds.compensated import CompensatedSensor
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings

@@ -9,7 +9,7 @@ import xarray as xr
 
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift import Event, Settings, SpindleDrift
-from errormotion.methods.spindle_drift.acquisition import HAND_OVER_SAMPLES, PATIENCE
+from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SAMPLES, PATIENCE
 from errormotion.plugins import Samples
 from errormotion.twin import VirtualMachine
 

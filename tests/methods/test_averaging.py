@@ -8,7 +8,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from errormotion.methods.spindle_drift.averaging import Averager, join, slices, window_sums
+from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

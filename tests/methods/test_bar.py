@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from errormotion.methods.spindle_drift.bar import end_point, fit_axis, state_jacobian
+from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis, state_jacobian
 
 R = 5e-3
 LEVELS = np.array([0.01, 0.05])

@@ -5,7 +5,7 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across
-from errormotion.methods.spindle_drift.beams import (
+from errormotion.methods.spindle_drift.identification.beams import (
     circles_and_line,
     fisher_bound,
     likelihood_fit,

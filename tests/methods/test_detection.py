@@ -6,8 +6,8 @@ import xarray as xr
 
 from errormotion.datasets import load, save, validate
 from errormotion.methods.spindle_drift import Settings, SpindleDrift
-from errormotion.methods.spindle_drift.scanning import last_attempts
-from errormotion.methods.spindle_drift.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.acquisition.beams import last_attempts
+from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.twin import StepProgram, VirtualMachine
 
 RATE = 1500.0

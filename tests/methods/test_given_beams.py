@@ -6,7 +6,7 @@ import xarray as xr
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift import Settings, SpindleDrift
-from errormotion.methods.spindle_drift.given_beams import NEEDED, given_beams
+from errormotion.methods.spindle_drift.acquisition.given_beams import NEEDED, given_beams
 from errormotion.twin import VirtualMachine
 
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")

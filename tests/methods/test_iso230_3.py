@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
+from errormotion.methods.spindle_drift.identification.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
 
 U = 1e-8
 

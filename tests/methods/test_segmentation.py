@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.segmentation import segment_steps
+from errormotion.methods.spindle_drift.identification.segmentation import segment_steps
 
 R, STEPS, RATE = 5e-3, 101, 1500.0
 PLACES = np.linspace(-1e-3, 1e-3, STEPS)

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import DOF, build_errors, provenance
-from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.method import BeamDirection
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.report import write_report

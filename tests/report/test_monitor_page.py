@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.campaign.monitor.report import log as monitor_log
 from errormotion.datasets import save
 from errormotion.errors import RunError
-from errormotion.report import monitor_log, write_report, write_run_report
+from errormotion.report import write_report, write_run_report
 from errormotion.twin import VirtualMachine
 
 MEANINGS = ["known", "open", "shorted", "out of range", "no answer", "unknown"]

@@ -10,9 +10,9 @@ import pytest
 import xarray as xr
 
 from errormotion.methods.normal_vector import NormalVector
+from errormotion.methods.normal_vector.report.drawings import balls
+from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
-from errormotion.report.normal_vector_figures import balls
-from errormotion.report.normal_vector_view import MISSING, MOVED, WRONG, probing
 from errormotion.report.text import fixed
 from errormotion.report.timeline import clock
 from errormotion.twin import Event, VirtualMachine

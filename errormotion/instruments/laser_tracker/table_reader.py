@@ -20,8 +20,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from errormotion.datasets.csv_text import Table, blocks
-from errormotion.datasets.log_reader import Complaints
+from errormotion.datasets.text.csv_text import Table, blocks
+from errormotion.datasets.text.log_reader import Complaints
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 

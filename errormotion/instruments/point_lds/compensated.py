@@ -13,7 +13,7 @@ from errormotion.errors import InstrumentError
 from errormotion.plugins import Samples
 
 if TYPE_CHECKING:
-    from errormotion.datasets.calibration import Compensated, InclinationCalibration
+    from errormotion.datasets.calibrations.inclination import Compensated, InclinationCalibration
 
 Array = np.ndarray[Any, Any]
 
@@ -139,7 +139,9 @@ class CompensatedSensor:
 
 
 def _found(calibration: str | Path | InclinationCalibration) -> InclinationCalibration:
-    from errormotion.datasets.calibration import InclinationCalibration  # reads files: only when one is needed
+    from errormotion.datasets.calibrations.inclination import (
+        InclinationCalibration,  # reads files: only when one is needed
+    )
 
     if isinstance(calibration, InclinationCalibration):
         return calibration

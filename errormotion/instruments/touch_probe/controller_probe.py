@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from errormotion import plugins
-from errormotion.datasets.pretravel import PretravelMap
+from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.units import Length, Time, Velocity
 from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.touch_probe.settings import ProbeSettings, corrected, refuse_unmapped

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.folders import folders_beside
-from errormotion.datasets.pretravel import PretravelMap
 from errormotion.datasets.units import Length
 from errormotion.errors import InstrumentError
 from errormotion.plugins import Contact, PluginSettings, Touch

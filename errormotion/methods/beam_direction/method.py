@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -33,6 +33,8 @@ class BeamDirection:
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
+    raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.beam_direction.report:chapters")
 
     def acquire(
         self,
@@ -51,7 +53,7 @@ class BeamDirection:
         """Return why the calibration that the settings name cannot be used, where it cannot."""
         if settings.compensation is None:
             return {}
-        from errormotion.datasets.calibration import InclinationCalibration
+        from errormotion.datasets.calibrations.inclination import InclinationCalibration
 
         try:
             InclinationCalibration.find(settings.compensation)
@@ -85,7 +87,7 @@ class BeamDirection:
         MethodError
             The data do not determine the answer.
         """
-        from errormotion.methods.beam_direction.identification import identify_beam
+        from errormotion.methods.beam_direction.identification.planes import identify_beam
 
         settings = settings or BeamSettings()
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
@@ -93,14 +95,14 @@ class BeamDirection:
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"beam_direction reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         if "distance" not in checked:
-            from errormotion.methods.beam_direction.bar_result import identify_bar
-            from errormotion.methods.beam_direction.identification import sensor_of
+            from errormotion.methods.beam_direction.identification.check_bar.result import identify_bar
+            from errormotion.methods.beam_direction.identification.planes import sensor_of
 
             return identify_bar(checked, sensor_of(checked, settings), settings, self.info.id, self.info.version)
         return identify_beam(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
-        from errormotion.methods.beam_direction.planning import plan
+        from errormotion.methods.beam_direction.planning.plan import plan
 
         return plan(self, settings or BeamSettings())

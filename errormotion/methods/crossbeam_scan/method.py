@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -31,10 +31,10 @@ class CrossbeamScan:
             "errors between two artefacts that neither of them shows",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("line_profiler",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = ScanSettings
+    raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
 
     def acquire(
         self,
@@ -45,7 +45,8 @@ class CrossbeamScan:
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``pocket``."""
-        from errormotion.methods.crossbeam_scan import acquisition, pocket
+        from errormotion.methods.crossbeam_scan.acquisition import pocket
+        from errormotion.methods.crossbeam_scan.acquisition import scans as acquisition
 
         if settings.procedure == "profiler_pose":
             return pocket.record_pocket(bench, settings, done)
@@ -57,13 +58,13 @@ class CrossbeamScan:
 
     def progress(self, settings: ScanSettings) -> float:
         """Return the expected number of lines, or of scans of the pocket."""
-        from errormotion.methods.crossbeam_scan.acquisition import expected_lines
+        from errormotion.methods.crossbeam_scan.acquisition.scans import expected_lines
 
         return float(len(settings.pocket_lifts) if settings.procedure == "profiler_pose" else expected_lines(settings))
 
     def follow(self, settings: ScanSettings) -> Callable[[xr.Dataset], str]:
         """Return what tells, chunk by chunk while measuring, how far things are."""
-        from errormotion.methods.crossbeam_scan.live import LiveScans
+        from errormotion.methods.crossbeam_scan.acquisition.live import LiveScans
 
         return LiveScans(settings).update
 
@@ -73,7 +74,7 @@ class CrossbeamScan:
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> Mapping[str, str]:
         """Return the NC programs of a campaign, name to text."""
-        from errormotion.methods.crossbeam_scan.schedule import program_texts
+        from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
 
         return program_texts(settings)
 
@@ -105,9 +106,9 @@ class CrossbeamScan:
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"crossbeam_scan reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
         if "pocket_radius" in checked:
-            from errormotion.methods.crossbeam_scan.pose_errors import identify_pose
+            from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import identify_pose
 
             return identify_pose(checked, settings, self.info.id, self.info.version)
-        from errormotion.methods.crossbeam_scan.identification import identify_scans
+        from errormotion.methods.crossbeam_scan.identification.scans import identify_scans
 
         return identify_scans(checked, settings, self.info.id, self.info.version)

@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import transform_covariance
-from errormotion.methods.crossbeam_scan import calibration, strain
-from errormotion.methods.crossbeam_scan.carriage import Rig
-from errormotion.methods.crossbeam_scan.chain import carriage_adjoint, carriage_errors, pose_twists
-from errormotion.methods.crossbeam_scan.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan.identification import strain
+from errormotion.methods.crossbeam_scan.identification.carriage import Rig
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import MethodInfo
 
-Array = NDArray[np.float64]
 
 EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
 """Errors (m, rad) of which a wrong pose and lever take their share in a plan."""

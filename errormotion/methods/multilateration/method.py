@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -32,10 +32,10 @@ class Multilateration:
             "drift that shifts and turns the machine as a whole from one set-up to the next",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("laser_tracker",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("laser_tracker",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
+    raw_schemas = lazy("errormotion.methods.multilateration.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.multilateration.report:chapters")
 
     def acquire(
         self,
@@ -46,7 +46,7 @@ class Multilateration:
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield one raw dataset a set-up. See ``acquisition``."""
-        from errormotion.methods.multilateration import acquisition
+        from errormotion.methods.multilateration.acquisition import measure as acquisition
 
         return acquisition.measure_stations(bench, settings, inputs, done)
 
@@ -74,8 +74,8 @@ class Multilateration:
         MethodError
             The data do not determine the answer, or contradict one another.
         """
-        from errormotion.methods.multilateration.acquisition import latest
-        from errormotion.methods.multilateration.identification import identify_targets
+        from errormotion.methods.multilateration.acquisition.measure import latest
+        from errormotion.methods.multilateration.identification.identify import identify_targets
 
         settings = settings or MultilaterationSettings()
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
@@ -86,6 +86,6 @@ class Multilateration:
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect of the layout."""
-        from errormotion.methods.multilateration.planning import plan
+        from errormotion.methods.multilateration.planning.plan import plan
 
         return plan(self.info, settings or MultilaterationSettings())

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from errormotion.datasets.units import Length, Quantity, Temperature
-from errormotion.methods.multilateration.acquisition import Measuring
-from errormotion.methods.multilateration.box import Place
-from errormotion.methods.multilateration.refraction import CO2, HELIUM_NEON
-from errormotion.methods.multilateration.sight import Planning
+from errormotion.methods.multilateration.acquisition.measure import Measuring
+from errormotion.methods.multilateration.identification.refraction import CO2, HELIUM_NEON
+from errormotion.methods.multilateration.planning.box import Place
+from errormotion.methods.multilateration.planning.sight import Planning
 from errormotion.plugins import PluginSettings
 
 Pressure = Annotated[float, Quantity("a pressure", "Pa", "1013.25 hPa")]

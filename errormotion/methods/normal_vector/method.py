@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -34,10 +34,10 @@ class NormalVector:
             "drift faster than the probing cycles follow one another",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("touch_probe",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BallSettings
+    raw_schemas = lazy("errormotion.methods.normal_vector.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.normal_vector.report:chapters")
 
     def acquire(
         self,
@@ -48,7 +48,7 @@ class NormalVector:
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield one raw dataset a probing cycle. See ``acquisition``."""
-        from errormotion.methods.normal_vector import acquisition
+        from errormotion.methods.normal_vector.acquisition import measure as acquisition
 
         return acquisition.acquire(bench, settings, done)
 
@@ -57,14 +57,14 @@ class NormalVector:
 
         The tip is that of the settings, else that of the bench's touch probe.
         """
-        from errormotion.methods.normal_vector.programs import programs
+        from errormotion.methods.normal_vector.acquisition.programs import programs
 
         tip = getattr((instruments or {}).get("touch_probe"), "tip_radius", None)
         return programs(settings if settings.tip_radius or not tip else settings.model_copy(update={"tip_radius": tip}))
 
     def motions(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
         """Return every step that the machine will make, for its limits and for a dry run."""
-        from errormotion.methods.normal_vector.cycle import campaign_steps
+        from errormotion.methods.normal_vector.acquisition.cycle import campaign_steps
 
         return campaign_steps(settings, instruments)
 
@@ -86,13 +86,13 @@ class NormalVector:
 
     def progress(self, settings: BallSettings) -> float:
         """Return the number of probing cycles, the cold one included."""
-        from errormotion.methods.normal_vector.cycle import cycles
+        from errormotion.methods.normal_vector.acquisition.cycle import cycles
 
         return float(cycles(settings))
 
     def follow(self, settings: BallSettings) -> Callable[[xr.Dataset], str]:
         """Return what tells of each cycle how far the balls have gone; see ``live``."""
-        from errormotion.methods.normal_vector.live import LiveBalls
+        from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 
         return LiveBalls(settings).update
 
@@ -112,7 +112,7 @@ class NormalVector:
         MethodError
             The data do not determine the answer, or contradict what is stated of the balls.
         """
-        from errormotion.methods.normal_vector.identification import identify_motion
+        from errormotion.methods.normal_vector.identification.identify import identify_motion
 
         settings = settings or BallSettings()
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)

@@ -8,12 +8,12 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.acquisition import SCHEMA
-from errormotion.methods.spindle_drift.detection import identify_beams
-from errormotion.methods.spindle_drift.drift import identify_drift
-from errormotion.methods.spindle_drift.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.acquisition.drift import SCHEMA
+from errormotion.methods.spindle_drift.identification.detection import identify_beams
+from errormotion.methods.spindle_drift.identification.drift import identify_drift
+from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -33,10 +33,10 @@ class SpindleDrift:
             "what moves the sensors' frame and is not in its temperature",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("spindle_frame",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
+    raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
 
     def acquire(
         self,
@@ -50,8 +50,9 @@ class SpindleDrift:
 
         For a drift ``inputs`` may hold the ``beams`` of a detection, or single ones by the name of their channel.
         """
-        from errormotion.methods.spindle_drift import acquisition, scanning
-        from errormotion.methods.spindle_drift.given_beams import given_beams
+        from errormotion.methods.spindle_drift.acquisition import beams as scanning
+        from errormotion.methods.spindle_drift.acquisition import drift as acquisition
+        from errormotion.methods.spindle_drift.acquisition.given_beams import given_beams
 
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
@@ -71,7 +72,7 @@ class SpindleDrift:
         """Return what tells, chunk by chunk while measuring, how far things are."""
         if settings.procedure == "beam_detection":
             return _beam_text
-        from errormotion.methods.spindle_drift.live import LiveDrift
+        from errormotion.methods.spindle_drift.acquisition.live import LiveDrift
 
         return LiveDrift(settings).update
 

@@ -8,8 +8,8 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.beam_direction import design
 from errormotion.methods.beam_direction.acquisition import measure_planes
+from errormotion.methods.beam_direction.planning import design
 from errormotion.methods.beam_direction.settings import Settings
 
 BEAM = np.array([np.sin(np.radians(21.0)), 0.01, -np.cos(np.radians(21.0))])

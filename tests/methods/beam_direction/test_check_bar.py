@@ -7,8 +7,8 @@ import pytest
 
 from errormotion import datasets
 from errormotion.errors import FitError, MethodError
-from errormotion.methods.beam_direction.check_bar import BarFit, fit_bar, measure_bar
-from errormotion.methods.beam_direction.scanning import points
+from errormotion.methods.beam_direction.identification.check_bar.measure import BarFit, fit_bar, measure_bar
+from errormotion.methods.beam_direction.identification.check_bar.scanning import points
 
 TABLE_2 = Path(__file__).parents[3] / "examples" / "check_bar"
 ALONG_Z = (0.0, 0.0, 1.0)

@@ -7,10 +7,10 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction.compensation import Planes, Sensor, settle, uncompensated
-from errormotion.methods.beam_direction.origin import locate
-from errormotion.methods.beam_direction.propagation import closure_chi2, propagate
-from errormotion.methods.beam_direction.slopes import expected_covariance
+from errormotion.methods.beam_direction.identification.compensation import Planes, Sensor, settle, uncompensated
+from errormotion.methods.beam_direction.identification.origin import locate
+from errormotion.methods.beam_direction.identification.propagation import closure_chi2, propagate
+from errormotion.methods.beam_direction.identification.slopes import expected_covariance
 
 U = np.array([0.34, 0.02, -0.94])
 U /= np.linalg.norm(U)

@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, turned
-from errormotion.methods.beam_direction.direction import bound, solve
-from errormotion.methods.beam_direction.slopes import fit_plane_readings, gradient_covariance
+from errormotion.methods.beam_direction.identification.direction import bound, solve
+from errormotion.methods.beam_direction.identification.slopes import fit_plane_readings, gradient_covariance
 
 U = np.array([0.34, 0.02, -0.94])
 U /= np.linalg.norm(U)

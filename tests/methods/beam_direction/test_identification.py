@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from errormotion.datasets import load, provenance, save, validate
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt
 from errormotion.methods.beam_direction import BeamDirection, Settings
-from errormotion.methods.beam_direction.direction import bound
-from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction.identification.direction import bound
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.twin import VirtualMachine
 
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.beam_direction.compensation import Planes, uncompensated
-from errormotion.methods.beam_direction.origin import locate
-from errormotion.methods.beam_direction.propagation import expected_beam, propagate
-from errormotion.methods.beam_direction.slopes import expected_covariance
+from errormotion.methods.beam_direction.identification.compensation import Planes, uncompensated
+from errormotion.methods.beam_direction.identification.origin import locate
+from errormotion.methods.beam_direction.identification.propagation import expected_beam, propagate
+from errormotion.methods.beam_direction.identification.slopes import expected_covariance
 
 U = np.array([0.34, 0.02, -0.94])
 U /= np.linalg.norm(U)

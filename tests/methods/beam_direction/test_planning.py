@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from errormotion import datasets
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction import BeamDirection, design
-from errormotion.methods.beam_direction.direction import bound
-from errormotion.methods.beam_direction.inclination import Settings as CalibrationSettings
-from errormotion.methods.beam_direction.inclination import calibrate
+from errormotion.methods.beam_direction import BeamDirection
+from errormotion.methods.beam_direction.identification.direction import bound
+from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings as CalibrationSettings
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
+from errormotion.methods.beam_direction.planning import design
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.twin import VirtualMachine
 

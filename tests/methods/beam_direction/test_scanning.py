@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.datasets.calibration import InclinationCalibration
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction.check_bar import fit_bar, measure_bar
-from errormotion.methods.beam_direction.inclination import calibrate
-from errormotion.methods.beam_direction.scanning import Points, along_curve, over_surface, points, round_bar
+from errormotion.methods.beam_direction.identification.check_bar.measure import fit_bar, measure_bar
+from errormotion.methods.beam_direction.identification.check_bar.scanning import (
+    Points,
+    along_curve,
+    over_surface,
+    points,
+    round_bar,
+)
+from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.twin import VirtualMachine
 
 U = np.array([0.6, 0.0, -0.8])

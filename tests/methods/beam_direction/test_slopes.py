@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.beam_direction.slopes import (
+from errormotion.methods.beam_direction.identification.slopes import (
     correlation_factor,
     expected_covariance,
     fit_plane_readings,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.registration import kernels, prepare
-from errormotion.methods.crossbeam_scan.registration.surface import Surface
+from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare
+from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface
 
 
 def plane_of(block, dx, dy):

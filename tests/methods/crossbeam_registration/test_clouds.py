@@ -7,7 +7,7 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import clouds, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration import clouds, prepare, register
 
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
 

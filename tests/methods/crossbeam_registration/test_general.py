@@ -5,7 +5,7 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import clouds, register_clouds
+from errormotion.methods.crossbeam_scan.identification.registration import clouds, register_clouds
 
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
 NOISE = 0.5e-6

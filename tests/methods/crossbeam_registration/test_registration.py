@@ -10,11 +10,11 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import prepare, register, solver
-from errormotion.methods.crossbeam_scan.registration.extra import Extra
-from errormotion.methods.crossbeam_scan.registration.solver import Problem, State
+from errormotion.methods.crossbeam_scan.identification.registration import prepare, register, solver
+from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
-registering = import_module("errormotion.methods.crossbeam_scan.registration.register")
+registering = import_module("errormotion.methods.crossbeam_scan.identification.registration.register")
 
 ORIGIN = np.zeros(3)
 BLOCK_X, BLOCK_Y = 16 * 12.5e-6, 4 * 70e-6

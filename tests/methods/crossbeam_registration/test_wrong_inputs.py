@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.registration import prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
 
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
 RARE = 27.9

@@ -19,10 +19,10 @@ from errormotion.instruments.line_profiler.profile_files import ProfileFiles
 from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.methods.crossbeam_scan import moving
-from errormotion.methods.crossbeam_scan.acquisition import HAND_OVER_LINES, expected_lines, record_scans
-from errormotion.methods.crossbeam_scan.cutting import Scans, interruptions
-from errormotion.methods.crossbeam_scan.schedule import schedule
+from errormotion.methods.crossbeam_scan.acquisition import moving
+from errormotion.methods.crossbeam_scan.acquisition.scans import HAND_OVER_LINES, expected_lines, record_scans
+from errormotion.methods.crossbeam_scan.acquisition.schedule import schedule
+from errormotion.methods.crossbeam_scan.identification.cutting import Scans, interruptions
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 
 PITCH = 70e-6

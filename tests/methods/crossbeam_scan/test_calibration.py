@@ -6,8 +6,8 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import load, save, validate
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan import calibration, edges
-from errormotion.methods.crossbeam_scan.calibration import Pocket, calibrate
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration, edges
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import Pocket, calibrate
 from errormotion.twin.profiler import Disturbances, Profiler
 
 RADIUS = 12.496e-3

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics.twists import transform
-from errormotion.methods.crossbeam_scan import calibration, chain, strain
-from errormotion.methods.crossbeam_scan.carriage import Rig, carriage
+from errormotion.methods.crossbeam_scan.identification import chain, strain
+from errormotion.methods.crossbeam_scan.identification.carriage import Rig, carriage
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registrations import QUALITY, Registrations
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.registrations import QUALITY, Registrations
 from errormotion.methods.crossbeam_scan.settings import Settings
 
 TIMES = np.array([0.0, 1800.0, 7200.0])

@@ -9,7 +9,8 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.datasets import build_errors, provenance, validate
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displaced, displacement, log
-from errormotion.methods.crossbeam_scan import calibration, chain
+from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import swept
 from errormotion.twin.profiler import Disturbances, Profiler

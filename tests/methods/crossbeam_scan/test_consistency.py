@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.chain import carriage_adjoint
-from errormotion.methods.crossbeam_scan.consistency import cold_repeats, moved_artefacts
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint
+from errormotion.methods.crossbeam_scan.identification.consistency import cold_repeats, moved_artefacts
 from errormotion.twin import VirtualMachine
 
 PLACES = 0.35 + 0.2 * np.arange(8)

@@ -7,13 +7,14 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.methods.crossbeam_scan import calibration, chain
-from errormotion.methods.crossbeam_scan.carriage import Carriage, Rig
-from errormotion.methods.crossbeam_scan.curves import MOMENTS, curves
+from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig
+from errormotion.methods.crossbeam_scan.identification.curves import MOMENTS, curves
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
+from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.registrations import Registrations
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.methods.crossbeam_scan.strain import from_maps
 from errormotion.twin import VirtualMachine
 
 PLACES = np.linspace(-0.7, 0.7, 8)

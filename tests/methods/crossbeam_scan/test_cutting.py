@@ -8,7 +8,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.cutting import Interruption, Scans, interruption, interruptions
+from errormotion.methods.crossbeam_scan.identification.cutting import Interruption, Scans, interruption, interruptions
 
 PITCH, POINTS, COUNT = 70e-6, 3, 1e-6
 POSITIONS = np.array([0.3, 0.45])

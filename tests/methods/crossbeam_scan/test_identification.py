@@ -12,8 +12,9 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
 from errormotion.datasets import provenance
-from errormotion.methods.crossbeam_scan import CrossbeamScan, calibration
-from errormotion.methods.crossbeam_scan.chain import SOURCES
+from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.profiler import Disturbances, Profiler

@@ -8,13 +8,14 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics.poses import displaced
-from errormotion.methods.crossbeam_scan import CrossbeamScan, chain
-from errormotion.methods.crossbeam_scan.carriage import Carriage
-from errormotion.methods.crossbeam_scan.judgement import MOVED, judge
+from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
+from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, judge
+from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
+from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.registrations import Registrations
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.methods.crossbeam_scan.strain import from_maps
 from errormotion.twin import VirtualMachine
 from errormotion.twin.profiler import Profiler
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.methods.crossbeam_scan.live import LONGEST_QUEUE, LiveScans
+from errormotion.methods.crossbeam_scan.acquisition.live import LONGEST_QUEUE, LiveScans
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.profiler import Disturbances, Profiler
 

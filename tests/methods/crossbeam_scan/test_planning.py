@@ -8,7 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan import CrossbeamScan, calibration
+from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine

@@ -13,8 +13,8 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles
 from errormotion.instruments.simulators import world
-from errormotion.methods.crossbeam_scan.calibration import calibrate_dataset, parameters
-from errormotion.methods.crossbeam_scan.pocket import record_pocket
+from errormotion.methods.crossbeam_scan.acquisition.pocket import record_pocket
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import calibrate_dataset, parameters
 from errormotion.methods.crossbeam_scan.settings import Settings
 
 SETTINGS = Settings(procedure="profiler_pose", pocket_position=0.1, travel=(-0.9, 0.9))

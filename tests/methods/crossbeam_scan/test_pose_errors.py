@@ -7,8 +7,9 @@ from scipy.spatial.transform import RigidTransform
 from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displacement
-from errormotion.methods.crossbeam_scan import CrossbeamScan, calibration
-from errormotion.methods.crossbeam_scan.pose_errors import given, given_covariance
+from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 from errormotion.twin import VirtualMachine
 

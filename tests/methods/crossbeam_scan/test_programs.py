@@ -7,8 +7,8 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.methods.crossbeam_scan.programs import measuring_pass, warm_up_piece
-from errormotion.methods.crossbeam_scan.schedule import program_texts
+from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass, warm_up_piece
+from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
 from errormotion.methods.crossbeam_scan.settings import Settings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (-1.0, 3.0), "Z": (0.0, 1.0)}

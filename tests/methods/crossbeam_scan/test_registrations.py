@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.crossbeam_scan.cutting import Scans
-from errormotion.methods.crossbeam_scan.registration import prepare
-from errormotion.methods.crossbeam_scan.registrations import register_all
+from errormotion.methods.crossbeam_scan.identification.cutting import Scans
+from errormotion.methods.crossbeam_scan.identification.registration import prepare
+from errormotion.methods.crossbeam_scan.identification.registrations import register_all
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.profiler import Profiler
 

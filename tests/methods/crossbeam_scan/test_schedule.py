@@ -8,8 +8,8 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.methods.crossbeam_scan.programs import measuring_pass
-from errormotion.methods.crossbeam_scan.schedule import PAUSE, scan_times, schedule
+from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, scan_times, schedule
 from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}

@@ -6,8 +6,8 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.chain import carriage_adjoint
-from errormotion.methods.crossbeam_scan.smoothing import smooth, smooth_twists, warm_up_scale
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint
+from errormotion.methods.crossbeam_scan.identification.smoothing import smooth, smooth_twists, warm_up_scale
 from errormotion.twin import VirtualMachine
 
 PLACES = 0.35 + 0.2 * np.arange(8)

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics.twists import transform
-from errormotion.methods.crossbeam_scan import calibration, chain, strain
+from errormotion.methods.crossbeam_scan.identification import chain, strain
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 
 T = 7200.0
 PLACES = np.linspace(-0.7, 0.7, 8)

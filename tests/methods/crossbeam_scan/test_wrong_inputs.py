@@ -8,7 +8,7 @@ import pytest
 
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.crossbeam_scan import CrossbeamScan
-from errormotion.methods.crossbeam_scan.cutting import interruption
+from errormotion.methods.crossbeam_scan.identification.cutting import interruption
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.artefacts import freeform, plane
 from errormotion.twin.profiler import Profiler

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.alternating import alternate
-from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.network.alternating import alternate
+from errormotion.methods.multilateration.network.solver import solve
 
 NEAR = np.array([[-0.15, -0.15, -0.1], [0.16, -0.13, 0.02], [0.0, 0.17, -0.05], [0.02, 0.01, 0.2]])
 

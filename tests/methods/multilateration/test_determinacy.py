@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.bound import bound
-from errormotion.methods.multilateration.determinacy import swapped_stations
-from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.network.determinacy import swapped_stations
+from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.planning.bound import bound
 
 GOOD = np.array([[-0.35, -0.3, -0.15], [0.36, -0.33, 0.02], [0.0, 0.37, -0.15], [0.02, 0.01, 0.4]])
 FLAT = np.array([[0.3, 0.3, -0.2], [-0.3, 0.3, -0.2], [-0.3, -0.3, -0.2], [0.4, -0.2, -0.2]])

@@ -7,8 +7,8 @@ from scipy import stats
 from errormotion import datasets
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.multilateration import Multilateration, Settings
-from errormotion.methods.multilateration.refraction import refractive_index
-from errormotion.methods.multilateration.volume import diagonals, grid, volumetric_errors
+from errormotion.methods.multilateration.identification.refraction import refractive_index
+from errormotion.methods.multilateration.identification.volume import diagonals, grid, volumetric_errors
 from errormotion.twin import VirtualMachine
 
 XYZ = ("EX", "EY", "EZ")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration import layout
-from errormotion.methods.multilateration.bound import bound
-from errormotion.methods.multilateration.box import Box
+from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.box import Box
+from errormotion.methods.multilateration.planning.sight import Planning, Sight, blocked
 from errormotion.methods.multilateration.settings import Layout
-from errormotion.methods.multilateration.sight import Planning, Sight, blocked
 
 CUBE = np.stack(np.meshgrid(*[np.linspace(-0.05, 0.05, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
 OPEN = Sight.of(Planning(acceptance=np.pi))

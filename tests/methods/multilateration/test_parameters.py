@@ -7,7 +7,7 @@ from numpy.polynomial.legendre import leggauss
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import cross_matrix, move
-from errormotion.methods.multilateration.parameters import fit_machine
+from errormotion.methods.multilateration.identification.parameters import fit_machine
 from errormotion.twin import VirtualMachine
 
 REFLECTOR = np.array([0.02, -0.01, -0.08])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.network.solver import solve
 
 STATION = np.array(
     [

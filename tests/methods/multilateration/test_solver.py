@@ -7,9 +7,9 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2, norm
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.bound import bound, relative_bound
-from errormotion.methods.multilateration.model import Stations, jacobian, motions, readings
-from errormotion.methods.multilateration.solver import solve
+from errormotion.methods.multilateration.network.model import Stations, jacobian, motions, readings
+from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
 # Around a cube of 100 mm, at distances like its size: the linear regime at 1 um.
 NEAR = np.array(

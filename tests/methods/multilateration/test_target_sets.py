@@ -7,16 +7,17 @@ import pytest
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration import Multilateration, layout
-from errormotion.methods.multilateration.bound import bound
-from errormotion.methods.multilateration.choosing import Choosing, positions, refuse_count
-from errormotion.methods.multilateration.model import motions
-from errormotion.methods.multilateration.parameters import fit_machine
-from errormotion.methods.multilateration.planning import plan
+from errormotion.methods.multilateration import Multilateration
+from errormotion.methods.multilateration.identification.parameters import fit_machine
+from errormotion.methods.multilateration.network.model import motions
+from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.choosing import Choosing, positions, refuse_count
+from errormotion.methods.multilateration.planning.plan import plan
+from errormotion.methods.multilateration.planning.sight import Planning, Sight
+from errormotion.methods.multilateration.planning.target_sets import Expected, Volume
 from errormotion.methods.multilateration.settings import Settings
-from errormotion.methods.multilateration.sight import Planning, Sight
-from errormotion.methods.multilateration.solver import solve
-from errormotion.methods.multilateration.target_sets import Expected, Volume
 
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
 STATIONS = np.array([(-0.75, -0.6, -0.1), (0.8, -0.55, 0.0), (0.7, 0.65, -0.05), (-0.6, 0.5, 0.8)])

@@ -5,9 +5,10 @@ import pytest
 
 from errormotion import datasets
 from errormotion.errors import DatasetError
-from errormotion.methods.multilateration import Multilateration, Settings, assembly, uncertainty
-from errormotion.methods.multilateration.solver import solve
-from errormotion.methods.multilateration.uncertainty import Scatter, responses
+from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration.identification import assembly, uncertainty
+from errormotion.methods.multilateration.identification.uncertainty import Scatter, responses
+from errormotion.methods.multilateration.network.solver import solve
 from errormotion.twin import VirtualMachine
 
 

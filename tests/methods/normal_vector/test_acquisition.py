@@ -11,8 +11,9 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings, cycle
-from errormotion.methods.normal_vector.live import LiveBalls
+from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector.acquisition import cycle
+from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 from errormotion.plugins import Contact, Identity, InstrumentInfo
 from errormotion.twin import VirtualMachine
 

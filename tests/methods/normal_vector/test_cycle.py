@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import reset, world
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
-from errormotion.methods.normal_vector import NormalVector, Settings, cycle
+from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.plugins import Touch
 from errormotion.twin import VirtualMachine
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.methods.normal_vector import normals
+from errormotion.methods.normal_vector.identification import normals
 
 BALLS = np.array([(1.0, -0.5, 0.1), (3.0, -0.6, 0.3), (2.0, 0.6, 0.15), (1.5, 0.1, 0.6)])
 POINT = np.array([2.0, 0.0, 0.3])

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import Ball, NormalVector, Settings
-from errormotion.methods.normal_vector.touching import touch_normals
+from errormotion.methods.normal_vector.acquisition.touching import touch_normals
 
 METHOD = NormalVector()
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.nc_program import interpret
-from errormotion.methods.normal_vector import NormalVector, Settings, cycle
-from errormotion.methods.normal_vector.programs import CYCLE, WARM_UP, cycle_program
+from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector.acquisition import cycle
+from errormotion.methods.normal_vector.acquisition.programs import CYCLE, WARM_UP, cycle_program
 from errormotion.twin import VirtualMachine
 
 GANTRY = VirtualMachine("gantry", seed=5)

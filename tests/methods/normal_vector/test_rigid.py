@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.normal_vector import chain
-from errormotion.methods.normal_vector.bound import bound
-from errormotion.methods.normal_vector.freedoms import Motion, turned, undetermined
-from errormotion.methods.normal_vector.rigid import Observations, fit, knot_weights
-from errormotion.methods.normal_vector.touching import touch_normals
+from errormotion.methods.normal_vector.acquisition.touching import touch_normals
+from errormotion.methods.normal_vector.identification import chain
+from errormotion.methods.normal_vector.identification.bound import bound
+from errormotion.methods.normal_vector.identification.freedoms import Motion, turned, undetermined
+from errormotion.methods.normal_vector.identification.rigid import Observations, fit, knot_weights
 
 BALLS = {
     "XYZ": np.array([(1.0, -0.5, 0.1), (3.0, -0.6, 0.3), (2.0, 0.6, 0.15), (1.5, 0.1, 0.6)]),

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from errormotion.datasets.pretravel import PretravelMap
+from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.touch_probe.dprnt.codec import Line, parse_line, text_of

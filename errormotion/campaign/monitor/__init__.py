@@ -1,0 +1,1 @@
+"""Monitors: temperatures and working parameters of a machine over hours or weeks."""

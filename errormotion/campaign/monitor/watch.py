@@ -1,0 +1,304 @@
+"""Watching a machine for hours or weeks: temperatures and working parameters on one clock, into a run folder.
+
+Every instrument is read by a thread of its own. At each tick the newest reading of each goes into the log if it is
+fresh; one that is silent leaves NaN and a mark in ``gap``, and when it is back the log goes on with it. What has been
+logged is on disk within a second, and nothing but the last readings stays in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from uuid import uuid4
+
+import numpy as np
+import xarray as xr
+
+from errormotion.campaign.bench import Answer
+from errormotion.campaign.files import BenchPlan
+from errormotion.campaign.folder import RunFolder, now
+from errormotion.campaign.journal import journal
+from errormotion.campaign.monitor.sources import Source
+from errormotion.campaign.recorder import Recorder
+from errormotion.campaign.store import RawStore
+from errormotion.datasets import provenance
+from errormotion.errors import BenchError
+
+SCHEMA = "errormotion.raw.monitor/1"
+TEST = "monitor"
+
+FLAGS = ("known", "open", "shorted", "out of range", "no answer", "unknown")
+"""Why a temperature is unknown; the log holds the number of the word in this list."""
+
+FRESH = 2.5
+"""Intervals after which a reading counts as old: one may be lost to the order of things, two may not."""
+
+LONGEST_START = 10.0
+"""Wait for the first answer of each instrument, s; who takes longer is marked as a gap until it answers."""
+
+BLOCK = 4096
+"""Rows of one chunk on disk: an hour at one a second; the chunk under way is written anew with every commit."""
+
+NUMBERS = ("spindle_speed", "spindle_load", "feed")
+"""Working parameters that are logged beside the position, as a controller's state names them."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What a monitor knows at one tick.
+
+    Attributes
+    ----------
+    time : float
+        Since the start, s.
+    temperatures : mapping of str to float
+        degC; NaN = unknown.
+    flags : mapping of str to str
+        Why those that are unknown are.
+    state : mapping
+        What the controller shows; empty without one, or while it is silent.
+    silent : mapping of str to str
+        Instruments that gave no fresh reading, and why.
+    logged : int
+        Rows in the log.
+    gaps : mapping of str to int
+        Rows without a reading, by instrument.
+    """
+
+    time: float
+    temperatures: Mapping[str, float]
+    flags: Mapping[str, str]
+    state: Mapping[str, Any]
+    silent: Mapping[str, str]
+    logged: int
+    gaps: Mapping[str, int] = field(default_factory=dict)
+
+
+class Monitor:
+    """Listens to the thermometers and the controller of a bench; a context manager.
+
+    Parameters
+    ----------
+    plan : BenchPlan
+        Its other instruments are left alone.
+    runs : Path
+        Where the run folder goes.
+    interval : float
+        Time between two rows of the log, s.
+
+    Attributes
+    ----------
+    folder : RunFolder
+        Where the log is, once entered.
+    sensors : tuple of str
+        Names of the temperatures: those of the thermometers, with the instrument before them where two are alike.
+
+    Raises
+    ------
+    BenchError
+        The bench has neither a thermometer nor a controller, or several controllers.
+    """
+
+    def __init__(self, plan: BenchPlan, runs: Path, interval: float = 1.0) -> None:
+        self.plan, self.runs, self.interval = plan, runs, float(interval)
+        kinds = ("thermometer", "controller")
+        self.sources = [Source(each, self.interval) for each in plan.instruments if each.driver.info.kind in kinds]
+        controllers = [source for source in self.sources if _kind(source) == "controller"]
+        if not self.sources or len(controllers) > 1:
+            found = ", ".join(source.name for source in controllers) or ", ".join(plan.kinds)
+            wanted = "thermometers, a controller, or both" if not self.sources else "one controller at most"
+            raise BenchError(f"{plan.source}: expected {wanted}; found {found}")
+        self.controller = controllers[0] if controllers else None
+        self._columns = _columns([source for source in self.sources if source is not self.controller])
+        self.sensors = tuple(self._columns.values())
+        self._gaps: Counter[str] = Counter()
+        self._noted: tuple[Answer, ...] = ()
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self.folder = self._new_folder()
+            stack.enter_context(self.folder.locked())
+            stack.enter_context(journal(self.folder.log))
+            stack.callback(self._stop)
+            for source in self.sources:
+                source.start()
+            attrs = {"schema": SCHEMA, "machine": self.plan.machine, "start": now(), "interval": self.interval}
+            attrs |= {"flag_meanings": json.dumps(list(FLAGS)), "instruments": "[]"}
+            # The store is made before the clock starts: that takes longer than a short interval.
+            empty = self._row(
+                Snapshot(0.0, dict.fromkeys(self.sensors, math.nan), dict.fromkeys(self.sensors, ""), {}, {}, 0)
+            )
+            RawStore.create(self.folder.raw, empty.assign_attrs(attrs), "time", BLOCK)
+            self._recorder = stack.enter_context(Recorder(self.folder.raw, "time", BLOCK, attrs))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        status, reason = "finished", ""
+        if error is not None and isinstance(error, Exception):
+            log.error("the monitor broke off", exc_info=error)
+            status, reason = "failed", f"{kind.__name__ if kind else ''}: {error}"
+        try:
+            self._stack.__exit__(kind, error, trace)
+        finally:
+            answers = [source.answer.record() for source in self.sources if source.answer]
+            self.folder.data["instruments"] = answers
+            self.folder.data["samples"] = {
+                "dim": "time",
+                "count": self._recorder.committed,
+                "dropped": 0,
+                "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
+            }
+            self.folder.step("monitor", "done" if status == "finished" else status, samples=self._recorder.committed)
+            self.folder.save(status=status, reason=reason, acquired=status == "finished")
+
+    def watch(self, duration: float = math.inf) -> Iterator[Snapshot]:
+        """Log row by row, and yield each as a snapshot.
+
+        Parameters
+        ----------
+        duration : float
+            When to end, s.
+
+        Raises
+        ------
+        RunError
+            The disk does not take it; what is committed stays whole.
+        """
+        for source in self.sources:
+            source.wait(LONGEST_START)
+        began, tick, rows = time.monotonic(), 0, 0
+        while tick * self.interval <= duration:
+            due = began + tick * self.interval
+            if (ahead := due - time.monotonic()) > 0:
+                time.sleep(ahead)
+            rows += 1
+            snapshot = self._snapshot(time.monotonic() - began, rows)
+            self._recorder.put(self._row(snapshot))
+            self._note_instruments()
+            yield snapshot
+            # Ticks that a sleeping computer has missed are no rows: the times of the log show it.
+            tick = max(tick + 1, math.ceil((time.monotonic() - began) / self.interval))
+
+    def _note_instruments(self) -> None:
+        """Say in the log who measures, once all have come up and whenever one comes up anew."""
+        answers = tuple(source.answer for source in self.sources if source.answer)
+        attrs = self._recorder.attrs  # those of the store, which the next commit writes
+        if "instruments" in attrs and answers != self._noted:
+            attrs["instruments"] = json.dumps(provenance.plain([answer.record() for answer in answers]))
+            self._noted = answers
+
+    def _snapshot(self, at: float, logged: int) -> Snapshot:
+        oldest = time.monotonic() - FRESH * self.interval
+        temperatures = dict.fromkeys(self.sensors, math.nan)
+        flags = dict.fromkeys(self.sensors, "no answer")
+        state: dict[str, Any] = {}
+        silent = {}
+        for source in self.sources:
+            reading = source.fresh(oldest)
+            if reading is None:
+                silent[source.name] = source.error or f"no answer for {FRESH * self.interval:g} s"
+                self._gaps[source.name] += 1
+            elif source is self.controller:
+                state = dict(reading.values)
+            else:
+                for channel, value in reading.values.items():
+                    name = self._columns[source.name, channel]
+                    temperatures[name], flags[name] = float(value), reading.flags.get(channel, "")
+        return Snapshot(at, temperatures, flags, state, silent, logged, dict(self._gaps))
+
+    def _row(self, snapshot: Snapshot) -> xr.Dataset:
+        gap = np.array([[source.name in snapshot.silent for source in self.sources]], dtype=np.int8)
+        data: dict[str, Any] = {"gap": (("time", "source"), gap, {"units": "1"})}
+        coords: dict[str, Any] = {
+            "time": ("time", [snapshot.time], {"units": "s"}),
+            "source": [source.name for source in self.sources],
+        }
+        if self.sensors:
+            values = np.array([[snapshot.temperatures[name] for name in self.sensors]])
+            flags = np.array([[_code(snapshot.flags[name]) for name in self.sensors]], dtype=np.int8)
+            coords["sensor"] = list(self.sensors)
+            data["temperature"] = (("time", "sensor"), values, {"units": "degC"})
+            data["temperature_flag"] = (("time", "sensor"), flags, {"units": "1"})
+            data["sensor_place"] = (("sensor", "direction"), self._places, {"units": "m"})
+            coords["direction"] = ["x", "y", "z"]
+        if self.controller is not None:
+            coords["direction"] = ["x", "y", "z"]
+            place = snapshot.state.get("position") or [math.nan] * 3
+            data["position"] = (("time", "direction"), np.array([place[:3]], dtype=float), {"units": "m"})
+            for name, unit in zip(NUMBERS, ("1/min", "1", "m/s"), strict=True):
+                value = snapshot.state.get(name, math.nan)
+                data[name] = ("time", np.array([math.nan if value is None else value], dtype=float), {"units": unit})
+        return xr.Dataset(data, coords)
+
+    @property
+    def _places(self) -> np.ndarray[Any, Any]:
+        places = {
+            name: place
+            for source in self.sources
+            if source is not self.controller
+            for name, place in ((self._columns[source.name, c], p) for c, p in source.places.items())
+        }
+        return np.array([places[name] or (math.nan,) * 3 for name in self.sensors], dtype=float)
+
+    def _stop(self) -> None:
+        for source in self.sources:
+            source.stop()
+        for source in self.sources:
+            source.join()
+
+    def _new_folder(self) -> RunFolder:
+        data = {
+            "status": "running",
+            "reason": "",
+            "acquired": False,
+            "bench": {
+                "name": self.plan.name,
+                "machine": self.plan.machine,
+                "file": self.plan.source.name,
+                "text": self.plan.text,
+            },
+            "settings": {"interval": self.interval},
+            "instruments": [],
+            "software": provenance.make({}, None, None)["software"],
+            "samples": {},
+            "raw": "raw.zarr",
+            "errors": None,
+            "report": None,
+            "log": "log.jsonl",
+            "steps": [],
+        }
+        return RunFolder.create(self.runs, TEST, uuid4().hex[:8], data)
+
+
+def _kind(source: Source) -> str:
+    return str(source.instrument.driver.info.kind)
+
+
+def _code(flag: str) -> int:
+    if not flag:
+        return 0
+    return FLAGS.index(flag) if flag in FLAGS else FLAGS.index("unknown")
+
+
+def _columns(thermometers: Sequence[Source]) -> dict[tuple[str, str], str]:
+    """Return the name of each sensor in the log by its instrument and channel."""
+    channels = [(source.name, channel) for source in thermometers for channel in source.channels]
+    count = Counter(channel for _, channel in channels)
+    return {
+        (source, channel): channel if count[channel] == 1 else f"{source}.{channel}" for source, channel in channels
+    }

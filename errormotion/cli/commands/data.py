@@ -1,0 +1,196 @@
+"""``errormotion identify``, ``import``, ``report`` and ``validate``: what is done with data on disk."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from errormotion import datasets, plugins
+from errormotion.cli.guard import ERROR, INTERNAL, log_file
+from errormotion.cli.output import show, show_json
+from errormotion.cli.progress import Bars
+from errormotion.cli.settings import read_settings
+from errormotion.cli.summary import last_values, notes_of
+from errormotion.datasets.storage import reading
+from errormotion.errors import DatasetError, ErrormotionError
+
+if TYPE_CHECKING:
+    from errormotion.campaign.batch import Outcome
+
+
+def identify(
+    raws: list[Path],
+    method_id: str | None,
+    out: Path,
+    assignments: list[str],
+    settings_file: Path | None,
+    scheduler: str | None,
+    workers: int | None,
+    as_json: bool,
+) -> None:
+    """Identify one raw dataset into a file, or several into a folder."""
+    from errormotion.campaign import batch
+
+    several = len(raws) > 1 or scheduler or workers or batch.is_runs_folder(raws[0])
+    if not several and out.exists():
+        raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
+    method_id = method_id or _method_of(raws[0])
+    settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
+    if not several:
+        _identify_one(batch.raw_of(raws[0]), method_id, settings, out, as_json)
+        return
+    scheduler, note = batch.choose_scheduler(scheduler)
+    if note:
+        typer.echo(note, err=True)
+    with Bars(as_json) as bars:
+        outcomes = batch.identify_runs(
+            raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
+        )
+    _tell(outcomes, out, scheduler, as_json)
+
+
+def _method_of(raw: Path) -> str:
+    """Return the id of the method that a raw dataset is for."""
+    from errormotion.campaign import batch
+
+    if batch.is_runs_folder(raw):
+        raise DatasetError(f"{raw}: is a folder of runs; say which method's with --method")
+    path = batch.raw_of(raw)
+    with reading(path), datasets.load(path) as dataset:
+        schema = str(dataset.attrs.get("schema", "none"))
+    match = re.fullmatch(r"errormotion\.raw\.(\w+)/\d+", schema)
+    if match is None:
+        raise DatasetError(f"{path}: expected a raw dataset, whose schema tells the method; found schema {schema}")
+    if match[1] == "inclination":
+        raise DatasetError(
+            f"{path}: holds readings for a calibration of a sensor's inclination error; turn them into one with "
+            "'errormotion calibrate'"
+        )
+    return match[1]
+
+
+def _tell(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
+    """Print what became of many runs; one that failed decides the exit code."""
+    failed = [outcome for outcome in outcomes if outcome.reason]
+    if as_json:
+        keys = ("raw", "errors", "reason", "seconds", "stepped_over")
+        runs = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
+        show_json({"ok": not failed, "scheduler": scheduler, "runs": runs})
+    else:
+        stepped_over = sum(outcome.stepped_over for outcome in outcomes)
+        made = len(outcomes) - len(failed) - stepped_over
+        show(f"{out}: {made} identified, {stepped_over} there already, {len(failed)} failed")
+        for outcome in failed:
+            name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
+            show(f"  failed: {name}{outcome.reason}")
+    broken = any(outcome.traceback for outcome in failed)
+    if broken:
+        typer.echo(f"The tracebacks are in {log_file()}.", err=True)
+    if failed:
+        raise typer.Exit(INTERNAL if broken else ERROR)
+
+
+def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: bool) -> None:
+    method = plugins.get("methods", method_id)
+    with Bars(as_json) as bars, reading(raw), datasets.load(raw) as dataset:
+        bars.stage("identifying")
+        errors = method().identify(dataset, settings)
+    datasets.validate(errors)
+    datasets.save(errors, out)
+    results, notes = last_values(errors), notes_of(errors)
+    if as_json:
+        answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
+        show_json({"ok": True, **answer})
+        return
+    show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
+    for result in results:
+        show(
+            f"  {result['name']} after {result['time_min']:.1f} min: {result['value']:+.2f} {result['unit']} "
+            f"(U = {result['expanded_uncertainty']:.2f}, k = 2)"
+        )
+    for note in notes:
+        show(f"  note: {note}")
+
+
+def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
+    """Turn a log with columns into a raw dataset."""
+    from errormotion.methods.spindle_drift.log_import.importer import import_log as read_log
+
+    with Bars(as_json) as bars:
+        bars.stage("importing")
+        raw = read_log(log, map_file, out)
+    sizes = {str(dim): size for dim, size in raw.sizes.items()}
+    missing = json.loads(raw.attrs["missing_values"])
+    if as_json:
+        show_json({"ok": True, "raw": str(out), "schema": raw.attrs["schema"], "sizes": sizes, "missing": missing})
+    else:
+        show(f"{out}: {raw.attrs['schema']}, " + ", ".join(f"{size} along {dim}" for dim, size in sizes.items()))
+        for column, count in missing.items():
+            show(f"  {column}: {count} empty cells, kept as NaN")
+
+
+def report(run: Path, out: Path | None, as_json: bool) -> None:
+    """Write the report of a run folder or of one file of errors."""
+    from errormotion.campaign.folder import RunFolder
+    from errormotion.report import write_report, write_run_report
+
+    if run.is_dir():
+        folder = RunFolder.open(run)
+        path = write_run_report(run, out)
+        if out is None:
+            folder.data["report"] = path.relative_to(folder.path).as_posix()
+            folder.step("report", "done")
+            folder.save()
+    else:
+        path = write_report(datasets.load(run), out or run.with_suffix(".html"))
+    if as_json:
+        show_json({"ok": True, "report": str(path)})
+    else:
+        show(str(path))
+
+
+def validate(file: Path) -> list[str]:
+    """Return every violation of a dataset, a run folder, a bench or a campaign file."""
+    if file.suffix == ".toml":
+        return _of_toml(file)
+    if (file / "run.json").exists():
+        return _of_run(file)
+    try:
+        with reading(file), datasets.load(file) as dataset:
+            return list(datasets.violations(dataset))
+    except DatasetError as error:
+        return [str(error)]
+
+
+def _of_toml(file: Path) -> list[str]:
+    from errormotion.campaign.files import load_bench, load_campaign
+    from errormotion.datasets.tomlfile import read_toml
+
+    try:
+        schema = str(read_toml(file).get("schema", ""))
+        if schema.startswith("errormotion.campaign/"):
+            load_campaign(file)
+        else:
+            load_bench(file)
+    except ErrormotionError as error:
+        return str(error).removeprefix(f"{file}: ").split("\n  - ")
+    return []
+
+
+def _of_run(path: Path) -> list[str]:
+    from errormotion.campaign.folder import RunFolder
+
+    try:
+        folder = RunFolder.open(path)
+    except ErrormotionError as error:
+        return [str(error)]
+    found = []
+    for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
+        found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    if folder.finished and folder.errors is None:
+        found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
+    return found

@@ -1,0 +1,1 @@
+"""The shipped demonstrations: campaigns on the virtual machine, and their results beside the truth."""

@@ -1,0 +1,174 @@
+"""``errormotion demo``: the shipped campaign on a virtual machine, and its result beside the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.arrays import Array
+from errormotion.campaign.files import CampaignPlan, load_campaign
+from errormotion.campaign.folder import RunFolder
+from errormotion.cli.commands.running import describe, work
+from errormotion.cli.output import show, show_json, table
+from errormotion.instruments.transports import parse_address
+from errormotion.kinematics.twists import move
+from errormotion.twin import Event, VirtualMachine
+
+CAMPAIGN = Path(__file__).parent / "campaign.toml"
+
+UM, ARCSEC = (1e6, "um"), (648000 / np.pi, "arcsec")
+AROUND_A_STEP = 10.0
+"""Seconds averaged before and after a compensation is switched off."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number that matters: measured, how well it is known (k = 2), and the truth; both None for an error itself."""
+
+    name: str
+    measured: float
+    expanded_uncertainty: float | None
+    truth: float | None
+    unit: str
+
+
+def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
+    """Run the campaign, and print where the report is and the numbers that matter."""
+    began = time.monotonic()
+    plan = load_campaign(campaign)
+    beams, drift = work(plan, runs=runs, quiet=as_json)
+    numbers = compare(plan, beams, drift)
+    seconds = time.monotonic() - began
+    if as_json:
+        tests = [describe(folder) for folder in (beams, drift)]
+        show_json({"ok": True, "seconds": seconds, "tests": tests, "numbers": [number.__dict__ for number in numbers]})
+        return
+    settings = plan.tests[1].settings
+    speed = settings.schedule[0].spindle_speed
+    minutes = f"{settings.duration / 60:.0f} simulated minutes at {speed:.0f} /min"
+    show(f"{plan.bench.machine}: {minutes}, measured over the wire")
+    show(f"through {len(plan.bench.instruments)} simulated instruments in {seconds:.0f} s.\n")
+    rows = [
+        [n.name, f"{n.measured:.2f}", f"{n.expanded_uncertainty:.2f}", f"{n.truth:.2f}", n.unit]
+        for n in numbers
+        if n.expanded_uncertainty is not None and n.truth is not None
+    ]
+    show(table(["", "measured", "U (k=2)", "truth", ""], rows) + "\n")
+    for number in numbers:
+        if number.truth is None:
+            show(f"{number.name}: {number.measured:.1f} {number.unit}")
+    for folder in (beams, drift):
+        show(f"\nreport on {folder.data['test']}: {describe(folder)['report']}")
+
+
+def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Number]:
+    """Return the numbers that matter beside the truth of the same virtual machine."""
+    machine = virtual_machine(plan)
+    with datasets.load(drift.errors or drift.path) as errors:
+        numbers = [*_drift_numbers(machine, errors, plan.tests[1].settings.schedule), *_ranges(machine, errors)]
+    with datasets.load(beams.errors or beams.path) as found:
+        numbers += _beam_numbers(machine, found)
+    return numbers
+
+
+def virtual_machine(plan: CampaignPlan) -> VirtualMachine:
+    """Return the machine that the bench's simulators ask, under the schedule of the drift test."""
+    place = parse_address(plan.bench.instruments[0].address)
+    machine = VirtualMachine(place.host, seed=int(place.number("seed", 0)))
+    machine.start([Event(e.at, e.spindle_speed, e.compensation) for e in plan.tests[1].settings.schedule])
+    return machine
+
+
+def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, schedule: Any) -> list[Number]:
+    t = np.asarray(errors["time"].values) + float(errors.attrs["reference_time"])
+    truth = _truth(machine, errors, errors.attrs["functional_point"])
+    off = [e for e in schedule if e.compensation]
+    end = int(np.searchsorted(t, off[0].at)) - 1
+    numbers = []
+    for k, (name, scale) in enumerate([("EX", UM), ("EY", UM), ("EZ", UM), ("EA", ARCSEC), ("EB", ARCSEC)]):
+        weights = np.zeros(t.size)
+        weights[end] = 1.0
+        what = f"{name} after {t[end] / 60:.0f} min, compensation on"
+        numbers.append(_number(what, errors, truth, weights, k, scale))
+    for event in off:
+        axis = next(iter(event.compensation))
+        before = (t >= event.at - AROUND_A_STEP) & (t < event.at - 1.0)
+        after = (t >= event.at + 1.0) & (t < event.at + AROUND_A_STEP)
+        weights = after / after.sum() - before / before.sum()
+        what = f"E{axis} step, compensation of {axis} switched off"
+        numbers.append(_number(what, errors, truth, weights, "XYZ".index(axis), UM))
+    return numbers
+
+
+def _number(
+    name: str, errors: xr.Dataset, truth: Array, weights: Array, freedom: int, scale: tuple[float, str]
+) -> Number:
+    value, covariance = errors.em.combine(weights, "time")
+    factor, unit = scale
+    expanded = 2.0 * float(np.sqrt(covariance.values[freedom, freedom]))
+    return Number(
+        name,
+        float(value.values[freedom]) * factor,
+        expanded * factor,
+        float(weights @ truth[:, freedom]) * factor,
+        unit,
+    )
+
+
+def _ranges(machine: VirtualMachine, errors: xr.Dataset) -> list[Number]:
+    """Return the ISO 230-3 ranges of the first hour: displacements at the two levels, Z and the tilts."""
+    t = np.asarray(errors["time"].values)
+    hour = (t >= 0.0) & (t <= 3600.0)
+    numbers = []
+    low, high = np.asarray(errors["level_height"].values, dtype=float)
+    places = {
+        "X1": (low, 0),
+        "X2": (high, 0),
+        "Y1": (low, 1),
+        "Y2": (high, 1),
+        "Z": (0.0, 2),
+        "A": (0.0, 3),
+        "B": (0.0, 4),
+    }
+    for name, (height, freedom) in places.items():
+        truth = _truth(machine, errors, (0.0, 0.0, height))[hour, freedom]
+        factor, unit = ARCSEC if freedom > 2 else UM
+        measured = errors["iso_value"].sel(quantity=name, measure="range_60min").item()
+        u = errors["iso_uncertainty"].sel(quantity=name, measure="range_60min").item()
+        what = f"d({name})60, range in the first 60 min"
+        numbers.append(Number(what, measured * factor, 2.0 * u * factor, float(np.ptp(truth)) * factor, unit))
+    return numbers
+
+
+def _truth(machine: VirtualMachine, errors: xr.Dataset, point: Any) -> Array:
+    """Return the true twists (time, 6) at the times of a result, relative to its reference state."""
+    reference = float(errors.attrs["reference_time"])
+    t = np.asarray(errors["time"].values) + reference
+    shift = np.asarray(point, dtype=float) - machine.spindle_functional_point
+    twists = machine.spindle_twist(t) - machine.spindle_twist(np.array([reference]))
+    return np.asarray(move(twists, shift))
+
+
+def _beam_numbers(machine: VirtualMachine, found: xr.Dataset) -> list[Number]:
+    """Return by how much the beams are off, and by how much the nominal ones would have been: root mean squares."""
+    frame = machine.frame
+    numbers = []
+    for what, origin, direction in (
+        ("beam detection", found["beam_origin"].values, found["beam_direction"].values),
+        ("nominal beams", frame.nominal_origin, frame.nominal_direction),
+    ):
+        across = np.cross(origin - frame.true_origin, frame.true_direction)
+        numbers.append(Number(f"{what}: origins off by (across the beam, rms)", _rms(across) * 1e6, None, None, "um"))
+        angle = np.cross(direction, frame.true_direction)
+        numbers.append(Number(f"{what}: directions off by (rms)", _rms(angle) * ARCSEC[0], None, None, "arcsec"))
+    return numbers
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))

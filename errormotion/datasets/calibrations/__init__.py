@@ -1,0 +1,1 @@
+"""Calibrations that methods and instruments share: inclination error of point sensors, pre-travel of touch probes."""

@@ -1,0 +1,219 @@
+"""Where calibrated tilts surround a point closely enough to speak for it.
+
+The calibrated tilt vectors are joined to triangles (Delaunay), so that the circle through the corners of each is empty.
+A triangle counts, unless it is part of a hole:
+
+* across: its circle is wider than ``gap``, half a wave of what may lie between; or
+* along the inclination: with h the usual step of the inclination, which is the median over the triangles of the range
+  of inclination between corners, no setting comes within `REACH` h of the inclination at the middle of the circle, or
+  of that half-way between the corners. Settings are looked for no farther along the rotation than the triangle is wide,
+  or than `REACH` h.
+
+Why there are two rules: across rotations, the surface that is fitted to few settings knows how little they say of what
+is between them, and its uncertainty grows. Along the inclination many settings on either side of a hole make it look
+certain inside. What vouches for the uncertainty is the prediction of settings that were left out, and leaving one out
+opens a hole of two steps, no wider. `REACH` to both sides makes that two and a half, since steps are not all alike. It
+is empty places that both rules ask for: a narrow triangle between scattered settings is none.
+
+A side counts with its triangles; or by itself if it is shorter than ``gap``, no setting is inside the circle on it, and
+its ends are no more than 2 `REACH` h apart in inclination, so that a row of settings speaks for itself. A tilt is
+supported if it lies in what counts or within ``margin`` of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets.calibrations.tilt_mesh import Mesh
+from errormotion.kinematics.beams import inclination_rotation
+
+REACH = 1.25
+"""Steps of the inclination within which a setting must lie on either side of the middle of an empty place."""
+
+_TURN = 2 * np.pi
+_SQUARE = 1e-9
+"""Tilt below which a setting has no rotation."""
+_SAME = 1e-6
+"""Angles that differ by less are the same, rad."""
+_BLOCK = 2**21
+"""Distances in memory at a time."""
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A region between calibrated tilts that they do not speak for.
+
+    Attributes
+    ----------
+    inclination : (low, high)
+        Of the settings around it, rad; from 0 if the surface at right angles is in it.
+    rotation : (low, high)
+        Of the settings around it, rad, ``low`` in [0, 2 pi); 2 pi apart if it goes all around.
+    middle : ndarray (2,)
+        The tilt in it that is farthest from all settings.
+    """
+
+    inclination: tuple[float, float]
+    rotation: tuple[float, float]
+    middle: Array
+
+
+class TiltSupport:
+    """The region of tilts that calibrated ones speak for.
+
+    Parameters
+    ----------
+    tilts : ndarray (n, 2)
+        Calibrated tilt vectors.
+    gap : float
+        Widest empty circle (its diameter) that counts as surrounded.
+    margin : float
+        How far beyond the joined points a tilt may lie.
+    """
+
+    def __init__(self, tilts: Array, gap: float, margin: float) -> None:
+        self.tilts = np.unique(np.round(np.asarray(tilts, float), 9), axis=0)
+        self.gap, self.margin = float(gap), float(margin)
+
+    def holds(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether each tilt (..., 2) is supported; a NaN is not."""
+        points = np.asarray(q, float).reshape(-1, 2)
+        held = np.zeros(len(points), dtype=bool)
+        finite = np.isfinite(points).all(axis=1)
+        which = self._mesh.locate(points[finite])
+        held[finite] = (which >= 0) & np.append(self._counts, False)[which]
+        rest = np.flatnonzero(finite & ~held)
+        step = max(1, _BLOCK // max(len(self._sides), 1))
+        for start in range(0, len(rest), step):
+            some = rest[start : start + step]
+            held[some] = self._distance(points[some]) <= self.margin
+        return held.reshape(np.shape(q)[:-1])
+
+    def holes(self) -> list[Hole]:
+        """Return the regions between calibrated tilts that these do not speak for, by inclination and rotation."""
+        bare = ~self._counts
+        bare[bare] = ~self.holds(self._mesh.corners[bare].mean(axis=1))
+        # A row of settings that counts by itself parts two holes.
+        found = [self._hole(part) for part in self._mesh.parts(bare, self._sides_count)]
+        return sorted(found, key=lambda hole: (np.round(hole.inclination, 3).tolist(), hole.rotation))
+
+    def nearest(self, q: Array, count: int = 3) -> Array:
+        """Return the calibrated tilts (count, 2) nearest to one tilt (2,)."""
+        return np.asarray(self.tilts[np.argsort(np.hypot(*(self.tilts - q).T), kind="stable")[:count]])
+
+    @cached_property
+    def step(self) -> float:
+        """The usual step of the inclination from setting to setting, rad."""
+        joined = self._mesh.triangles if len(self._mesh.triangles) else self._mesh.sides
+        return float(np.median(np.ptp(self._inclination[joined], axis=1))) if len(joined) else 0.0
+
+    @cached_property
+    def _reach(self) -> float:
+        # Inclinations that differ by less than the margin are the same.
+        return max(REACH * self.step, float(np.arctan(self.margin))) + _SAME
+
+    @cached_property
+    def _inclination(self) -> Array:
+        return np.asarray(np.arctan(_size(self.tilts)))
+
+    @cached_property
+    def _mesh(self) -> Mesh:
+        return Mesh.of(self.tilts)
+
+    @cached_property
+    def _counts(self) -> NDArray[np.bool_]:
+        """Which triangles (m,) count."""
+        mesh = self._mesh
+        counts = 2 * mesh.radii <= self.gap
+        at = np.arctan(np.hypot(*mesh.middles.T))
+        around = self._inclination[mesh.triangles]
+        half_way = (around.min(axis=1, initial=np.inf) + around.max(axis=1, initial=-np.inf)) / 2
+        for inclination in (at, half_way):
+            along = mesh.middles * (np.tan(inclination) / np.maximum(np.tan(at), _SQUARE))[:, None]
+            counts[counts] = self._met(along[counts], mesh.corners[counts])
+        return counts
+
+    def _met(self, places: Array, corners: Array) -> NDArray[np.bool_]:
+        """Return whether a setting has about the inclination of each place (m, 2) and is not far along the rotation."""
+        wide = np.maximum(_way(corners, corners[:, [1, 2, 0]]).max(axis=1, initial=0.0), self._reach)
+
+        def near(some: NDArray[np.int64], settings: Array) -> NDArray[np.bool_]:
+            at = places[some, None]
+            apart = np.abs(np.arctan(_size(at)) - np.arctan(_size(settings)))
+            found: NDArray[np.bool_] = ((apart <= self._reach) & (_way(at, settings) <= wide[some, None])).any(axis=1)
+            return found
+
+        found = near(np.arange(len(places)), corners)
+        rest = np.flatnonzero(~found)
+        step = max(1, _BLOCK // len(self.tilts))
+        for start in range(0, len(rest), step):
+            some = rest[start : start + step]
+            found[some] = near(some, self.tilts[None])
+        return found
+
+    @cached_property
+    def _sides_count(self) -> NDArray[np.bool_]:
+        """Which sides (s,) count."""
+        mesh = self._mesh
+        ends = self.tilts[mesh.sides]
+        short = np.hypot(*(ends[:, 1] - ends[:, 0]).T) <= self.gap
+        close = np.ptp(self._inclination[mesh.sides], axis=1) <= 2 * self._reach
+        with_triangle = np.bincount(mesh.which[self._counts].ravel(), minlength=len(mesh.sides)) > 0
+        return np.asarray(with_triangle | (short & close & mesh.empty))
+
+    @cached_property
+    def _sides(self) -> Array:
+        """Sides (m, 2, 2) that count; each point is a side of no length."""
+        points = np.stack([self.tilts, self.tilts], axis=1)
+        return np.concatenate([points, self.tilts[self._mesh.sides[self._sides_count]]])
+
+    def _distance(self, points: Array) -> Array:
+        """Return the distance (n,) of points (n, 2) to the nearest side."""
+        start, way = self._sides[:, 0], self._sides[:, 1] - self._sides[:, 0]
+        to = points[:, None] - start
+        square = (way**2).sum(axis=1)
+        part = np.clip((to * way).sum(axis=-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+        return np.asarray(np.sqrt(((to - part[..., None] * way) ** 2).sum(axis=-1)).min(axis=1))
+
+    def _hole(self, part: NDArray[np.int64]) -> Hole:
+        """Return the hole of some triangles."""
+        mesh = self._mesh
+        corners, around = mesh.corners[part], self._inclination[mesh.triangles[part]]
+        square = bool(np.isin(mesh.locate(np.zeros((1, 2))), part)[0])
+        middle = mesh.middles[part[int(np.argmax(mesh.radii[part]))]]
+        low = 0.0 if square else float(around.min())
+        return Hole((low, float(around.max())), (0.0, _TURN) if square else _arc(corners), middle)
+
+
+def _way(one: Array, other: Array) -> Array:
+    """Return how far tilts (..., 2) are from others along the rotation, 2 sqrt(|p| |q|) sin of half the angle."""
+    square = ((one - other) ** 2).sum(axis=-1) - (_size(one) - _size(other)) ** 2
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
+
+
+def _size(q: Array) -> Array:
+    return np.asarray(np.hypot(q[..., 0], q[..., 1]))
+
+
+def _arc(corners: Array) -> tuple[float, float]:
+    """Return from which rotation to which triangles (m, 3, 2) reach that hang together, away from right angles."""
+    middle = inclination_rotation(corners.mean(axis=1))[1]
+    off = np.remainder(inclination_rotation(corners)[1] - middle[:, None] + np.pi, _TURN) - np.pi
+    off[_size(corners) < _SQUARE] = 0.0
+    low, high = middle + off.min(axis=1), middle + off.max(axis=1)
+    order = np.argsort(low)
+    # Twice around, so that what begins before 0 is seen to go on.
+    low, high = (np.concatenate([ends[order], ends[order] + _TURN]) for ends in (low, high))
+    reached = np.maximum.accumulate(high)
+    begins = np.flatnonzero(low[1:] > reached[:-1] + _SAME) + 1
+    if not len(begins):
+        return 0.0, _TURN
+    begin = float(low[begins[0]])
+    length = float(reached[begins[1] - 1] if len(begins) > 1 else reached[-1]) - begin
+    begin = 0.0 if _TURN - begin % _TURN < _SAME else begin % _TURN
+    return begin, begin + length

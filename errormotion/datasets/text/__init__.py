@@ -1,0 +1,1 @@
+"""Text files as datasets: logs of a lab, readings as CSV."""

@@ -1,0 +1,1 @@
+"""Identification: beam direction, from raw data to errors with covariance."""

@@ -1,0 +1,1 @@
+"""A check bar measured by a calibrated beam."""

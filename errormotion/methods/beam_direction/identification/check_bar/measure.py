@@ -1,0 +1,335 @@
+"""A check bar as the proof of a calibrated beam: the circle or cylinder through its points, and what they leave over.
+
+All points count alike, as in the tables that such measurements are published in; the covariance is that of this very
+estimate, from each point's own noise and from what all points share (`Points.influence`). Points that do not belong are
+left out and named. What the noise does not explain is said: that the residuals are larger than the noise, and that they
+are systematic, that is, resemble those of their neighbours along the bar. A radius that comes out well is no proof
+then, since a systematic error goes into centre and radius without being seen in their uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.identification.check_bar.estimate import (
+    FALSE_ALARMS,
+    Judged,
+    judged,
+    settled,
+    start,
+)
+from errormotion.methods.beam_direction.identification.check_bar.likeness import likeness
+from errormotion.methods.beam_direction.identification.check_bar.scanning import Points, points
+from errormotion.methods.beam_direction.identification.check_bar.surfaces import round_bar
+
+__all__ = ["BarFit", "fit_bar", "measure_bar"]
+
+
+@dataclass(frozen=True, eq=False)
+class BarFit:
+    """A bar through points; lengths in m.
+
+    Attributes
+    ----------
+    shape : {"circle", "cylinder"}
+    centre : ndarray (3,)
+        Point of the axis; of a cylinder the one at the middle height of its points.
+    centre_covariance : ndarray (3, 3)
+        Across the axis; along it a centre has no variance.
+    axis : ndarray (3,)
+        Unit vector along the bar: as given for a circle, fitted for a cylinder.
+    axis_covariance : ndarray (3, 3)
+        0 for a circle.
+    radius, radius_u : float
+        Radius and its standard uncertainty: as given where it was held.
+    free_radius, free_radius_u : float
+        Radius that the points have by themselves.
+    covariance : ndarray (p, p)
+        Of `parameter_names`: own and common part.
+    common_covariance : ndarray (p, p)
+        The part that all points share: beam, calibration, a held radius.
+    parameter_names : tuple of str
+        ``across_1 across_2`` (along ``kinematics.beams.across(axis)``), for a cylinder ``tilt_1 tilt_2`` (rad), and
+        ``radius`` where it is free.
+    residuals : ndarray (n,)
+        Of all points, left-out ones included; positive outside. NaN where there was no reading.
+    left_out : tuple of int
+        Indices, from 0, of the points that do not belong.
+    rms : float
+        Of the residuals of the points that were used.
+    explained : float
+        The rms that the stated noise would leave; NaN where none is stated.
+    exceeds_noise : bool
+        Whether the residuals are larger than the noise explains.
+    likeness : float
+        Correlation of neighbouring residuals beyond what the fit itself makes; about 0 for noise.
+    systematic : bool
+        Whether neighbours resemble one another more than noise does.
+    chance : float
+        How often noise alone makes neighbours as much alike.
+    notes : tuple of str
+    """
+
+    shape: str
+    centre: Array
+    centre_covariance: Array
+    axis: Array
+    axis_covariance: Array
+    radius: float
+    radius_u: float
+    free_radius: float
+    free_radius_u: float
+    covariance: Array
+    common_covariance: Array
+    parameter_names: tuple[str, ...]
+    residuals: Array
+    left_out: tuple[int, ...]
+    rms: float
+    explained: float
+    exceeds_noise: bool
+    likeness: float
+    systematic: bool
+    chance: float
+    notes: tuple[str, ...]
+
+
+def fit_bar(
+    scanned: Points | ArrayLike,
+    axis: ArrayLike,
+    *,
+    shape: Literal["circle", "cylinder"] = "circle",
+    radius: float | None = None,
+    radius_uncertainty: float = 0.0,
+    hold_radius: bool = False,
+    robust: bool = True,
+    noise: float | None = None,
+) -> BarFit:
+    """Fit a bar to points.
+
+    Parameters
+    ----------
+    scanned : Points, or array_like (n, 3)
+        m, in the order of the scan. NaN where there was no reading.
+    axis : array_like (3,)
+        Along the bar: known for a circle, about right (20 degrees) for a cylinder.
+    shape : {"circle", "cylinder"}
+        A circle is fitted in the plane across ``axis``; points that spread along the bar allow a cylinder.
+    radius, radius_uncertainty : float, optional
+        Calibrated radius of the bar and its standard uncertainty: the fitted one is compared with it.
+    hold_radius : bool
+        Fit with ``radius`` as it is given.
+    robust : bool
+        Leave out and name the points that do not belong.
+    noise : float, optional
+        Standard deviation of each coordinate, m; for bare points, since `Points` have their own.
+
+    Raises
+    ------
+    MethodError
+        Input that is not as said above.
+    FitError
+        Points that do not hold the shape, or no shape that half of them agree on.
+    """
+    p, own, influence, reading = _given(scanned, noise)
+    u = np.asarray(axis, float)
+    if u.shape != (3,) or not np.linalg.norm(u) > 0:
+        raise MethodError(f"axis: expected the direction of the bar, three numbers; found {u.tolist()}.")
+    if radius is not None and not radius > 0:
+        raise MethodError(f"radius: expected a positive length; found {radius}.")
+    if hold_radius and radius is None:
+        raise MethodError("hold_radius: expected a radius to hold; found none.")
+    if shape not in ("circle", "cylinder"):
+        raise MethodError(f"shape: expected 'circle' or 'cylinder'; found '{shape}'.")
+    u = u / np.linalg.norm(u)
+    there = np.flatnonzero(np.isfinite(p).all(axis=1))
+    near, outside = start(p[there], own[there], u, shape, robust)
+    left_out = tuple(int(there[k]) for k in outside)
+    used = np.setdiff1d(there, left_out)
+
+    held = radius if hold_radius else None
+    bar = settled(p[used], near, shape, held)
+    free = bar if held is None else settled(p[used], near, shape, None)
+    result = judged(bar, p[used], own[used], influence[:, used], radius_uncertainty if hold_radius else 0.0)
+    by_itself = result if free is bar else judged(free, p[used], own[used], influence[:, used], 0.0)
+
+    residuals = np.full(len(p), np.nan)
+    residuals[there] = bar.misses(p[there])[0]
+    order = np.arange(len(used)) if shape == "cylinder" else bar.around(p[used])
+    alike, chance = likeness(residuals[used][order], result.M[np.ix_(order, order)])
+    verdict = _Verdict(result, alike, chance)
+    C, G = result.covariance, bar.spread()
+    free_u = float(np.sqrt(by_itself.covariance[-1, -1]))
+    notes = [_left_out(k, residuals[k], reading, len(p)) for k in left_out]
+    notes += verdict.notes()
+    if radius is not None:
+        notes += _compared(free.radius, free_u, radius, radius_uncertainty)
+    return BarFit(
+        shape=shape,
+        centre=bar.centre,
+        centre_covariance=G[:3] @ C @ G[:3].T,
+        axis=bar.axis,
+        axis_covariance=G[3:] @ C @ G[3:].T,
+        radius=bar.radius,
+        radius_u=radius_uncertainty if hold_radius else free_u,
+        free_radius=free.radius,
+        free_radius_u=free_u,
+        covariance=C,
+        common_covariance=result.common,
+        parameter_names=bar.names,
+        residuals=residuals,
+        left_out=left_out,
+        rms=result.rms,
+        explained=result.explained,
+        exceeds_noise=result.exceeds,
+        likeness=alike,
+        systematic=verdict.systematic,
+        chance=chance,
+        notes=tuple(notes),
+    )
+
+
+def measure_bar(
+    raw: xr.Dataset,
+    origin: ArrayLike,
+    direction: ArrayLike,
+    covariance: ArrayLike | None = None,
+    *,
+    calibration: InclinationCalibration | None = None,
+    moves: Literal["sensor", "target"] = "sensor",
+    shape: Literal["circle", "cylinder"] = "circle",
+    stage_noise: float = 0.0,
+    radius_uncertainty: float = 0.0,
+    hold_radius: bool = False,
+    robust: bool = True,
+    extrapolate: bool = False,
+) -> tuple[Points, BarFit]:
+    """Return points and bar of the rows ``bar_...`` of a raw dataset, for a beam that is known from elsewhere.
+
+    Parameters
+    ----------
+    raw : Dataset
+        Schema ``errormotion.raw.beam_direction/1`` with a check bar.
+    origin, direction, covariance
+        The beam; see `errormotion.methods.beam_direction.identification.check_bar.scanning.points`.
+    calibration, moves, stage_noise, extrapolate
+        See there; the normals are those of a round bar.
+    shape, radius_uncertainty, hold_radius, robust
+        See `fit_bar`.
+
+    Raises
+    ------
+    MethodError
+        No check bar in the dataset; else see `points` and `fit_bar`.
+    FitError
+        See `fit_bar`.
+    """
+    lacking = [name for name in ("bar_distance", "bar_stage", "bar_axis") if name not in raw]
+    if lacking:
+        raise MethodError(f"Expected readings of a check bar in the raw dataset; missing {', '.join(lacking)}.")
+    axis = raw["bar_axis"].values
+    speckle = float(raw["speckle"]) if "speckle" in raw else 0.0
+    scanned = points(
+        raw["bar_distance"].values,
+        raw["bar_stage"].transpose("bar_reading", "direction").values,
+        origin,
+        direction,
+        covariance=covariance,
+        noise=float(np.hypot(float(raw["distance_noise"]), speckle)),
+        stage_noise=stage_noise,
+        calibration=calibration,
+        triangulation_normal=raw["triangulation_normal"].values if "triangulation_normal" in raw else None,
+        mid_range=float(raw["mid_range"]) if "mid_range" in raw else None,
+        normals=round_bar(axis) if calibration is not None else None,
+        moves=moves,
+        extrapolate=extrapolate,
+    )
+    radius = float(raw["bar_radius"]) if "bar_radius" in raw and np.isfinite(raw["bar_radius"]) else None
+    held = hold_radius and radius is not None
+    return scanned, fit_bar(
+        scanned,
+        axis,
+        shape=shape,
+        radius=radius,
+        radius_uncertainty=radius_uncertainty,
+        hold_radius=held,
+        robust=robust,
+    )
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """Whether residuals are noise, in words."""
+
+    judged: Judged
+    likeness: float
+    chance: float
+
+    @property
+    def systematic(self) -> bool:
+        return bool(self.chance < FALSE_ALARMS)
+
+    def notes(self) -> list[str]:
+        size = f"residual rms {_um(self.judged.rms)}"
+        explained = f", where the stated noise explains {_um(self.judged.explained)}"
+        noise = explained if self.judged.exceeds else ""
+        if self.systematic:
+            return [
+                f"The residuals are systematic: {size}{noise}, and neighbours along the bar resemble each other "
+                f"(correlation {self.likeness:.2f}, by chance once in {_rarely(self.chance)}). Centre and radius carry "
+                "an error that their uncertainty does not contain."
+            ]
+        if self.judged.exceeds:
+            return [
+                f"The residuals exceed the noise: {size}{noise}. They look random along the bar; uncertainties were "
+                "enlarged to match. Is the noise as stated, the bar clean, the stage quiet?"
+            ]
+        return []
+
+
+def _given(scanned: Points | ArrayLike, noise: float | None) -> tuple[Array, Array, Array, Array | None]:
+    """Return points (n, 3), their own covariance, influence of what they share, and the readings behind them."""
+    if isinstance(scanned, Points):
+        if noise is not None:
+            raise MethodError("noise: points of a scan have their own; give it with bare coordinates only.")
+        return scanned.points, scanned.covariance, scanned.influence, scanned.reading
+    p = np.asarray(scanned, float)
+    if p.ndim != 2 or p.shape[1] != 3:
+        raise MethodError(f"Expected points (n, 3), one a row; found {p.shape}.")
+    if noise is not None and not noise >= 0:
+        raise MethodError(f"noise: expected a standard deviation in m; found {noise}.")
+    own = np.broadcast_to((noise or 0.0) ** 2 * np.eye(3), (len(p), 3, 3))
+    return p, np.asarray(own), np.zeros((0, len(p), 3)), None
+
+
+def _left_out(k: int, residual: float, reading: Array | None, n: int) -> str:
+    what = "" if reading is None else f", reading {1e3 * reading[k]:.3f} mm"
+    side = "outside" if residual > 0 else "inside"
+    return f"Point {k + 1} of {n} (index {k}{what}) was left out: it lies {_um(abs(residual))} {side} the bar."
+
+
+def _compared(free: float, free_u: float, known: float, known_u: float) -> Sequence[str]:
+    """Return what there is to say of a radius that is not the bar's."""
+    u = float(np.hypot(free_u, known_u))
+    if not abs(free - known) > 2 * u:
+        return ()
+    return [
+        f"The points have a radius of {1e3 * free:.4f} mm by themselves, which is {1e6 * (free - known):+.1f} um off "
+        f"the bar's {1e3 * known:.4f} mm; the expanded uncertainty (k = 2) of the difference is {_um(2 * u)}."
+    ]
+
+
+def _um(length: float) -> str:
+    return f"{1e6 * length:.3g} um"
+
+
+def _rarely(chance: float) -> str:
+    return f"{1 / chance:.0f}" if chance > 1e-4 else "more than 10 000"

@@ -1,0 +1,119 @@
+"""A check bar in a result: beside the planes that a beam was found with, or alone, seen by a beam that is known."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
+
+if TYPE_CHECKING:
+    from errormotion.datasets.calibrations.inclination import InclinationCalibration
+    from errormotion.methods.beam_direction.identification.compensation import Sensor
+    from errormotion.methods.beam_direction.settings import Settings
+
+    Array = Array
+
+log = logging.getLogger(__name__)
+
+
+def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return a result that holds a check bar and no errors of the beam: they are NaN, since nothing tells them.
+
+    The beam is taken as the data state it, ``nominal_direction`` and ``nominal_origin`` (the stage's zero without).
+
+    Parameters
+    ----------
+    raw : Dataset
+        Schema ``errormotion.raw.beam_direction/1``, the check bar alone.
+    sensor : Sensor or None
+        How its readings are compensated.
+    settings : Settings
+    method, version : str
+
+    Raises
+    ------
+    MethodError, FitError
+        See `errormotion.methods.beam_direction.identification.check_bar.measure.measure_bar`.
+    """
+    moves = raw.attrs.get("moves", settings.moves)
+    if moves not in ("sensor", "target"):
+        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.")
+    u0 = np.asarray(raw["nominal_direction"].values, np.float64)
+    p0 = np.asarray(raw["nominal_origin"].values if "nominal_origin" in raw else np.full(3, np.nan), np.float64)
+    notes = ["A check bar alone: the beam is taken as stated, without uncertainty, and its errors are unknown."]
+    if not np.isfinite(p0).all():
+        notes.append("No nominal_origin in the data: the centre of the bar counts from the zero point of the beam.")
+    if sensor is None:
+        notes.append("No inclination compensation: the readings are taken as they are.")
+    calibration = sensor.calibration if sensor is not None else None
+    extras = bar_extras(raw, np.nan_to_num(p0), u0, None, calibration, moves, settings, notes)
+    for note in notes:
+        log.warning(note)
+    vector = ("beam", "direction")
+    extras |= {
+        "nominal_origin": xr.DataArray(p0[None], dims=vector, attrs={"units": "m"}),
+        "nominal_direction": xr.DataArray(u0[None], dims=vector, attrs={"units": "1"}),
+        "beam_direction": xr.DataArray(np.full((1, 3), np.nan), dims=vector, attrs={"units": "1"}),
+    }
+    ds = build_errors(
+        np.full((1, 6), np.nan),
+        np.full((1, 6, 6), np.nan),
+        dims=("beam",),
+        coords={"beam": [settings.beam], "direction": ("direction", list("xyz"))},
+        component="beam",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=np.nan_to_num(p0),
+        reference="nominal beam; a check bar does not tell its errors",
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, raw, None, steps=["check bar"])
+        | ({"calibration": calibration.told()} if calibration is not None else {}),
+        extras=extras,
+    )
+    return ds.assign_attrs(notes=notes)
+
+
+def bar_extras(
+    raw: xr.Dataset,
+    origin: Array,
+    direction: Array,
+    covariance: Array | None,
+    calibration: InclinationCalibration | None,
+    moves: Literal["sensor", "target"],
+    settings: Settings,
+    notes: list[str],
+) -> dict[str, xr.DataArray]:
+    """Return the check bar of a raw dataset as a beam sees it; ``notes`` get what is to be said of it."""
+    points, bar = measure_bar(
+        raw,
+        origin,
+        direction,
+        covariance,
+        calibration=calibration,
+        moves=moves,
+        robust=settings.robust,
+        extrapolate=settings.extrapolate,
+    )
+    notes.extend(f"Check bar: {note}" for note in (*points.notes, *bar.notes))
+    left_out = np.zeros(len(bar.residuals), np.int8)
+    left_out[list(bar.left_out)] = 1
+    coords = {"direction": list("xyz")}
+    m = {"units": "m"}
+    return {
+        "bar_point": xr.DataArray(points.points, coords, ("bar_reading", "direction"), attrs=m),
+        "bar_residual": xr.DataArray(bar.residuals, dims="bar_reading", attrs=m),
+        "bar_left_out": xr.DataArray(left_out, dims="bar_reading"),
+        "bar_centre": xr.DataArray(bar.centre, coords, "direction", attrs=m),
+        "bar_centre_u": xr.DataArray(np.sqrt(np.diag(bar.centre_covariance)), coords, "direction", attrs=m),
+        "bar_axis": xr.DataArray(bar.axis, coords, "direction", attrs={"units": "1"}),
+        "bar_radius_fitted": xr.DataArray(bar.free_radius, attrs=m),
+        "bar_radius_u": xr.DataArray(bar.free_radius_u, attrs=m),
+    }

@@ -1,0 +1,341 @@
+"""Surface points from the readings of a calibrated beam, with what is known of each and of all together.
+
+A reading d at the place s of the stage puts a point at p = p0 + s + d u, p0 the zero point, u the unit vector of the
+beam; readings grow away from the sensor. The noise is each point's own. What is not known of the beam, or of the
+calibration of its inclination error, is one draw for the whole scan: it is kept as influences, never as scatter.
+
+The inclination error depends on the surface's normal and the normal on the points, so where the normals are not given
+both are found in turn, until the points rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.errors import MethodError
+from errormotion.kinematics.beams import tilt
+from errormotion.methods.beam_direction.identification.check_bar.surfaces import (
+    Surface,
+    along_curve,
+    over_surface,
+    round_bar,
+)
+
+__all__ = ["Points", "Surface", "along_curve", "over_surface", "points", "round_bar"]
+
+
+AT_REST = 1e-10
+"""Change of a point, m, below which it rests."""
+TURNS = 50
+"""Turns of normals and points until it is said that they do not settle."""
+_ROUNDING = 1e-9
+_UNIT_NORM = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of a surface.
+
+    Attributes
+    ----------
+    points : ndarray (n, 3)
+        m; NaN where there was no reading.
+    covariance : ndarray (n, 3, 3)
+        What is each point's own: noise of reading and stage, m^2.
+    influence : ndarray (source, n, 3)
+        Signed effect, m, of one standard uncertainty of each source that all points share.
+    sources : tuple of str
+        Names of these sources; scans with the same beam and calibration share the sources of the same name.
+    reading : ndarray (n,)
+        As read, m.
+    distance : ndarray (n,)
+        With the inclination error taken off, m; the same as `reading` where there is no calibration.
+    direction : ndarray (3,)
+        Of the beam.
+    normals : ndarray (n, 3) or None
+        Unit normals towards the sensor, where they are known.
+    tilt : ndarray (n, 2) or None
+        Tilt vectors of the surface to the beam, where a calibration was used.
+    turns : int
+        How often the normals were found anew.
+    notes : tuple of str
+        What a user should know.
+    """
+
+    points: Array
+    covariance: Array
+    influence: Array
+    sources: tuple[str, ...]
+    reading: Array
+    distance: Array
+    direction: Array
+    normals: Array | None = None
+    tilt: Array | None = None
+    turns: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def total_covariance(self) -> Array:
+        """Covariance (n, 3, 3) of each point by itself, with what it shares with the others."""
+        return np.asarray(self.covariance + np.einsum("sni,snj->nij", self.influence, self.influence))
+
+
+def points(
+    reading: ArrayLike,
+    stage: ArrayLike,
+    origin: ArrayLike,
+    direction: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    noise: float = 0.0,
+    stage_noise: float = 0.0,
+    calibration: InclinationCalibration | None = None,
+    triangulation_normal: ArrayLike | None = None,
+    mid_range: float | None = None,
+    normals: ArrayLike | Surface | None = None,
+    moves: Literal["sensor", "target"] = "sensor",
+    extrapolate: bool = False,
+) -> Points:
+    """Return the points that a beam met.
+
+    Parameters
+    ----------
+    reading : array_like (n,)
+        m, growing away from the sensor; NaN where there was none.
+    stage : array_like (n, 3)
+        Place of the stage at each reading, m.
+    origin, direction : array_like (3,)
+        Zero point of the beam while the stage is at 0, m, and the unit vector along which readings grow.
+    covariance : array_like (6, 6), optional
+        Of (origin, direction): one draw for all points.
+    noise, stage_noise : float
+        Standard deviation of one reading, and of each coordinate of the stage, m.
+    calibration : InclinationCalibration, optional
+        Of the sensor; without one the readings are taken as they are.
+    triangulation_normal : array_like (3,), optional
+        Normal of the plane of emitted and received beam; needed with a calibration.
+    mid_range : float, optional
+        Reading at which the inclination error vanishes, m; default: that of the calibration.
+    normals : array_like (n, 3) or Surface, optional
+        Unit normals, or what tells them from the points: `along_curve`, `over_surface`, `round_bar` or another. By
+        default a scan along one line is taken as a curve in its plane, any other one as a surface.
+    moves : {"sensor", "target"}
+        What the stage carries; if it is the target, the points are in the target's own frame.
+    extrapolate : bool
+        Compensate also where the calibration does not speak for the tilt or the depth.
+
+    Raises
+    ------
+    MethodError
+        Input of the wrong shape, a beam without origin, a calibration without triangulation normal, normals that look
+        along the beam or do not settle, tilts and readings beyond the calibration.
+    """
+    r, s = np.asarray(reading, float), np.asarray(stage, float)
+    if r.ndim != 1 or s.shape != (len(r), 3):
+        raise MethodError(f"Expected readings (n,) and stage places (n, 3); found {r.shape} and {s.shape}.")
+    beam = _beam(origin, direction, covariance)
+    measured = np.isfinite(r) & np.isfinite(s).all(axis=1)
+    if not measured.any():
+        raise MethodError("Expected readings; found none that is a number.")
+    if moves not in ("sensor", "target"):
+        raise MethodError(f"moves: expected 'sensor' or 'target'; found '{moves}'.")
+    places = s[measured] if moves == "sensor" else -s[measured]
+    scan = _Scan(r[measured], places, beam, calibration, triangulation_normal, mid_range, extrapolate)
+    surface, notes = _surface(normals, measured, scan)
+    distance, N, turns = _at_rest(scan, surface)
+    notes += _extrapolated(scan, N)
+
+    influence, sources = _influences(scan, N, distance)
+    # The reading's noise comes through the compensation a little stretched.
+    stretch = 1.0 if N is None or calibration is None else 1 / (1 + calibration.slope(scan.tilt(N))[0])
+    u = scan.direction
+    along = (noise * np.broadcast_to(stretch, distance.shape)) ** 2
+    own = along[:, None, None] * np.outer(u, u) + stage_noise**2 * np.eye(3)
+
+    def spread(values: Array | None, axis: int = 0) -> Array | None:
+        if values is None:
+            return None
+        full = np.full((*values.shape[:axis], len(r), *values.shape[axis + 1 :]), np.nan)
+        full[(slice(None),) * axis + (measured,)] = values
+        return full
+
+    filled = [spread(values) for values in (scan.place(distance), own, distance)]
+    p, C, d = (np.asarray(values) for values in filled)
+    return Points(
+        points=p,
+        covariance=C,
+        influence=np.asarray(spread(influence, 1)),
+        sources=sources,
+        reading=r,
+        distance=d,
+        direction=u,
+        normals=spread(N),
+        tilt=spread(scan.tilt(N)) if N is not None and calibration is not None else None,
+        turns=turns,
+        notes=notes,
+    )
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Readings that are there, and all that turns them into points."""
+
+    reading: Array
+    stage: Array
+    beam: tuple[Array, Array, Array | None]
+    calibration: InclinationCalibration | None
+    triangulation_normal: ArrayLike | None
+    mid_range: float | None
+    extrapolate: bool
+
+    @property
+    def direction(self) -> Array:
+        return self.beam[1]
+
+    def place(self, distance: Array, origin: Array | None = None, direction: Array | None = None) -> Array:
+        """Return the points (n, 3) at these distances, of this beam or of another one."""
+        p0, u, _ = self.beam
+        p0, u = p0 if origin is None else origin, u if direction is None else direction
+        return np.asarray(self.stage + p0 + distance[:, None] * u)
+
+    def tilt(self, normals: Array, direction: Array | None = None) -> Array:
+        """Return the tilt vectors (n, 2) of a surface with these normals."""
+        if self.triangulation_normal is None:
+            raise MethodError(
+                "A calibration needs the triangulation normal, which says how the sensor is turned about its beam: the "
+                "normal of the plane that holds the emitted and the received beam."
+            )
+        return np.asarray(tilt(self.beam[1] if direction is None else direction, self.triangulation_normal, normals))
+
+    def facing(self, normals: Array) -> Array:
+        """Return normals (n, 3) turned towards the sensor."""
+        way = -(normals @ self.direction)
+        if not (np.abs(way) > _ROUNDING).all():
+            raise MethodError("The beam runs along the surface at some points: it has no reading there. Check normals.")
+        return np.asarray(normals * np.sign(way)[:, None])
+
+
+def _beam(origin: ArrayLike, direction: ArrayLike, covariance: ArrayLike | None) -> tuple[Array, Array, Array | None]:
+    p0, u = np.asarray(origin, float), np.asarray(direction, float)
+    if p0.shape != (3,) or not np.isfinite(p0).all():
+        raise MethodError(
+            f"Expected the beam's origin, three lengths; found {p0.tolist()}. Give 0 0 0 for form and size alone."
+        )
+    if u.shape != (3,) or not abs(np.linalg.norm(u) - 1) <= _UNIT_NORM:
+        raise MethodError(f"Expected the beam's direction, a unit vector of three numbers; found {u.tolist()}.")
+    if covariance is None:
+        return p0, u, None
+    C = np.asarray(covariance, float)
+    if C.shape != (6, 6) or not np.isfinite(C).all():
+        raise MethodError(f"Expected the covariance of (origin, direction), 6 x 6 numbers; found {C.shape}.")
+    return p0, u, C
+
+
+def _surface(
+    normals: ArrayLike | Surface | None, measured: NDArray[np.bool_], scan: _Scan
+) -> tuple[Array | Surface | None, tuple[str, ...]]:
+    """Return the normals or what tells them, and what has to be said of that."""
+    if callable(normals):
+        return normals, ()
+    if normals is not None:
+        N = np.asarray(normals, float)
+        if N.shape != (len(measured), 3) or not (np.abs(np.linalg.norm(N[measured], axis=1) - 1) <= _UNIT_NORM).all():
+            raise MethodError(f"Expected unit normals ({len(measured)}, 3), one for each reading; found {N.shape}.")
+        return scan.facing(N[measured]), ()
+    if scan.calibration is None:
+        return None, ()
+    away = scan.stage - scan.stage.mean(axis=0)
+    _, spread, ways = np.linalg.svd(away, full_matrices=False)
+    if len(spread) > 1 and spread[1] > 1e-3 * spread[0]:
+        return over_surface(), ()
+    axis = np.cross(ways[0], scan.direction)
+    if np.linalg.norm(axis) < 1e-3:
+        raise MethodError("The stage moved along the beam alone: such a scan shows no tilt. Give the normals.")
+    note = (
+        "The scan runs along one line, where only the tilt in the plane of the scan can be seen; the tilt across it "
+        "was taken as 0. If the surface leans that way, give its normals or the surface, such as round_bar(axis)."
+    )
+    return along_curve(axis / np.linalg.norm(axis)), (note,)
+
+
+def _at_rest(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Array | None, int]:
+    """Return distances (n,), normals (n, 3) and the number of turns."""
+    if surface is None:
+        return scan.reading, None, 0
+    if not callable(surface):
+        return _compensated(scan, surface), surface, 0
+    distance = scan.reading
+    for turn in range(1, TURNS + 1):
+        N = scan.facing(surface(scan.place(distance)))
+        before, distance = distance, _compensated(scan, N)
+        if np.abs(distance - before).max() < AT_REST:
+            return distance, N, turn
+    change = np.abs(distance - before).max()
+    raise MethodError(
+        f"Normals and points do not settle: after {TURNS} turns the points still move by {1e6 * change:.3g} um. The "
+        "neighbours are closer than the noise allows: take more of them, or tell the surface, such as round_bar(axis)."
+    )
+
+
+def _compensated(scan: _Scan, normals: Array) -> Array:
+    if scan.calibration is None:
+        return scan.reading
+    q = scan.tilt(normals)
+    return np.asarray(scan.calibration.compensate(scan.reading, q, scan.mid_range, scan.extrapolate).value)
+
+
+def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
+    """Say how many points (normals (n, 3)) were compensated at tilts that the calibration does not speak for."""
+    if scan.calibration is None or normals is None:
+        return ()
+    beyond = int((~scan.calibration.supported(scan.tilt(normals))).sum())
+    if not beyond:
+        return ()
+    return (
+        f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not speak "
+        "for: what was taken off there is extrapolated.",
+    )
+
+
+def _influences(scan: _Scan, normals: Array | None, distance: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return the effect (source, n, 3) of one standard uncertainty of what all points share."""
+    found: list[Array] = []
+    sources: list[str] = []
+    p0, u, C = scan.beam
+    calibration = scan.calibration
+
+    def moved(step: Array) -> Array:
+        tipped = u + step[3:]
+        d = distance
+        if calibration is not None and normals is not None:
+            q = scan.tilt(normals, tipped)
+            d = calibration.compensate(scan.reading, q, scan.mid_range, extrapolate=True).value
+        return scan.place(d, p0 + step[:3], tipped)
+
+    for k, step in enumerate(factors(C) if C is not None else ()):
+        found.append((moved(step) - moved(-step)) / 2)
+        sources.append(f"beam {k + 1}")
+    if calibration is not None and normals is not None:
+        q = scan.tilt(normals)
+        J = calibration.compensate(scan.reading, q, scan.mid_range, extrapolate=True).jacobian
+        for k, step in enumerate(factors(calibration.coefficient_covariance)):
+            found.append((J @ step)[:, None] * u)
+            sources.append(f"inclination calibration {k + 1}")
+    return np.array(found).reshape(-1, len(distance), 3), tuple(sources)
+
+
+def factors(covariance: Array) -> Array:
+    """Return independent steps (k, p) of one standard uncertainty each, whose squares add up to a covariance (p, p)."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / scale[:, None] / scale)
+    if values[0] < -1e-8 * max(values[-1], 1.0):
+        raise MethodError("Expected a covariance; found a matrix with a negative variance in some direction.")
+    kept = values > 1e-12 * max(values[-1], 0.0)
+    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * scale)

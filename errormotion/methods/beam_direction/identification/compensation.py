@@ -1,0 +1,261 @@
+"""The sensor's inclination error taken off, when it depends on the direction that is sought.
+
+A reading r of a plane with the tilt q is r = d + (d - m) k(q). On one plane q is the same for all readings, so that the
+compensated gradient is g / (1 + k) and the compensated offset m + (offset - m) / (1 + k): nothing has to be fitted
+again. The normal is N = g / |g| whatever k is. The tilt needs the beam, the beam needs the gradients: both are found
+in turn until the direction rests. Source: Lu et al., section 3.3, whose loop is over readings instead.
+
+What is uncertain goes through the whole loop. With du = M dk the effect of the slopes on the direction and H = dk/du
+that of the direction on the slopes, a change that comes from elsewhere grows to (1 - M H)^-1 of itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.kinematics.beams import across, tilt, turned
+from errormotion.methods.beam_direction.identification.direction import Direction, solve
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from errormotion.datasets.calibrations.inclination import InclinationCalibration
+
+    Array = Array
+
+CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
+"""What all planes share: the first two where the inclination error is compensated, the last one where it is not."""
+_STEP = 1e-5
+_LARGEST = 0.2
+_NEGLIGIBLE = 1e-12
+
+
+@dataclass(frozen=True)
+class Planes:
+    """What was found on the planes, as read or compensated.
+
+    Attributes
+    ----------
+    names : tuple of str
+        For messages.
+    gradients : ndarray (k, 3)
+    offsets : ndarray (k,)
+        Reading at the stage's place 0, m.
+    covariances : ndarray (k, 4, 4)
+        Of (gradient, offset), SI.
+    """
+
+    names: tuple[str, ...]
+    gradients: Array
+    offsets: Array
+    covariances: Array
+
+    @property
+    def normals(self) -> Array:
+        """Unit normals (k, 3) of the planes, towards the sensor."""
+        return np.asarray(self.gradients / np.linalg.norm(self.gradients, axis=1, keepdims=True))
+
+    def compensated(self, slope: Array, mid_range: float) -> Planes:
+        """Return them with the inclination error of slopes (k,) taken off."""
+        scale = 1 / (1 + slope)
+        return replace(
+            self,
+            gradients=self.gradients * scale[:, None],
+            offsets=mid_range + (self.offsets - mid_range) * scale,
+            covariances=self.covariances * (scale**2)[:, None, None],
+        )
+
+    def direction(self, nominal: Array) -> Direction:
+        """Return the direction of the beam, see `direction.solve`."""
+        return solve(self.gradients, self.covariances[:, :3, :3], nominal, self.names)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What the compensation has to know of the sensor.
+
+    Attributes
+    ----------
+    calibration : InclinationCalibration
+    triangulation_normal : ndarray (3,)
+        Unit normal of the plane of emitted and received beam.
+    normal_uncertainty : float
+        Standard uncertainty of that normal's angle about the beam, rad.
+    mid_range : float
+        Reading at which the inclination error vanishes, m.
+    """
+
+    calibration: InclinationCalibration
+    triangulation_normal: Array
+    normal_uncertainty: float
+    mid_range: float
+
+    def slopes(self, beam: Array, normals: Array) -> Array:
+        """Return the slopes (k,) of the inclination error on planes with normals (k, 3)."""
+        return self.calibration.slope(tilt(beam, self.triangulation_normal, normals))[0]
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A direction and the compensation that belongs to it.
+
+    Attributes
+    ----------
+    direction : Direction
+        Its covariance is that of the noise without the loop; see `propagation`.
+    planes : Planes
+        Compensated.
+    tilt : ndarray (k, 2) or None
+        Of each plane to the beam; None where nothing was compensated.
+    slope : ndarray (k,)
+        Of the inclination error on each plane.
+    slope_by_direction : ndarray (k, 3)
+        Its change with the direction.
+    sources, groups : tuple of str
+        What the slopes share, and what it belongs to in a budget.
+    slope_by_source : ndarray (source, k)
+        Change of the slopes with one standard uncertainty of each source, at this direction.
+    mid_range : float
+        m.
+    iterations : int
+        0 where nothing was compensated.
+    """
+
+    direction: Direction
+    planes: Planes
+    tilt: Array | None
+    slope: Array
+    slope_by_direction: Array
+    sources: tuple[str, ...]
+    groups: tuple[str, ...]
+    slope_by_source: Array
+    mid_range: float
+    iterations: int
+
+
+def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0, mid_range: float = 0.0) -> Settled:
+    """Return the direction from the readings as they are.
+
+    Parameters
+    ----------
+    planes : Planes
+    nominal : ndarray (3,)
+        Rough direction.
+    scale_uncertainty : float
+        Relative standard uncertainty of the readings' scale about ``mid_range`` (m), common to all planes.
+    """
+    k, known = len(planes.offsets), scale_uncertainty == 0
+    direction = planes.direction(nominal)
+    return Settled(
+        direction,
+        planes,
+        tilt=None,
+        slope=np.zeros(k),
+        slope_by_direction=np.zeros((k, 3)),
+        sources=() if known else (SCALE,),
+        groups=() if known else (SCALE,),
+        slope_by_source=np.full((0 if known else 1, k), scale_uncertainty),
+        mid_range=mid_range,
+        iterations=0,
+    )
+
+
+def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max_iterations: int) -> Settled:
+    """Compensate and solve in turn until the direction rests.
+
+    Parameters
+    ----------
+    planes : Planes
+        As read.
+    nominal : ndarray (3,)
+        Rough direction.
+    sensor : Sensor
+    tolerance : float
+        Change of the direction at which it rests, rad.
+    max_iterations : int
+
+    Raises
+    ------
+    MethodError
+        It does not rest within ``max_iterations``, or the compensation is no small correction; what `direction.solve`
+        refuses.
+    """
+    normals = planes.normals
+    u = planes.direction(nominal).direction
+    steps: list[Array] = []
+    while True:
+        slope = sensor.slopes(u, normals)
+        _check_slopes(slope, planes.names)
+        now = planes.compensated(slope, sensor.mid_range)
+        direction = now.direction(nominal)
+        steps.append(direction.direction - u)
+        u = direction.direction
+        if np.linalg.norm(steps[-1]) < tolerance:
+            break
+        if len(steps) >= max_iterations:
+            raise MethodError(_does_not_settle(steps, tolerance))
+    q = tilt(u, sensor.triangulation_normal, normals)
+    sources, groups, by_source = _slope_sources(sensor, q)
+    by_direction = np.zeros((len(slope), 3))
+    for e in np.eye(2):
+        ahead, behind = (sensor.slopes(turned(u, sign * _STEP * e), normals) for sign in (1, -1))
+        by_direction += np.outer((ahead - behind) / (2 * _STEP), e @ across(u))
+    return Settled(direction, now, q, slope, by_direction, sources, groups, by_source, sensor.mid_range, len(steps))
+
+
+def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
+    """Return names and groups of what the slopes share, and their change (source, k) with each at tilts q (k, 2)."""
+    J = sensor.calibration.jacobian(q)
+    # All coefficients together move the slopes of k planes in k independent ways at most.
+    variance, axes = np.linalg.eigh(J @ sensor.calibration.coefficient_covariance @ J.T)
+    moved = variance > _NEGLIGIBLE * max(float(variance[-1]), 1e-300)
+    by_source = (axes * np.sqrt(np.maximum(variance, 0.0)))[:, moved].T[::-1]
+    sources = tuple(f"{CALIBRATION} {i + 1}" for i in range(len(by_source)))
+    groups = (CALIBRATION,) * len(sources)
+    if sensor.normal_uncertainty > 0:
+        c, s = np.cos(sensor.normal_uncertainty), np.sin(sensor.normal_uncertainty)
+        # Turned about the beam with the sensor, the axes of q turn, and q the other way.
+        ahead, behind = (sensor.calibration.slope(q @ np.array([[c, -sign * s], [sign * s, c]]))[0] for sign in (1, -1))
+        by_source = np.concatenate([by_source, [(ahead - behind) / 2]])
+        sources, groups = (*sources, TRIANGULATION), (*groups, TRIANGULATION)
+    return sources, groups, by_source
+
+
+def _check_slopes(slope: Array, names: Sequence[str]) -> None:
+    for name, k in zip(names, slope, strict=True):
+        if np.isnan(k):
+            raise MethodError(
+                f"{name}: while compensating, the beam came to look at its back. Check the nominal direction and that "
+                "the calibration belongs to this sensor."
+            )
+        if abs(k) > _LARGEST:
+            raise MethodError(
+                f"{name}: the calibration says that the reading is off by {k:.0%} of the depth; expected a few per "
+                "cent at most. Does it belong to this sensor, and does it reach this inclination?"
+            )
+
+
+def _does_not_settle(steps: list[Array], tolerance: float) -> str:
+    size = np.linalg.norm(steps, axis=1)
+    back = float(steps[-1] @ steps[-2]) / max(size[-1] * size[-2], 1e-300) if len(steps) > 1 else 0.0
+    factor = size[-1] / size[-2] if len(steps) > 1 else np.nan
+    if back < -0.5:
+        how = f"it swings to and fro, each step {factor:.2g} of the one before"
+    elif factor >= 1:
+        how = f"its steps grow, each {factor:.2g} of the one before"
+    else:
+        how = f"it still creeps, each step {factor:.2g} of the one before" if len(steps) > 1 else "after one step"
+    needs = (
+        f" At this rate {int(np.ceil(np.log(tolerance / size[-1]) / np.log(factor)))} more would do (max_iterations)."
+        if 0 < factor < 0.9
+        else " The inclination error depends too strongly on the tilt: take planes that are less inclined."
+    )
+    return (
+        f"The compensation of the inclination error does not settle: after {len(steps)} iterations the direction "
+        f"changed by {size[-1]:.2g} rad, expected less than {tolerance:.2g} rad; {how}.{needs}"
+    )

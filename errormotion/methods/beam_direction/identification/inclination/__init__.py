@@ -1,0 +1,1 @@
+"""Calibration of the inclination error of a point sensor."""

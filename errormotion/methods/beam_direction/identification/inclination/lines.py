@@ -1,0 +1,304 @@
+"""Readings against an interferometer, setting by setting: each setting of the surface has a line of errors over depth.
+
+The error of a reading is e = r - d = (d - m) k + b: k the slope of the setting, b the zero of its series, because an
+interferometer tells displacements only. Readings that do not belong to the line of their setting are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+Indices = NDArray[np.int64]
+
+SAME = 1e-5
+"""Angle within which groups belong to one setting, rad."""
+FEWEST_FREE = 30
+"""Degrees of freedom from which on the scatter about the lines tells the noise."""
+_ENOUGH = 4
+"""Readings that a setting needs, on average, for a zero of its own."""
+_OUTLIER = 5.0
+"""Standard deviations from which on a reading does not belong to its line."""
+_LEAST_NOISE = 1e-10
+"""m; rounding of readings without noise."""
+_ROUNDS = 20
+_GAUSS = 1.4826  # standard deviation of normal numbers over their median absolute deviation
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings that can be used, group by group.
+
+    Attributes
+    ----------
+    error : ndarray (group,)
+        r - d, m.
+    depth : ndarray (group,)
+        d - m, m.
+    reading : ndarray (group,)
+        r, m.
+    setting : ndarray (group,)
+        Which setting each group belongs to.
+    inclination, rotation : ndarray (setting,)
+        rad.
+    noise : float
+        As stated, m; NaN if not.
+    mid_range : float
+        m.
+    missing : int
+        Groups without a reading.
+    """
+
+    error: Array
+    depth: Array
+    reading: Array
+    setting: Indices
+    inclination: Array
+    rotation: Array
+    noise: float
+    mid_range: float
+    missing: int
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of all settings.
+
+    Attributes
+    ----------
+    slope, offset : ndarray (setting,)
+        k, and the error at mid range, m; the offset is 0 where it was not free.
+    slope_variance, offset_variance, shared_variance : ndarray (setting,)
+        Of slope and offset and between them, from the noise.
+    residual : ndarray (group,)
+        m; of groups that were left out as well.
+    left_out : ndarray of bool (group,)
+    noise : float
+        Standard deviation of one reading, m.
+    free_offsets : bool
+    """
+
+    slope: Array
+    offset: Array
+    slope_variance: Array
+    offset_variance: Array
+    shared_variance: Array
+    residual: Array
+    left_out: NDArray[np.bool_]
+    noise: float
+    free_offsets: bool
+
+
+def read(raw: xr.Dataset) -> Readings:
+    """Take the readings out of a raw dataset and refuse those that cannot be meant.
+
+    Raises
+    ------
+    MethodError
+        Readings or references that do not move, that count against one another or in another unit, depths on one side
+        of mid range only, no inclination at all.
+    """
+    r, d, alpha, beta = (
+        np.asarray(raw[name].values, dtype=float) for name in ("reading", "reference", "inclination", "rotation")
+    )
+    known = np.isfinite(r) & np.isfinite(d)
+    if not known.any():
+        raise MethodError("Every reading is missing (NaN); expected readings of the sensor against the interferometer.")
+    r, d, alpha, beta = r[known], d[known], alpha[known], beta[known]
+    m = float(raw["mid_range"]) if "mid_range" in raw.variables else 0.0
+    _check(r, d, m)
+    if np.abs(alpha).max() < SAME:
+        raise MethodError("Every inclination is 0; expected a surface that is set to several inclinations.")
+    written = np.round(np.stack([alpha, beta]) / SAME)
+    _, first, setting = np.unique(written, axis=1, return_index=True, return_inverse=True)
+    return Readings(
+        error=r - d,
+        depth=d - m,
+        reading=r,
+        setting=setting.ravel(),
+        inclination=alpha[first],
+        rotation=beta[first],
+        noise=float(raw["reading_noise"]) if "reading_noise" in raw.variables else float("nan"),
+        mid_range=m,
+        missing=int((~known).sum()),
+    )
+
+
+def _check(r: Array, d: Array, m: float) -> None:
+    """Refuse readings and references that cannot be meant."""
+    if np.ptp(d) < 1e-6:
+        raise MethodError(f"The reference stays at {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor.")
+    way = float(np.cov(r, d)[0, 1] / d.var(ddof=1)) if len(d) > 1 else 1.0
+    if abs(way) < 1e-4:
+        raise MethodError(
+            f"The readings stay near {1e3 * np.median(r):.4f} mm while the reference moves by {1e3 * np.ptp(d):.3f} "
+            "mm; expected both to move together. Is it the right column?"
+        )
+    if way < 0:
+        raise MethodError(
+            "The readings fall where the reference rises: one of them counts the other way. Change the sign of the "
+            "reference, so that both grow with the depth."
+        )
+    if not 0.8 < way < 1.25:
+        units = {1e3: " Is the reference in mm, written as m?", 1e-3: " Are the readings in mm, written as m?"}
+        hint = next((text for factor, text in units.items() if 0.8 < way * factor < 1.25), " Are the units right?")
+        raise MethodError(f"The readings move {way:.4g} times as far as the reference; expected about once.{hint}")
+    low, high = float(d.min() - m), float(d.max() - m)
+    if min(-low, high) < 0.05 * (high - low):
+        raise MethodError(
+            f"The depths go from {1e3 * low:.3f} to {1e3 * high:.3f} mm about mid range ({1e3 * m:.3f} mm), all on one "
+            "side; expected both sides, because the error changes its sign there. Is `mid_range` right, and does the "
+            "reference count as the readings do?"
+        )
+
+
+def fit(readings: Readings, offsets: str = "auto") -> Lines:
+    """Fit the lines of all settings.
+
+    Parameters
+    ----------
+    readings : Readings
+    offsets : str
+        ``"each"``: every setting has its own zero of the interferometer; ``"none"``: the interferometer counts from the
+        zero of the sensor throughout; ``"auto"``: the first where the settings have enough readings for it.
+
+    Raises
+    ------
+    MethodError
+        A setting has too few readings for a zero of its own, or nothing tells the noise.
+    """
+    count = np.bincount(readings.setting)
+    free = offsets == "each" or (offsets == "auto" and float(np.median(count)) >= _ENOUGH and count.min() > 1)
+    if offsets == "each" and count.min() < 2:
+        k = int(np.argmin(count))
+        raise MethodError(
+            f"{_name(readings, k)} has one reading only, which cannot tell a zero of its own; expected at least two, "
+            "or offsets 'none'."
+        )
+    slope, offset = _start(readings, free)
+    kept = np.ones(len(readings.error), dtype=bool)
+    for _ in range(_ROUNDS):
+        residual = readings.error - slope[readings.setting] * readings.depth - offset[readings.setting]
+        before, kept = kept, _belonging(residual, kept, readings, free)
+        slope, offset, parts = _solve(readings, kept, free)
+        if (before == kept).all():
+            break
+    residual = readings.error - slope[readings.setting] * readings.depth - offset[readings.setting]
+    noise = _noise(residual[kept], int(kept.sum()) - len(count) * (2 if free else 1), readings.noise)
+    by_slope, by_offset, shared = (noise**2 * part for part in parts)
+    return Lines(slope, offset, by_slope, by_offset, shared, residual, ~kept, noise, free)
+
+
+def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
+    """Return slopes and offsets that a few wild readings do not move: medians over pairs of readings."""
+    n = int(readings.setting.max()) + 1
+    slope, offset = np.zeros(n), np.zeros(n)
+    order = np.argsort(readings.setting, kind="stable")
+    for k, places in enumerate(np.split(order, np.cumsum(np.bincount(readings.setting))[:-1])):
+        depth, error = readings.depth[places], readings.error[places]
+        if free:
+            i, j = np.triu_indices(len(places), 1)
+            step = depth[j] - depth[i]
+            far = np.abs(step) > 0.2 * np.ptp(depth)
+            slope[k] = np.median((error[j] - error[i])[far] / step[far]) if far.any() else 0.0
+            offset[k] = np.median(error - slope[k] * depth)
+        else:
+            weight = np.abs(depth)
+            far = weight >= 0.2 * weight.max()
+            slope[k] = np.median(error[far] / depth[far]) if weight.max() > 0 else 0.0
+    return slope, offset
+
+
+def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, free: bool) -> NDArray[np.bool_]:
+    """Return which readings lie on the line of their setting; a setting keeps at least what its line needs."""
+    count = np.bincount(readings.setting)
+    # Lines come closer to their readings than the truth does, by the share of the readings that they take up.
+    share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
+    scale = max(_GAUSS * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
+    few = count[readings.setting] < (_ENOUGH if free else 2)
+    return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
+
+
+def _solve(readings: Readings, kept: NDArray[np.bool_], free: bool) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Return slopes, offsets, and their variances and covariances for noise 1."""
+    n = int(readings.setting.max()) + 1
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.bincount(readings.setting, values * kept, n), dtype=float)
+
+    N, D, DD = total(np.ones(len(kept))), total(readings.depth), total(readings.depth**2)
+    E, DE = total(readings.error), total(readings.depth * readings.error)
+    if not free:
+        _require_depth(readings, DD > 0)
+        return DE / DD, np.zeros(n), (1 / DD, np.zeros(n), np.zeros(n))
+    det = N * DD - D**2
+    _require_depth(readings, det > 1e-9 * np.maximum(N * DD, 1e-30))
+    slope, offset = (N * DE - D * E) / det, (DD * E - D * DE) / det
+    return slope, offset, (N / det, DD / det, -D / det)
+
+
+def _require_depth(readings: Readings, enough: NDArray[np.bool_]) -> None:
+    if not enough.all():
+        raise MethodError(
+            f"{_name(readings, int(np.argmin(enough)))} has readings at one depth only; expected several depths, which "
+            "tell the slope of the error. Leave the setting out or measure it again."
+        )
+
+
+def _noise(residual: Array, freedom: int, stated: float) -> float:
+    """Return the standard deviation of one reading: what the lines show, or what was stated if they show too little."""
+    if freedom >= FEWEST_FREE:
+        return max(float(np.sqrt((residual**2).sum() / freedom)), _LEAST_NOISE)
+    if not np.isfinite(stated):
+        raise MethodError(
+            f"{freedom} readings more than unknowns do not tell the noise of the readings; expected at least "
+            f"{FEWEST_FREE}, or `reading_noise` in the data."
+        )
+    return max(stated, _LEAST_NOISE)
+
+
+def _name(readings: Readings, setting: int) -> str:
+    alpha, beta = np.degrees(readings.inclination[setting]), np.degrees(readings.rotation[setting])
+    return f"The setting of inclination {alpha:g} deg at rotation {beta:g} deg"
+
+
+@dataclass(frozen=True)
+class MidRange:
+    """Where the lines of all settings meet: the reading at which the error does not depend on the inclination.
+
+    Attributes
+    ----------
+    reading, uncertainty : float
+        m; NaN where the lines do not tell.
+    scatter : float
+        Standard deviation of the zeros of the settings, m.
+    """
+
+    reading: float
+    uncertainty: float
+    scatter: float
+
+
+def mid_range(readings: Readings, lines: Lines) -> MidRange:
+    """Return where the lines meet.
+
+    The error at the stated mid range is b = b0 - k (m_found - m): a line over k.
+    """
+    known = len(lines.slope) - 2
+    if not lines.free_offsets or known < 3 or np.ptp(lines.slope) < 5 * np.sqrt(np.median(lines.slope_variance)):
+        return MidRange(float("nan"), float("nan"), float("nan"))
+    A = np.stack([np.ones(len(lines.slope)), -lines.slope], axis=1)
+    good = np.ones(len(lines.slope), dtype=bool)
+    for _ in range(3):  # a zero that was set wrongly does not count
+        (_, shift), *_ = np.linalg.lstsq(A[good], lines.offset[good])
+        rest = lines.offset - A @ np.array([np.median(lines.offset + lines.slope * shift), shift])
+        good = np.abs(rest) <= _OUTLIER * max(_GAUSS * float(np.median(np.abs(rest))), _LEAST_NOISE)
+    scatter = float(np.sqrt((rest[good] ** 2).sum() / max(int(good.sum()) - 2, 1)))
+    C = np.linalg.inv(A[good].T @ A[good]) * scatter**2
+    return MidRange(readings.mid_range + float(shift), float(np.sqrt(C[1, 1])), scatter)

@@ -1,0 +1,156 @@
+"""What a raw dataset says, checked as far as a schema cannot: range of the sensor, order of the stage, noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.beam_direction.settings import Settings
+
+    Array = Array
+
+LOST = 0.3
+"""Largest share of a plane's readings that may be missing."""
+_STRAIGHT = 0.999
+_REST = 1e-3
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings on planes, SI.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the planes, counted from 1 as people do.
+    raw, distance : ndarray (plane, reading)
+        As read, and without what lies out of the sensor's range.
+    stage : ndarray (plane, reading, 3)
+        As the sensor moves, so reversed where the stage carries the target.
+    moves : {"sensor", "target"}
+    nominal_direction : ndarray (3,)
+    nominal_origin : ndarray (3,)
+        NaN where it is not known.
+    points : ndarray (plane, 3)
+        A known point of each plane; NaN where there is none.
+    noise, speckle, speckle_length, point_uncertainty : float
+    """
+
+    names: tuple[str, ...]
+    raw: Array
+    distance: Array
+    stage: Array
+    moves: Literal["sensor", "target"]
+    nominal_direction: Array
+    nominal_origin: Array
+    points: Array
+    noise: float
+    speckle: float
+    speckle_length: float
+    point_uncertainty: float
+
+
+def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
+    """Take the readings out of a raw dataset; ``notes`` get what a user should know.
+
+    Raises
+    ------
+    MethodError
+        A stroke out of the sensor's range, a stage that turns back along a stroke, a noise of 0, speckle without its
+        length.
+    """
+    moves = raw.attrs.get("moves", settings.moves)
+    if moves not in ("sensor", "target"):
+        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.")
+    distance = np.array(raw["distance"].transpose("plane", "reading").values, np.float64)
+    stage = np.asarray(raw["stage"].transpose("plane", "reading", "direction").values, np.float64)
+    names = tuple(f"Plane {i + 1}" for i in range(len(distance)))
+    noise, speckle, length = float(raw["distance_noise"]), _scalar(raw, "speckle"), _scalar(raw, "speckle_length")
+    if not noise > 0:
+        raise MethodError("distance_noise is 0: expected the standard deviation of one reading at rest, m.")
+    if speckle > 0 and "speckle_length" not in raw:
+        raise MethodError("The data state speckle but no speckle_length; expected the way on which it correlates, m.")
+    low, high = raw["reading_range"].values if "reading_range" in raw else (-np.inf, np.inf)
+    within = distance.copy()
+    for i, name in enumerate(names):
+        within[i] = _in_range(name, distance[i], np.isfinite(stage[i]).all(axis=1), float(low), float(high), notes)
+        if settings.ordered:
+            _check_order(name, stage[i])
+    u0 = np.asarray(raw["nominal_direction"].values, np.float64)
+    unknown = np.full(3, np.nan)
+    return Readings(
+        names=names,
+        raw=distance,
+        distance=within,
+        stage=stage if moves == "sensor" else -stage,
+        moves=moves,
+        nominal_direction=u0 / np.linalg.norm(u0),
+        nominal_origin=np.asarray(raw["nominal_origin"].values if "nominal_origin" in raw else unknown, np.float64),
+        points=np.asarray(
+            raw["plane_point"].transpose("plane", "direction").values
+            if "plane_point" in raw
+            else np.tile(unknown, (len(names), 1)),
+            np.float64,
+        ),
+        noise=noise,
+        speckle=speckle,
+        speckle_length=length,
+        point_uncertainty=_scalar(raw, "plane_point_uncertainty"),
+    )
+
+
+def _scalar(raw: xr.Dataset, name: str) -> float:
+    value = float(raw[name]) if name in raw else 0.0
+    return value if np.isfinite(value) else 0.0
+
+
+def _in_range(
+    name: str, distance: Array, placed: NDArray[np.bool_], low: float, high: float, notes: list[str]
+) -> Array:
+    """Return the readings without those out of range; refuse a stroke that leaves it."""
+    out = (distance < low) | (distance > high)
+    missing = placed & (out | np.isnan(distance))
+    if not missing.any():
+        return distance
+    first, empty = int(np.argmax(missing)) + 1, int((placed & np.isnan(distance)).sum())
+    text = (
+        f"{name}: {int(missing.sum())} of {int(placed.sum())} readings are missing ({empty} without value, "
+        f"{int(out.sum())} out of the sensor's range), the first of them reading {first}"
+    )
+    if missing.sum() > LOST * placed.sum():
+        limits = f" of {low * 1e3:g} to {high * 1e3:g} mm" if np.isfinite(low) else ""
+        raise MethodError(
+            f"{text}: the strokes leave the sensor's range{limits}. Shorten them, start nearer to mid-range, or tilt "
+            "the plane less."
+        )
+    notes.append(f"{text}; they were not used.")
+    return np.where(out, np.nan, distance)
+
+
+def _check_order(name: str, stage: Array) -> None:
+    """Refuse a place that lies back along an otherwise straight stroke: rows swapped, a counter lost, backlash."""
+    rows = np.flatnonzero(np.isfinite(stage).all(axis=1))
+    steps = np.diff(stage[rows], axis=0)
+    size = np.linalg.norm(steps, axis=1)
+    moving = np.flatnonzero(size > _REST * size.max(initial=0.0))
+    if len(moving) < 3:
+        return
+    d, size = steps[moving] / size[moving, None], size[moving]
+    turns = np.sum(d[1:] * d[:-1], axis=1) < -_STRAIGHT
+    wrong = turns[:-1] & turns[1:] & (size[1:-1] < 0.9 * np.minimum(size[:-2], size[2:]))
+    if wrong.any():
+        at = int(np.argmax(wrong)) + 1
+        raise MethodError(
+            f"{name}: at reading {rows[moving[at]] + 2} the stage steps back by {size[at] * 1e6:.4g} um along a stroke "
+            "and then goes on. Expected strokes that go one way: check that places and readings belong together, and "
+            "the stage for backlash. Where it went to its places in any order on purpose, set ordered = false."
+        )

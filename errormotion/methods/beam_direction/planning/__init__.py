@@ -1,0 +1,1 @@
+"""Planning: beam direction, the uncertainty to expect before a measurement."""

@@ -1,0 +1,356 @@
+"""Where to put the planes and how to move over them, so that a beam's direction becomes best known.
+
+A plane of gradient g says one thing of the beam u: g.u = -1. The angles by which the beam may be off its nominal
+direction change this by t, the plane's tilt across the beam (|t| = tan of the inclination), and it is known as well as
+the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings in all, shared out
+as is best, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of the sensor limits
+a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is positive. With an
+inclination of alpha at most, no set-up with n readings in all can bring the worse of the two angles below
+
+    sqrt(24 / n) sigma / (R tan alpha),
+
+and two planes tilted at right angles to one another reach it where gauge and travel allow. A longer stroke is never
+worse, so that only the orientations of the planes and their shares of the readings are left to search for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.kinematics.beams import across
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from errormotion.methods.beam_direction.settings import Settings
+
+    Array = Array
+
+LEAST_READINGS = 3
+"""A stroke has so many readings at least, so that it shows whether it is straight."""
+_LEAST_SHARE = 0.02
+_PENALTY = 1e3
+_EVALUATIONS = 1000
+"""Of each search, for each plane."""
+_TOLERANCE = 1e-7
+_ROUNDING = 1e-9
+_ROUNDS = 2
+_TURNS = 3
+"""So many sets of planes evenly about the beam are tried as starts, beside the given one."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a set-up has to stay within, and what is known before.
+
+    Attributes
+    ----------
+    beam : ndarray (3,)
+        Nominal direction of the beam.
+    beam_uncertainty : float
+        Standard uncertainty of each of its two angles, rad.
+    reach : float
+        Change of the reading that a stroke may make, m.
+    travel : ndarray (3,)
+        Longest strokes along X, Y, Z, m.
+    plate : float
+        Longest way of the light spot over the plane in one stroke, m.
+    inclination, rotation : tuple of float
+        Least and largest inclination and rotation of the gauge, rad.
+    max_inclination : float
+        Largest angle between the beam and the plane's normal, rad.
+    readings : int
+        Of all planes together.
+    noise : float
+        Standard deviation of one reading, m.
+    scale_uncertainty : float
+        Relative standard uncertainty of the sensor's scale, common to all planes.
+    slope_uncertainty : callable, optional
+        Relative standard uncertainty of the slope that the inclination leaves, from the tilts (k, 2) -> (k,).
+    """
+
+    beam: Array
+    beam_uncertainty: float
+    reach: float
+    travel: Array
+    plate: float
+    inclination: tuple[float, float]
+    rotation: tuple[float, float]
+    max_inclination: float
+    readings: int
+    noise: float
+    scale_uncertainty: float = 0.0
+    slope_uncertainty: Callable[[Array], Array] | None = None
+
+
+def limits_of(
+    settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
+) -> Limits:
+    """Return the limits that settings state; ``sensor_range``, m, where the sensor itself says its own."""
+    p = settings.layout
+    if sensor_range is None:
+        sensor_range = p.reading_range[1] - p.reading_range[0]
+    u = np.array(p.nominal_direction, np.float64)
+    return Limits(
+        beam=u / np.linalg.norm(u),
+        beam_uncertainty=p.direction_uncertainty,
+        reach=p.used_range * sensor_range,
+        travel=np.array(p.travel),
+        plate=p.plate,
+        inclination=p.inclinations,
+        rotation=p.rotations,
+        max_inclination=p.max_inclination,
+        readings=len(settings.planes) * p.readings,
+        noise=float(np.hypot(p.noise / np.sqrt(p.average), p.speckle)),
+        scale_uncertainty=p.scale_uncertainty,
+        slope_uncertainty=slope_uncertainty,
+    )
+
+
+@dataclass(frozen=True)
+class Design:
+    """A set-up: planes, strokes, and how many readings each stroke has.
+
+    Attributes
+    ----------
+    planes : ndarray (k, 2)
+        Inclination and rotation of the gauge, rad.
+    strokes : ndarray (k, 3)
+        Lengths of the strokes along X, Y, Z, m.
+    readings : ndarray of int64 (k, 3)
+        Readings of each stroke, equally spaced.
+    path : ndarray (n, 3), optional
+        Places of the stage on every plane instead of strokes, m.
+    """
+
+    planes: Array
+    strokes: Array
+    readings: NDArray[np.int64]
+    path: Array | None = None
+
+    def stages(self) -> list[Array]:
+        """Return for each plane the places (n, 3) of the stage, m, about the one where the reading is mid-range."""
+        if self.path is not None:
+            return [self.path] * len(self.planes)
+        return [stroke_points(lengths, counts) for lengths, counts in zip(self.strokes, self.readings, strict=True)]
+
+    @property
+    def normals(self) -> Array:
+        """Return the normals (k, 3) of the planes."""
+        return plane_normals(self.planes)
+
+
+def plane_normals(planes: Array) -> Array:
+    """Return the normals (k, 3) of a gauge on a turntable about Z, from inclinations and rotations (k, 2), rad."""
+    a, b = np.asarray(planes, np.float64).T
+    return np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
+
+
+def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
+    """Return places (n, 3) on strokes along X, Y and Z whose middles meet in one place, m."""
+    parts = [
+        np.linspace(-0.5, 0.5, count)[:, None] * length * axis
+        for axis, length, count in zip(np.eye(3), lengths, counts, strict=True)
+        if count
+    ]
+    return np.concatenate(parts)
+
+
+def tilts(normals: Array, beam: Array) -> Array:
+    """Return the tilts (k, 2) of planes along ``across(beam)``: what g.u gains when the beam turns by an angle."""
+    return np.asarray(normals @ _basis(tuple(beam)).T / -(normals @ beam)[:, None])
+
+
+@lru_cache(maxsize=4)
+def _basis(beam: tuple[float, ...]) -> Array:
+    """Return ``across(beam)``, which a search asks for ten thousands of times."""
+    return across(np.array(beam))
+
+
+def inclinations(normals: Array, beam: Array) -> Array:
+    """Return the angles (k,) between the way back along the beam and the normals, rad; beyond pi/2: seen from below."""
+    return np.asarray(np.arccos(np.clip(-(normals @ beam), -1.0, 1.0)))
+
+
+def longest_strokes(normals: Array, limits: Limits) -> Array:
+    """Return the longest strokes (k, 3), m, that keep to the range, the travel and the plate."""
+    gradient = -normals / (normals @ limits.beam)[:, None]
+    spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
+    with np.errstate(divide="ignore"):
+        longest = np.minimum(limits.reach / np.abs(gradient), limits.plate / spot)
+    return np.asarray(np.minimum(longest, limits.travel))
+
+
+def shares_of_strokes(strokes: Array, limits: Limits) -> tuple[Array, Array]:
+    """Return the best shares (k, 3) of the strokes in a plane's readings, and c (k,), 1/m (see the module)."""
+    # A beam that is not quite where it is meant to be has a component along every axis.
+    per_stroke = np.hypot(limits.beam, limits.beam_uncertainty) / strokes
+    c = per_stroke.sum(axis=1)
+    return per_stroke / c[:, None], c
+
+
+def spread(planes: Array, shares: Array, limits: Limits) -> Array:
+    """Return the covariance (2, 2) of the beam's two angles, rad^2, for planes with shares (k,) of the readings."""
+    normals = plane_normals(planes)
+    t = tilts(normals, limits.beam)
+    _, c = shares_of_strokes(longest_strokes(normals, limits), limits)
+    own = 12 * limits.noise**2 * c**2 / (limits.readings * shares)
+    if limits.slope_uncertainty is not None:
+        own = own + limits.slope_uncertainty(t) ** 2
+    weighted = t / own[:, None]
+    information = t.T @ weighted
+    information += 1e-12 * np.trace(information) * np.eye(2) + np.finfo(float).tiny
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    return np.asarray(covariance + common_scale(covariance, weighted, limits))
+
+
+def common_scale(covariance: Array, weighted: Array, limits: Limits) -> Array:
+    """Return what a scale error common to all planes adds to the covariance (2, 2) of the angles."""
+    effect = covariance @ weighted.sum(axis=0) * limits.scale_uncertainty
+    return np.outer(effect, effect)
+
+
+def worst_angle(covariance: Array) -> float:
+    """Return the standard uncertainty, rad, of the angle in the direction across the beam where it is largest."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def least_angle(limits: Limits) -> float:
+    """Return what the worse angle's uncertainty cannot fall below, rad, whatever the planes; see the module."""
+    return float(
+        np.sqrt(24.0 / limits.readings) * limits.noise / (limits.reach * np.tan(limits.max_inclination)),
+    )
+
+
+def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
+    """Find the planes, strokes and readings that leave the worse of the beam's two angles least uncertain.
+
+    Parameters
+    ----------
+    limits : Limits
+    start : array_like (k, 2)
+        Inclination and rotation of the planes to begin with, rad; as many planes are sought.
+    seed : int
+        Of the search over all orientations; same seed, same answer.
+
+    Raises
+    ------
+    MethodError
+        Fewer than two planes, fewer readings than they need, or no orientation within the limits.
+    """
+    import nlopt
+
+    start = np.asarray(start, np.float64).reshape(-1, 2)
+    number = len(start)
+    check_numbers(number, limits)
+    lower = np.array([0.0, -np.pi] * number + [_LEAST_SHARE] * number)
+    upper = np.array([limits.max_inclination, 3 * np.pi] * number + [1.0] * number)
+
+    def cost(x: Array, gradient: Array) -> float:  # noqa: ARG001 - the signature of nlopt
+        planes = _planes(x[: 2 * number], limits)
+        beyond = np.maximum(inclinations(plane_normals(planes), limits.beam) - limits.max_inclination, 0.0).sum()
+        if beyond > _ROUNDING:
+            return _PENALTY * (1.0 + float(beyond))
+        shares = x[2 * number :]
+        return float(np.log(worst_angle(spread(planes, shares / shares.sum(), limits))))
+
+    nlopt.srand(seed)
+
+    def search(algorithm: int, x: Array, evaluations: int) -> Array:
+        problem = nlopt.opt(algorithm, x.size)
+        problem.set_lower_bounds(lower)
+        problem.set_upper_bounds(upper)
+        problem.set_min_objective(cost)
+        problem.set_ftol_abs(_TOLERANCE)
+        problem.set_maxeval(evaluations)
+        found = np.clip(problem.optimize(x), lower, upper)
+        return found if cost(found, found) <= cost(x, x) else x
+
+    equal = np.full(number, 0.5)
+    even = [(np.arange(number) + turn / _TURNS) * 2 * np.pi / number for turn in range(_TURNS)]
+    steep = [np.stack([np.full(number, limits.max_inclination), azimuth], axis=-1) for azimuth in even]
+    starts = [np.clip(np.concatenate([p.ravel(), equal]), lower, upper) for p in (_about_beam(start, limits), *steep)]
+    starts[0] = search(nlopt.GN_CRS2_LM, starts[0], _EVALUATIONS * number)
+    starts = [search(nlopt.LN_SBPLX, x, _EVALUATIONS * number) for x in starts]
+    x = min(starts, key=lambda x: cost(x, x))
+    # The larger of two variances has an edge along which a search creeps: begun anew it goes on.
+    for algorithm in (nlopt.LN_COBYLA, nlopt.LN_SBPLX) * _ROUNDS:
+        x = search(algorithm, x, _EVALUATIONS * number)
+    if cost(x, x) >= _PENALTY:
+        raise MethodError(
+            f"No plane of the gauge meets the beam at {np.degrees(limits.max_inclination):.3g} deg or less. Expected a "
+            "nominal direction that looks down on the gauge, and a gauge that can be inclined towards it."
+        )
+    planes, shares = _planes(x[: 2 * number], limits), x[2 * number :]
+    order = np.lexsort((planes[:, 0], planes[:, 1]))
+    return with_readings(planes[order], shares[order] / shares.sum(), limits)
+
+
+def _planes(about_beam: Array, limits: Limits) -> Array:
+    """Return planes (k, 2) of the gauge from their inclinations to the beam and azimuths about it, flat (2 k,).
+
+    A plane beyond what the gauge can do becomes the nearest that it can; that is never steeper for a beam within the
+    gauge's own reach.
+    """
+    inclination, azimuth = about_beam.reshape(-1, 2).T
+    sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ _basis(tuple(limits.beam))
+    normals = np.sin(inclination)[:, None] * sideways - np.cos(inclination)[:, None] * limits.beam
+    rotation = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), 2 * np.pi)
+    planes = np.stack([np.arccos(np.clip(normals[:, 2], -1.0, 1.0)), rotation], axis=-1)
+    lower, upper = zip(limits.inclination, limits.rotation, strict=True)
+    return np.asarray(np.clip(planes, lower, upper))
+
+
+def _about_beam(planes: Array, limits: Limits) -> Array:
+    """Return the inclinations to the beam and the azimuths about it (k, 2) of planes of the gauge."""
+    q = tilts(plane_normals(planes), limits.beam)
+    return np.stack([np.arctan(np.hypot(*q.T)), np.arctan2(q[:, 1], q[:, 0])], axis=-1)
+
+
+def check_numbers(planes: int, limits: Limits) -> None:
+    """Refuse what cannot determine a direction.
+
+    Raises
+    ------
+    MethodError
+        Fewer than two planes, or fewer readings than `LEAST_READINGS` for each stroke.
+    """
+    if planes < 2:
+        raise MethodError(
+            f"One plane says nothing of one of the beam's two angles: expected two or more; found {planes}"
+        )
+    if limits.readings < (needed := 3 * LEAST_READINGS * planes):
+        raise MethodError(
+            f"{planes} planes with three strokes each need {needed} readings or more; found {limits.readings}"
+        )
+
+
+def with_readings(planes: Array, shares: Array, limits: Limits) -> Design:
+    """Return the design with the longest strokes, and the readings shared out in whole numbers."""
+    strokes = longest_strokes(plane_normals(planes), limits)
+    fractions = (shares[:, None] * shares_of_strokes(strokes, limits)[0]).ravel()
+    spare = limits.readings - LEAST_READINGS * fractions.size
+    wanted = np.maximum(fractions * limits.readings - LEAST_READINGS, 0.0)
+    wanted *= spare / max(wanted.sum(), np.finfo(float).tiny)
+    counts = np.floor(wanted).astype(np.int64)
+    counts[np.argsort(counts - wanted, kind="stable")[: spare - counts.sum()]] += 1
+    return Design(planes, strokes, (counts + LEAST_READINGS).reshape(-1, 3))
+
+
+def equal_strokes(planes: Array, limits: Limits) -> Design:
+    """Return planes with strokes of one length and as many readings in each: as one does without a plan."""
+    planes = np.asarray(planes, np.float64).reshape(-1, 2)
+    check_numbers(len(planes), limits)
+    length = longest_strokes(plane_normals(planes), limits).min()
+    strokes = np.full((len(planes), 3), length)
+    counts = np.full(strokes.size, limits.readings // strokes.size)
+    counts[: limits.readings - counts.sum()] += 1
+    return Design(planes, strokes, counts.reshape(-1, 3))

@@ -1,0 +1,298 @@
+"""What to expect before anything is measured: of the set-up in the settings, of the paper's, and of the best one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import map_coordinates
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.datasets.units import format_quantity
+from errormotion.errors import MethodError
+from errormotion.kinematics.beams import across, beam_errors, error_jacobian, tilt
+from errormotion.methods.beam_direction.identification.direction import bound
+from errormotion.methods.beam_direction.identification.propagation import Propagated, expected_beam
+from errormotion.methods.beam_direction.identification.slopes import gradient_covariance
+from errormotion.methods.beam_direction.planning import design
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from errormotion.methods.beam_direction.planning.design import Design, Limits
+    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.plugins import Method
+
+    Array = Array
+
+PAPER = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
+"""Two faces turned by 90 deg, the widest of the pairs in table 1 of Lu et al.; the inclination is not printed there."""
+_TABLE_STEP = np.radians(1.0)
+_UNCOMPENSATED = 0.03
+"""Slope of an inclination error that is not compensated."""
+_ADDED = 1.05
+SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
+
+
+def plan(method: Method, settings: Settings) -> xr.Dataset:
+    """Return an error dataset of zeros with the covariance to expect of the set-up that the settings name.
+
+    What it holds beside, over ``setup``: the expected uncertainty of the worse angle of the beam, ``angle_uncertainty``
+    (rad), and what the readings alone make of it, ``readings_uncertainty``: of the published set-up (two faces turned
+    by 90 deg with strokes of one length), of that of the settings, and of the best that there is with two planes and
+    with as many as the settings name, all with as many readings in all. The last one is ``best_inclination``,
+    ``best_rotation`` (rad), ``best_stroke`` (m) and ``best_readings``; its ``gain`` is the factor over the published
+    set-up. ``notes`` say all of it in words.
+
+    Parameters
+    ----------
+    method : Method
+    settings : Settings
+
+    Raises
+    ------
+    MethodError
+        Planes that leave the direction open; settings within which there is no set-up.
+    """
+    left = _left(settings)
+    slope_uncertainty = left.table(settings.layout.max_inclination) if left is not None else None
+    limits = design.limits_of(settings, slope_uncertainty=slope_uncertainty)
+    number = len(settings.planes)
+    own = as_set(settings, limits)
+    pair = design.optimise(limits, np.array(PAPER))
+    best = pair if number == 2 else design.optimise(limits, _angles(settings))
+    setups = (design.equal_strokes(np.array(PAPER), limits), own, pair, best)
+    expected = [expected_direction(setup, settings, limits, left) for setup in setups]
+    totals = [readings + sources.T @ sources for readings, sources in expected]
+    angles = np.array([_worse(total, limits) for total in totals])
+    alone = np.array([_worse(readings, limits) for readings, _ in expected])
+    gain = float(angles[0] / angles[3])
+    beam, u = expected_with_origin(own, settings, limits, left), limits.beam[None]
+    known = np.isfinite(beam.covariance[0, 0])
+    origin = np.array([settings.layout.nominal_origin if known else (np.nan,) * 3], np.float64)
+    total = beam.covariance + beam.influence.T @ beam.influence
+    errors, covariance = beam_errors(origin, u, origin, u, total[None])
+    influence = (np.nan_to_num(beam.influence) @ error_jacobian(u, u)[0].T)[:, None]
+    plane = ("best_plane",)
+    ds = build_errors(
+        errors,
+        covariance,
+        dims=("beam",),
+        coords={"beam": [settings.beam], "setup": list(SETUPS), "direction": list("xyz")},
+        component="beam",
+        machine="plan",
+        frame="machine",
+        functional_point=np.array(settings.layout.nominal_origin or (0.0, 0.0, 0.0)),
+        reference="planned, not measured",
+        method=method.info.id,
+        method_version=method.info.version,
+        provenance=provenance.make(settings, None, None, steps=["plan"])
+        | ({"calibration": left.calibration.told()} if left is not None else {}),
+        influence=influence,
+        sources=["scale", "triangulation plane", *(f"inclination calibration {i + 1}" for i in range(number))],
+        source_groups=["sensor", "triangulation plane", *["inclination calibration"] * number],
+        extras={
+            "angle_uncertainty": xr.DataArray(angles, dims="setup", attrs={"units": "rad"}),
+            "readings_uncertainty": xr.DataArray(alone, dims="setup", attrs={"units": "rad"}),
+            "gain": xr.DataArray(gain, attrs={"units": "1"}),
+            "best_inclination": xr.DataArray(best.planes[:, 0], dims=plane, attrs={"units": "rad"}),
+            "best_rotation": xr.DataArray(best.planes[:, 1], dims=plane, attrs={"units": "rad"}),
+            "best_stroke": xr.DataArray(best.strokes, dims=(*plane, "direction"), attrs={"units": "m"}),
+            "best_readings": xr.DataArray(best.readings, dims=(*plane, "direction")),
+        },
+    )
+    return ds.assign_attrs(notes=_notes(setups, angles, alone, limits, left))
+
+
+def as_set(settings: Settings, limits: Limits) -> Design:
+    """Return the set-up that the settings name; places of a path count by their spread."""
+    p, planes = settings.layout, _angles(settings)
+    design.check_numbers(len(planes), limits)
+    counts = np.full(3, p.readings // 3)
+    counts[: p.readings % 3] += 1
+    strokes = (
+        design.longest_strokes(design.plane_normals(planes), limits)
+        if p.strokes == "longest"
+        else np.tile(np.array(p.strokes, np.float64), (len(planes), 1))
+    )
+    path = np.array(p.path, np.float64) if p.path else None
+    return design.Design(planes, strokes, np.tile(counts, (len(planes), 1)), path)
+
+
+def expected_direction(setup: Design, settings: Settings, limits: Limits, left: Left | None) -> tuple[Array, Array]:
+    """Return the bound (3, 3) of the direction by its readings, and what single sources add to it (source, 3).
+
+    The sources are the sensor's scale and its triangulation plane, common to all planes, and what the calibration
+    leaves of the inclination error at each plane, much where it does not speak for that plane.
+    """
+    p, u, stages = settings.layout, limits.beam, setup.stages()
+    noise = p.noise / np.sqrt(p.average)
+    readings = bound(stages, setup.normals, u, noise, p.speckle, p.speckle_length)
+    t = design.tilts(setup.normals, u)
+    variance = [u @ gradient_covariance(stage, noise, p.speckle, p.speckle_length) @ u for stage in stages]
+    # How the direction follows the conditions of the planes, weighted as the method weights them: by the noise alone.
+    follow = readings @ across(u).T @ (t / np.array(variance)[:, None]).T
+    return readings, slopes_by_source(t, limits, left) @ follow.T
+
+
+def slopes_by_source(t: Array, limits: Limits, left: Left | None) -> Array:
+    """Return what one standard uncertainty of each source adds to the slopes at tilts (k, 2): (source, k)."""
+    own, common = left.at(t) if left is not None else np.zeros((2, len(t)))
+    return np.concatenate([np.full((1, len(t)), limits.scale_uncertainty), common[None], np.diag(own)])
+
+
+def expected_with_origin(setup: Design, settings: Settings, limits: Limits, left: Left | None) -> Propagated:
+    """Return what to expect of direction and zero point; NaN for the latter where drawing or pivot is not stated."""
+    p, u, points = settings.layout, limits.beam, None
+    stages, origin = setup.stages(), None
+    if p.nominal_origin is not None and p.pivot is not None:
+        origin, points = np.array(p.nominal_origin), np.tile(np.array(p.pivot), (len(stages), 1))
+        middle = points[0] - origin - sum(p.reading_range) / 2 * u
+        stages = [middle + stage for stage in stages]
+    return expected_beam(
+        stages,
+        setup.normals,
+        u,
+        p.noise / np.sqrt(p.average),
+        p.speckle,
+        p.speckle_length,
+        origin=origin,
+        points=points,
+        point_uncertainty=p.pivot_uncertainty,
+        slope_by_source=slopes_by_source(design.tilts(setup.normals, u), limits, left),
+    )
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a calibration leaves of the inclination error.
+
+    Attributes
+    ----------
+    calibration : InclinationCalibration
+    beam, triangulation_normal : ndarray (3,)
+        As drawn, unit vectors.
+    normal_uncertainty : float
+        Standard uncertainty of the triangulation plane's angle about the beam, rad.
+    extrapolate : bool
+        Whether tilts count that the calibration does not speak for.
+    """
+
+    calibration: InclinationCalibration
+    beam: Array
+    triangulation_normal: Array
+    normal_uncertainty: float
+    extrapolate: bool
+
+    def at(self, t: Array) -> tuple[Array, Array]:
+        """Return what is left of the slope at tilts (k, 2), (k,) each: by the calibration, by the triangulation plane.
+
+        The latter is common to all planes. Where the calibration does not speak for a tilt, what is left is large.
+        """
+        q = self._tilt(t)
+        c, s = np.cos(self.normal_uncertainty), np.sin(self.normal_uncertainty)
+        one_way, other_way = (self.calibration.slope(q @ np.array([[c, sine], [-sine, c]]))[0] for sine in (s, -s))
+        return self.calibration.slope(q)[1], np.asarray(one_way - other_way) / 2
+
+    def speaks(self, t: Array) -> NDArray[np.bool_]:
+        """Return whether a measurement at tilts (k, 2) is compensated and not refused, (k,)."""
+        return np.asarray(self.extrapolate | self.calibration.supported(self._tilt(t)))
+
+    def _tilt(self, t: Array) -> Array:
+        normals = t @ across(self.beam) - self.beam
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return tilt(self.beam, self.triangulation_normal, normals)
+
+    def table(self, max_inclination: float) -> Callable[[Array], Array]:
+        """Return the uncertainty as a function of tilts (k, 2), from a table: a search asks for it often.
+
+        Beyond what the calibration speaks for it is as if nothing were compensated.
+        """
+        steep = np.linspace(0.0, max_inclination, max(2, round(max_inclination / _TABLE_STEP) + 1))
+        azimuth = np.linspace(-np.pi, np.pi, round(2 * np.pi / _TABLE_STEP) + 1)
+        A, B = np.meshgrid(steep, azimuth, indexing="ij")
+        t = np.stack([np.tan(A) * np.cos(B), np.tan(A) * np.sin(B)], axis=-1).reshape(-1, 2)
+        values = np.where(self.speaks(t), np.hypot(*self.at(t)), _UNCOMPENSATED).reshape(A.shape)
+        per_step = np.array([(n - 1) / (x[-1] - x[0]) for x, n in ((steep, steep.size), (azimuth, azimuth.size))])
+
+        def look_up(t: Array) -> Array:
+            at = np.stack([np.arctan(np.hypot(t[:, 0], t[:, 1])), np.arctan2(t[:, 1], t[:, 0]) + np.pi])
+            return np.asarray(map_coordinates(values, at * per_step[:, None], order=1, mode="nearest"))
+
+        return look_up
+
+
+def _left(settings: Settings) -> Left | None:
+    """Return what the calibration named in the settings leaves; None where they name none."""
+    if settings.compensation is None:
+        return None
+    p = settings.layout
+    if p.triangulation_normal is None:
+        raise MethodError(
+            "A plan with a calibration of the inclination error needs layout.triangulation_normal: the normal of the "
+            "plane of emitted and received beam."
+        )
+    u, t = np.array(p.nominal_direction, np.float64), np.array(p.triangulation_normal, np.float64)
+    calibration = InclinationCalibration.find(settings.compensation)
+    return Left(
+        calibration,
+        u / np.linalg.norm(u),
+        t / np.linalg.norm(t),
+        settings.triangulation_normal_uncertainty,
+        settings.extrapolate,
+    )
+
+
+def _angles(settings: Settings) -> Array:
+    return np.array([(face.inclination, face.rotation) for face in settings.planes])
+
+
+def _worse(covariance: Array, limits: Limits) -> float:
+    basis = across(limits.beam)
+    return design.worst_angle(basis @ covariance @ basis.T)
+
+
+def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limits, left: Left | None) -> list[str]:
+    paper, own, pair, best = (format_quantity(float(angle), "arcsec", 3) for angle in angles)
+    total = limits.readings
+    tilts = [design.tilts(setup.normals, limits.beam) for setup in setups[:2]]
+    refused = [np.flatnonzero(~left.speaks(t)) + 1 if left is not None else np.zeros(0, int) for t in tilts]
+    notes = [
+        f"With {total} readings in all the worse of the beam's two angles has a standard uncertainty of {own} as set, "
+        f"and of {paper} with the published two planes at 20 deg, turned by 90 deg, strokes of one length"
+        + (", which this calibration does not speak for." if refused[0].size else "."),
+        f"The best two planes: {pair}, {angles[0] / angles[2]:.3g} times better than the published ones.",
+    ]
+    if setups[3] is not setups[2]:
+        notes.append(f"The best {len(setups[3].planes)} planes: {best}, {angles[0] / angles[3]:.3g} times better.")
+    if np.max(angles / alone) > _ADDED:
+        notes.append(
+            "The noise of the readings alone makes "
+            + ", ".join(
+                f"{format_quantity(float(angle), 'arcsec', 3)} ({name})"
+                for name, angle in dict(zip(SETUPS, alone, strict=True)).items()
+            )
+            + "; the rest is the sensor's scale and what is left of its inclination error."
+        )
+    for name, dumb in zip(("the published set-up", "the set-up as set"), refused, strict=True):
+        if dumb.size:
+            notes.append(
+                f"The calibration does not speak for plane {' and '.join(map(str, dumb))} of {name}: the "
+                "figures take what it says there all the same, and its uncertainty; a measurement would be refused."
+            )
+    for i, (face, strokes, counts) in enumerate(
+        zip(setups[3].planes, setups[3].strokes, setups[3].readings, strict=True)
+    ):
+        ways = ", ".join(
+            f"{n} readings over {length * 1e3:.1f} mm of {axis}"
+            for axis, length, n in zip("XYZ", strokes, counts, strict=True)
+        )
+        a, b = np.degrees(face)
+        notes.append(f"Best plane {i + 1}: inclination {a:.1f} deg, rotation {b:.1f} deg; {ways}.")
+    return notes

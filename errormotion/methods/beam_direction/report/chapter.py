@@ -1,0 +1,333 @@
+"""The chapter of one beam's direction from planes: beam against nominal, planes, inclination error, check bar."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+
+from errormotion.methods.beam_direction.report import check_bar as beam_direction_bar
+from errormotion.methods.beam_direction.report import drawings as beam_direction_figures
+from errormotion.methods.beam_direction.report import planes as beam_direction_planes
+from errormotion.methods.beam_direction.report import surface as beam_direction_surface
+from errormotion.methods.beam_direction.report.view import STROKES, Found, found, is_direction
+from errormotion.methods.crossbeam_scan.report.view import remarks, unit_of
+from errormotion.report import budget, provenance, quality
+from errormotion.report.beams import angle_between
+from errormotion.report.budget import FREEDOMS
+from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
+from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
+
+__all__ = ["is_direction", "part"]
+
+_UNKNOWN = "the direction was not determined"
+_NO_ORIGIN = "no plane has a known point, and without one the place of the beam is not determined"
+_NO_NOMINAL = "no nominal is known"
+_ABOUT_ITSELF = "the turn of a beam about itself is not seen"
+_INDEPENDENT = "noise of the readings"
+_UNITS = (("arcsec", ARCSEC), ("mrad", 1e-3), ("°", math.pi / 180))
+
+
+def part(source: Source, key: str) -> Part:
+    """Return the chapter of one beam; ``key`` keeps its figures' identifiers apart."""
+    beam = found(source.errors, source.raw)
+    calibration, why = beam_direction_surface.calibration_of(source, beam.planes)
+    bar = beam_direction_bar.bar_of(source)
+    sections = [
+        Section("direction", "Direction and origin", _direction(beam, source.errors, key)),
+        Section("planes", "Planes and residuals", beam_direction_planes.blocks(beam.planes, f"{key}-residual")),
+        Section("compensation", "Compensation of the inclination error", _compensation(beam, source.errors, key)),
+        Section(
+            "surface",
+            "Inclination error of the sensor",
+            beam_direction_surface.blocks(beam, calibration, why, f"{key}-surface"),
+        ),
+    ]
+    if bar is not None:
+        sections.append(Section("bar", "Check bar", beam_direction_bar.blocks(bar, f"{key}-bar")))
+    sections += [
+        Section("uncertainty", "Uncertainty", _uncertainty(source.errors, beam)),
+        Section("quality", "Data quality", _quality(source)),
+        Section("provenance", "Provenance", provenance.blocks(source)),
+    ]
+    return Part(
+        f"Direction of the beam '{beam.name}'",
+        _key_figures(beam, bar),
+        _summary(beam, source.errors, bar),
+        sections,
+    )
+
+
+def _worst(beam: Found) -> float:
+    """Return the standard uncertainty of the direction across the beam, in the worst direction, rad."""
+    C = beam.covariance[3:, 3:]
+    return float(np.sqrt(np.linalg.eigvalsh(C)[-1].clip(0))) if np.isfinite(C).all() else math.nan
+
+
+def _to_nominal(beam: Found) -> tuple[float, float]:
+    """Return the angle to nominal and its standard uncertainty, rad; NaN where either is unknown."""
+    if not (beam.known and np.isfinite(beam.nominal).all()):
+        return math.nan, math.nan
+    return angle_between(beam.direction, beam.nominal, beam.covariance[3:, 3:])
+
+
+def _shift(beam: Found) -> float:
+    return float(np.linalg.norm(beam.origin - beam.nominal_origin))
+
+
+def _key_figures(beam: Found, bar: beam_direction_bar.Bar | None) -> list[KeyFigure]:
+    figures = []
+    angle, sigma = _to_nominal(beam)
+    if math.isfinite(angle):
+        value = estimate(angle / ARCSEC, 2 * sigma / ARCSEC, signed=False)
+        figures.append(KeyFigure("angle to nominal", value, "arcsec", f"{fixed(1e3 * angle, 3)} mrad"))
+    if math.isfinite(_worst(beam)):
+        value = Cell(significant(2 * _worst(beam) / ARCSEC))
+        figures.append(KeyFigure("direction known to", value, "arcsec", "U, k = 2, worst direction"))
+    if math.isfinite(_shift(beam)):
+        figures.append(KeyFigure("zero point", Cell(fixed(1e6 * _shift(beam), 0)), "µm", "from nominal"))
+    if beam.known and beam.compensated:
+        turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
+        note = "by the inclination error, if it is not compensated"
+        figures.append(KeyFigure("turned", Cell(fixed(turned / ARCSEC, 0)), "arcsec", note))
+    if bar is not None and math.isfinite(bar.rms):
+        out = int(bar.left_out.sum())
+        note = f"rms; {integer(out)} {'point' if out == 1 else 'points'} left out"
+        figures.append(KeyFigure("check bar residual", Cell(fixed(1e6 * bar.rms, 2)), "µm", note))
+    return figures
+
+
+def _summary(beam: Found, errors: xr.Dataset, bar: beam_direction_bar.Bar | None) -> list[str]:
+    planes = beam.planes
+    words = []
+    if len(planes):
+        used, out = int((planes.given & ~planes.left_out).sum()), int(planes.left_out.sum())
+        left = f"; {integer(out)} left out" if out else ""
+        count = f"{integer(len(planes))} planes" if len(planes) != 1 else "one plane"
+        words.append(f"The direction comes from {integer(used)} readings on {count}{left}.")
+    angle, sigma = _to_nominal(beam)
+    if not beam.known:
+        words.append("The direction could not be determined.")
+    elif not math.isfinite(angle):
+        words.append("The direction is known; no nominal direction to compare it with.")
+    else:
+        value, expanded = rounded(angle / ARCSEC, 2 * sigma / ARCSEC, signed=False)
+        within = f" ± {expanded}" if expanded != DASH else ""
+        words.append(
+            f"The beam is {value}{within} arcsec off nominal: 10 mm along it that is {fixed(1e4 * angle, 1)} µm."
+        )
+    if beam.known and math.isfinite(_shift(beam)):
+        words.append(f"Its zero point is {fixed(1e6 * _shift(beam), 0)} µm from nominal.")
+    elif beam.known and not np.isfinite(beam.origin).all():
+        words.append(f"The zero point is unknown: {_NO_ORIGIN}.")
+    words += _inclination_in_words(beam)
+    off = beam_direction_planes.far_off(planes) if np.isfinite(planes.closure).sum() > 2 else []
+    if off:
+        words.append(
+            f"The planes contradict one another: {listed([f'plane {name}' for name, _ in off])} "
+            f"{'do' if len(off) > 1 else 'does'} not close."
+        )
+    if bar is not None and math.isfinite(bar.radius):
+        known = f" (known: {fixed(1e3 * bar.given, 4)} mm)" if math.isfinite(bar.given) else ""
+        words.append(f"The check bar came out with a radius of {fixed(1e3 * bar.radius, 4)} mm{known}.")
+    unseen = [name for name in FREEDOMS if not np.isfinite(errors[name].values).any()]
+    if beam.known and unseen:
+        words.append(f"Not determined: {listed(unseen)}. Reported as unknown, not as zero.")
+    return words
+
+
+def _inclination_in_words(beam: Found) -> list[str]:
+    taken = np.abs(beam.planes.compensation)
+    if beam.known and beam.compensated:
+        turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
+        return [
+            f"Up to {fixed(1e6 * finite(np.max, taken), 1)} µm of inclination error were taken off the readings; "
+            f"without that the direction would be {fixed(turned / ARCSEC, 0)} arcsec off."
+        ]
+    tilted = beam.planes.inclination[np.isfinite(beam.planes.inclination)]
+    if beam.known and tilted.size and not np.nan_to_num(taken).any():
+        return [
+            "The readings were not compensated for the tilt of the planes (up to "
+            f"{fixed(np.rad2deg(tilted.max()), 0)}°); an inclination error of the sensor is in the direction and in no "
+            "uncertainty."
+        ]
+    return []
+
+
+def _direction(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
+    if not beam.known:
+        return [Text("The direction could not be determined.", "warning")]
+    drawn = [
+        beam_direction_figures.space(beam, f"{key}-space"),
+        beam_direction_figures.lines(beam, f"{key}-lines"),
+    ]
+    return [*(figure for figure in drawn if figure is not None), _angles(beam, errors), _vectors(beam), _origins(beam)]
+
+
+def _angles(beam: Found, errors: xr.Dataset) -> Table:
+    angle, sigma = _to_nominal(beam)
+    rows = [["to nominal", *_in_units(angle, sigma, _NO_NOMINAL, signed=False)]]
+    for i, name in enumerate(FREEDOMS[3:]):
+        value = float(errors[name].values[0])
+        variance = float(errors["covariance"].isel(beam=0, dof=3 + i, dof_=3 + i))
+        deviation = math.sqrt(variance) if variance >= 0 else math.nan
+        reason = _ABOUT_ITSELF if np.abs(beam.nominal[i]) > 0.99 else _UNKNOWN
+        rows.append([f"{name}, about {STROKES[i]}", *_in_units(value, deviation, reason)])
+    return Table(
+        "Angles from the nominal to the measured direction: the smallest rotation that takes one to the other, and its "
+        "parts about the machine's axes. After ±: expanded uncertainty, k = 2.",
+        ["angle", *(f"/ {unit}" for unit, _ in _UNITS)],
+        rows,
+    )
+
+
+def _in_units(value: float, sigma: float, reason: str, *, signed: bool = True) -> list[Cell | str]:
+    return [estimate(value / size, 2 * sigma / size, reason=reason, signed=signed) for _, size in _UNITS]
+
+
+def _vectors(beam: Found) -> Table:
+    variance = np.diag(beam.covariance[3:, 3:])
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    rows: list[list[Cell | str]] = []
+    for i, name in enumerate(STROKES):
+        sine = math.sqrt(max(1 - beam.direction[i] ** 2, 0.0))
+        # Near an axis the angle to it has no linear part; the worst direction stands for it.
+        spread = sigma[i] / sine if sine > 1e-2 else _worst(beam)
+        inclined = math.acos(float(np.clip(beam.direction[i], -1, 1)))
+        row: list[Cell | str] = [
+            f"u_{name.lower()}",
+            estimate(beam.direction[i], 2 * sigma[i], digits=7),
+            or_dash(fixed(beam.nominal[i], 7, signed=True), _NO_NOMINAL),
+        ]
+        if beam.compensated:
+            row.append(fixed(beam.uncompensated[i], 7, signed=True))
+        rows.append([*row, estimate(math.degrees(inclined), math.degrees(2 * spread), signed=False, digits=6)])
+    before = ["without compensation"] if beam.compensated else []
+    return Table(
+        "Direction as a unit vector, from the sensor to the target, and its angle to each machine axis. After ±: "
+        "expanded uncertainty, k = 2; the three components are not independent.",
+        ["", "measured", "nominal", *before, "angle to the axis / °"],
+        rows,
+    )
+
+
+def _origins(beam: Found) -> Block:
+    if not np.isfinite(beam.origin).any():
+        return Text(f"The zero point of the beam is unknown: {_NO_ORIGIN}.")
+    variance = np.diag(beam.covariance[:3, :3])
+    expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan))
+    apart = beam.origin - beam.nominal_origin
+    rows: list[list[Cell | str]] = [
+        [
+            name.lower(),
+            estimate(1e3 * beam.origin[i], 1e3 * expanded[i], reason=_NO_ORIGIN),
+            or_dash(fixed(1e3 * beam.nominal_origin[i], 3, signed=True), _NO_NOMINAL),
+            estimate(1e6 * apart[i], 1e6 * expanded[i], reason=_NO_NOMINAL),
+        ]
+        for i, name in enumerate(STROKES)
+    ]
+    return Table(
+        "Zero point: where the beam is when the reading is 0 and the stage stands at its zero. After ±: expanded "
+        "uncertainty, k = 2.",
+        ["", "measured / mm", "nominal / mm", "difference / µm"],
+        rows,
+    )
+
+
+def _compensation(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
+    taken = beam_direction_planes.compensation(beam.planes, f"{key}-compensation")
+    if not (beam.compensated and beam.known):
+        if taken:
+            return taken
+        return [
+            Text(
+                "Nothing was taken off the readings. A triangulating sensor reads wrong on an inclined surface, in "
+                "proportion to depth; on a plane that is a wrong gradient, and so a wrong direction.",
+                "note",
+            )
+        ]
+    rows: list[list[Cell | str]] = []
+    for what, direction in (("without compensation", beam.uncompensated), ("compensated", beam.direction)):
+        to_nominal = beam_direction_figures.angle_between(direction, beam.nominal)
+        off = beam_direction_figures.angle_between(direction, beam.direction)
+        rows.append(
+            [
+                what,
+                *(fixed(value, 6, signed=True) for value in direction),
+                or_dash(fixed(to_nominal / ARCSEC, 1), _NO_NOMINAL),
+                fixed(off / ARCSEC, 1),
+                fixed(math.degrees(off), 4),
+            ]
+        )
+    table = Table(
+        "Direction before and after compensation.",
+        ["", "u_x", "u_y", "u_z", "to nominal / arcsec", "to the result / arcsec", "/ °"],
+        rows,
+        [("", 1), ("direction", 3), ("angle", 3)],
+    )
+    return [table, *_rounds(errors), *taken]
+
+
+def _rounds(errors: xr.Dataset) -> list[Block]:
+    rounds = float(errors["iterations"].values.ravel()[0]) if "iterations" in errors else math.nan
+    if not math.isfinite(rounds) or rounds < 1:
+        return []
+    count = f"{integer(rounds)} rounds" if rounds > 1 else "one round"
+    return [
+        Text(
+            "The compensation needs the tilt of each plane to the beam, and the beam needs compensated readings: "
+            f"{count} of one after the other."
+        )
+    ]
+
+
+def _uncertainty(errors: xr.Dataset, beam: Found) -> list[Block]:
+    here = errors.isel(beam=0)
+    point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(errors.attrs["functional_point"]))
+    blocks: list[Block] = []
+    if "influence" in errors and beam.known:
+        made = budget.table(here, f"of the beam '{beam.name}'")
+        rest = budget.readable("independent")
+        rows = [[_INDEPENDENT if row[0] == rest else row[0], *row[1:]] for row in made.rows]
+        blocks.append(replace(made, rows=rows))
+    else:
+        blocks.append(_freedoms(here))
+    blocks.append(
+        Text(
+            f"The error motions are those of the beam against nominal, about the zero point ({point}) mm in the frame "
+            f"'{errors.attrs.get('frame', 'not stated')}'. The uncertainty covers noise of the readings and the "
+            "sources that it names; how straight and square the stage is and how flat the planes are is not in it.",
+            "note",
+        )
+    )
+    return blocks
+
+
+def _freedoms(here: xr.Dataset) -> Table:
+    rows: list[list[Cell | str]] = []
+    for i, name in enumerate(FREEDOMS):
+        unit, size = unit_of(i)
+        variance = float(here["covariance"].isel(dof=i, dof_=i))
+        sigma = math.sqrt(variance) if variance >= 0 else math.nan
+        reason = _NO_ORIGIN if i < 3 else _ABOUT_ITSELF
+        rows.append([name, unit, estimate(float(here[name]) / size, 2 * sigma / size, reason=reason)])
+    return Table(
+        "The beam's errors against nominal. After ±: expanded uncertainty, k = 2.", ["freedom", "unit", "value"], rows
+    )
+
+
+def _quality(source: Source) -> list[Block]:
+    errors = source.errors
+    blocks: list[Block] = [Text(note, "warning") for note in remarks(errors)]
+    if "noise" in errors and np.isfinite(errors["noise"].values).any():
+        noise = float(errors["noise"].values.ravel()[0])
+        blocks.append(
+            Text(f"Noise of one reading about its plane: {significant(1e6 * noise)} µm, one standard deviation.")
+        )
+    counted = quality.counts(errors, source.raw)
+    if counted:
+        words = ", ".join(f"{name} {number}" for name, number in counted.items())
+        blocks.append(Text(f"Counted while measuring: {words}."))
+    return blocks or [Text("The result holds no remarks on the data.", "note")]

@@ -1,0 +1,153 @@
+"""Lines of a profiler while the axis passes: with their places and times, until the pass is over or breaks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.crossbeam_scan.acquisition.moving import Mover
+    from errormotion.methods.crossbeam_scan.acquisition.programs import Program
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+    Array = Array
+
+BLOCK_LINES = 64
+"""Most lines that are asked for at once."""
+OVERFLOW = 2.0**32
+"""Counts after which an encoder begins anew."""
+
+
+class BrokenPassError(InstrumentError):
+    """The stream broke in a pass; what came before it has been handed over."""
+
+    def __init__(self, reason: str, position: float) -> None:
+        self.reason, self.position = reason, position
+        super().__init__(reason)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of one pass.
+
+    Attributes
+    ----------
+    heights : ndarray, float32, (line, point)
+        m.
+    encoder, position, time : ndarray, (line,)
+        Count and place (m) of the axis, NaN where the line was lost; when it was taken, s by the mover's clock.
+    x : ndarray, (point,)
+        m.
+    dropped : int
+        Lines lost on the way.
+    invalid : mapping of str to int
+        Why points have no value, counted.
+    """
+
+    heights: NDArray[np.float32]
+    encoder: Array
+    position: Array
+    time: Array
+    x: Array
+    dropped: int
+    invalid: Mapping[str, int]
+
+    def within(self, low: Array, high: Array) -> Lines:
+        """Return the lines between places (m, one or several pairs); a lost one stays where its neighbour does."""
+        place = filled(self.position)[:, None]
+        kept = ((place >= low) & (place <= high)).any(axis=1)
+        if kept.all():
+            return self
+        part: dict[str, Any] = {name: getattr(self, name)[kept] for name in ("heights", "encoder", "position", "time")}
+        if not kept.any():
+            part |= {"dropped": 0, "invalid": {}}
+        return replace(self, **part)
+
+
+def listen(
+    profiler: Any, mover: Mover, program: Program, settings: Settings, low: float, high: float
+) -> Generator[Lines]:
+    """Have a pass made and yield its lines until the axis is past its last scan.
+
+    Parameters
+    ----------
+    profiler : instrument of kind ``line_profiler``
+    mover : Mover
+    program : Program
+        The pass.
+    settings : Settings
+    low, high : float
+        From where to where the axis goes with the measuring feed, m; behind the last scan there is ``margin``.
+
+    Raises
+    ------
+    BrokenPassError
+        The stream fell silent in the pass, or did not begin; the profiler failed.
+    """
+    size = max(1, min(BLOCK_LINES, int(settings.margin / settings.line_pitch / 2)))
+    middle = ((low + high) / 2 - settings.encoder_zero) / settings.encoder_pitch
+    passing, last = False, math.nan
+    mover.begin(program, listening=True)
+    while True:
+        try:
+            with closing(profiler.stream(block=size)) as stream:
+                for block in stream:
+                    lines = _located(block, middle, mover.now(), settings)
+                    reached = np.nanmax(lines.position, initial=-np.inf)
+                    # Lines on the way to the start are none of the pass: the axis rests there.
+                    passing = passing or bool(
+                        np.any((lines.position > low + settings.margin / 4) & (lines.position < high))
+                    )
+                    last = reached if math.isfinite(reached) else last
+                    yield lines
+                    if passing and last >= high - settings.margin:
+                        return
+            raise BrokenPassError("the profiler's stream has ended", last)
+        except InstrumentTimeoutError as error:
+            if passing or not mover.may_still_come():
+                raise BrokenPassError(str(error), last) from error
+        except BrokenPassError:
+            raise
+        except InstrumentError as error:
+            raise BrokenPassError(str(error), last) from error
+
+
+def _located(block: Any, middle: float, now: float, settings: Settings) -> Lines:
+    encoder = folded(block.encoder, middle)
+    position = settings.encoder_zero + settings.encoder_pitch * encoder
+    place = filled(position)
+    ago = np.abs(place[-1] - place) / settings.measuring_feed
+    return Lines(
+        heights=block.heights.astype(np.float32),
+        encoder=encoder,
+        position=position,
+        time=now - np.where(np.isfinite(ago), ago, 0.0),
+        x=np.asarray(block.x, dtype=float),
+        dropped=int(block.dropped),
+        invalid=block.invalid,
+    )
+
+
+def folded(counts: Array, middle: float) -> Array:
+    """Return encoder counts with whole overflows taken off, so that they lie nearest to the middle of the axis."""
+    counts = np.asarray(counts, dtype=float)
+    return np.asarray(counts - OVERFLOW * np.rint((counts - middle) / OVERFLOW))
+
+
+def filled(values: Array) -> Array:
+    """Return values with each NaN replaced between its neighbours, or by the next known one at an end."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
+        return values
+    index = np.arange(values.size)
+    return np.interp(index, index[known], values[known])

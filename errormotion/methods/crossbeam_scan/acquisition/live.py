@@ -1,0 +1,159 @@
+"""A campaign while it is being measured: which pass and artefact, and how the last scan lies on its cold one."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_errors
+from errormotion.methods.crossbeam_scan.identification.cutting import Scan, Scans
+from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, prepare, register
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+log = logging.getLogger(__name__)
+
+LONGEST_QUEUE = 2
+"""So many scans may wait before a warm one is passed over."""
+_ARCSEC = np.degrees(1.0) * 3600.0
+
+
+class LiveScans:
+    """Follow a record of scans; hold the scan that is being made, and every artefact's cold one reduced to blocks.
+
+    A view for the person at the machine: rigid registration, no strain, no consistency. What counts is identified from
+    the whole record afterwards. Whole scans are registered one after the other in a thread that ends when there is none
+    left; a warm scan that would have to wait behind others is passed over, so that the measurement never waits.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._cold: dict[int, BlockMap] = {}
+        self._parts: list[xr.Dataset] = []
+        self._at = (-1, -1)
+        self._waiting: deque[_Job] = deque()
+        self._queued: set[int] = set()  # artefacts whose cold scan is known, or waits
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._found = ""
+
+    def update(self, chunk: xr.Dataset) -> str:
+        """Take in a chunk of the raw dataset; return in a line of text how far things are."""
+        if "record" not in chunk:
+            return f"pocket, scan at a lift of {float(chunk['stage'].values[-1, 0, 2]) * 1e3:g} mm"
+        position = chunk["position"].values
+        place = float(chunk["encoder_zero"]) + float(chunk["encoder_pitch"]) * chunk["encoder"].values
+        cycle = chunk["cycle_of_line"].values
+        known = np.flatnonzero(np.isfinite(place))
+        if not known.size:
+            return self.text(chunk.sizes["cycle"], position.size)
+        artefact = np.abs(place[known, None] - position).argmin(axis=1)
+        keys = np.stack([cycle[known], artefact], axis=1)
+        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1), axis=1))
+        for low, high in zip(starts, [*starts[1:], known.size], strict=True):
+            self._take(chunk.isel(line=known[low:high]), (int(keys[low, 0]), int(keys[low, 1])))
+        self._whole(place[known])
+        return self.text(chunk.sizes["cycle"], position.size)
+
+    def _take(self, part: xr.Dataset, at: tuple[int, int]) -> None:
+        if at != self._at:
+            self._submit()
+            self._at = at
+        self._parts.append(part)
+
+    def _whole(self, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+        """Begin to register as soon as the axis is past the scan."""
+        if self._at[1] < 0 or not place.size:
+            return
+        if place[-1] > self._settings.positions[self._at[1]] + self._settings.scan_length / 2:
+            self._submit()
+
+    def _submit(self) -> None:
+        """Have the scan that was collected registered, unless others wait and it is a warm one."""
+        parts, self._parts = self._parts, []
+        if not parts:
+            return
+        job = _Job(parts, *self._at)
+        with self._lock:
+            if job.artefact in self._queued and len(self._waiting) >= LONGEST_QUEUE:
+                return
+            self._queued.add(job.artefact)
+            self._waiting.append(job)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, name="live-scans", daemon=True)
+                self._thread.start()
+
+    def _work(self) -> None:
+        """Register scans until there is none left."""
+        while True:
+            with self._lock:
+                if not self._waiting:
+                    self._thread = None
+                    return
+                job = self._waiting.popleft()
+            self._register(job)
+
+    def _register(self, job: _Job) -> None:
+        where = f"pass {job.cycle + 1}, artefact {job.artefact + 1}: "
+        try:
+            height, x, y, _ = job.scan()
+            warm = prepare(height, x, y)
+            cold = self._cold.setdefault(job.artefact, warm)
+            if cold is not warm:
+                self._found = where + _text(cold, warm, job.parts[0])
+        except MethodError as error:
+            self._found = f"{where}{error}"
+        except Exception:  # whatever it is, the measurement goes on without this view
+            log.exception("%s cannot be shown while measuring", where)
+
+    def text(self, cycles: int, artefacts: int) -> str:
+        """Return where the campaign is, and what the last registration found."""
+        cycle, artefact = self._at
+        text = f"pass {cycle + 1} of {cycles}, artefact {artefact + 1} of {artefacts}" if artefact >= 0 else ""
+        return f"{text}; {self._found}" if self._found else text
+
+    def wait(self) -> None:
+        """Wait until every scan that was taken in is registered."""
+        with self._lock:
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+
+@dataclass(frozen=True)
+class _Job:
+    """The lines of one scan."""
+
+    parts: list[xr.Dataset]
+    cycle: int
+    artefact: int
+
+    def scan(self) -> Scan:
+        raw = xr.concat(
+            self.parts, dim="line", data_vars="minimal", coords="minimal", compat="override", join="override",
+            combine_attrs="drop",
+        )  # fmt: skip
+        return Scans(raw).scan(self.cycle, self.artefact)
+
+
+def _text(cold: BlockMap, warm: BlockMap, raw: xr.Dataset) -> str:
+    """Return the errors of the carriage with their standard uncertainty by the registration, in field units."""
+    found = register(cold, warm, point=np.zeros(3))
+    pose = RigidTransform.from_matrix(np.asarray(raw["profiler_pose"].values, dtype=float))
+    errors = carriage_errors(found.twist, found.covariance, pose, raw["lever"].values)
+    size = np.sqrt(np.diag(errors.covariance))
+    shown = [f"E{k} {v * 1e6:+.1f} ({u * 1e6:.2f})" for k, v, u in zip("XYZ", errors.values, size, strict=False)]
+    turns = [
+        f"E{k} {v * _ARCSEC:+.2f} ({u * _ARCSEC:.2f})"
+        for k, v, u in zip("ABC", errors.values[3:], size[3:], strict=True)
+    ]
+    return f"{' '.join(shown)} um, {' '.join(turns)} arcsec"

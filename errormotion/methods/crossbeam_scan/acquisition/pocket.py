@@ -1,0 +1,159 @@
+"""Measuring where the profiler is: a pass over a circular pocket at each of several heights of the spindle."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.errors import InstrumentError, MethodError
+from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
+from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
+from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pocket_pass
+from errormotion.methods.crossbeam_scan.acquisition.scans import PATIENCE, SCHEMA, prepare_profiler, reopen
+from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.plugins import Bench
+
+    Array = Array
+    Heights = NDArray[np.float32]
+
+log = logging.getLogger(__name__)
+
+
+def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+    """Yield scans of a pocket, one chunk along ``scan`` for each lift of the spindle.
+
+    A pass whose stream breaks, or that an interruption cut off, is made again.
+
+    Parameters
+    ----------
+    bench : Bench
+        With a ``line_profiler``; a ``controller`` where there is one, else the operator is asked.
+    settings : Settings
+    done : Dataset, optional
+        What an interrupted run holds: whole scans.
+
+    Raises
+    ------
+    MethodError
+        The scans are files, or lines come but none of them over the pocket.
+    InstrumentError
+        A pass broke three times.
+    """
+    profiler = bench.of_kind("line_profiler")
+    if hasattr(profiler, "scans"):
+        raise MethodError(
+            "The scans of a pocket are not read from files: expected a line profiler that streams. A raw dataset of "
+            "the variant 'profiler pose' can be identified as it is."
+        )
+    programs = program_texts(settings)
+    move = mover(bench)
+    static = _static(bench, settings, programs)
+    first = 0 if done is None else int(done.sizes["scan"])
+    if not move.virtual:
+        prepare_profiler(profiler)
+    for number in range(first, len(settings.pocket_lifts)):
+        program = pocket_pass(settings, number + 1)
+        y, heights, x, counts = _scan(profiler, move, program, settings)
+        stage = np.zeros((1, y.size, 3))
+        stage[0, :, 1], stage[0, :, 2] = y, settings.pocket_lifts[number]
+        found = static.assign(
+            x=("point", x, {"units": "m"}),
+            height=(("scan", "profile", "point"), heights[None], {"units": "m"}),
+            stage=(("scan", "profile", "direction"), stage, {"units": "m"}),
+        )
+        found.attrs |= counts
+        yield found
+
+
+def _static(bench: Bench, settings: Settings, programs: dict[str, str]) -> xr.Dataset:
+    m = {"units": "m"}
+    return xr.Dataset(
+        {
+            "pocket_centre": ("direction", np.zeros(3), m),
+            "pocket_radius": ((), settings.pocket_radius, m),
+            "pocket_radius_uncertainty": ((), settings.pocket_radius_uncertainty, m),
+        },
+        coords={"direction": list("xyz")},
+        attrs={
+            "schema": SCHEMA,
+            "machine": bench.machine,
+            "start": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "programs": json.dumps(programs),
+        },
+    )
+
+
+def _scan(
+    profiler: Any, move: Mover, program: Program, settings: Settings
+) -> tuple[Array, Heights, Array, dict[str, Any]]:
+    """Return y (profile,), heights (profile, point) and x (point,) of a pass, and what was lost; tries again."""
+    for attempt in range(1, PATIENCE + 1):
+        try:
+            return _cut(list(_pass(profiler, move, program, settings)), settings)
+        except BrokenPassError as error:
+            log.warning("%s: %s", program.name, error)
+            if attempt == PATIENCE:
+                raise InstrumentError(
+                    f"{program.name} broke {PATIENCE} times, at last, its last line at {error.position:g} m (nan: none "
+                    f"came): {error.reason}"
+                ) from error
+            reopen(profiler)
+    raise InstrumentError(f"{program.name} was not made")
+
+
+def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> Iterator[Lines]:
+    """Yield the lines over the pocket."""
+    low, high = program.reach()
+    reach = settings.pocket_scan_length / 2 + settings.line_pitch
+    window = np.array([settings.pocket_position - reach]), np.array([settings.pocket_position + reach])
+    with closing(listen(profiler, move, program, settings, low, high)) as listening:
+        for lines in listening:
+            part = lines.within(*window)
+            if part.encoder.size:
+                yield part
+
+
+def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array, dict[str, Any]]:
+    """Put the lines on as many even places as every scan has; a place without a line stays NaN."""
+    count = int(settings.pocket_scan_length / settings.line_pitch)
+    if not parts:
+        raise MethodError(
+            f"No line came over the pocket at {settings.pocket_position:g} m: check pocket_position, encoder_pitch "
+            f"({settings.encoder_pitch:g} m a count) and encoder_zero ({settings.encoder_zero:g} m)."
+        )
+    y = np.concatenate([part.position for part in parts]) - settings.pocket_position
+    heights = np.concatenate([part.heights for part in parts])
+    known = np.isfinite(y)
+    y, heights = y[known], heights[known]
+    pitch = settings.line_pitch
+    phase = y[0] - pitch * round(y[0] / pitch)  # of the lines that came: none is on the verge of two places
+    place = np.rint((y - phase) / pitch).astype(np.int64) + count // 2
+    inside = (place >= 0) & (place < count)
+    if np.unique(place[inside]).size < 0.9 * count:
+        raise MethodError(
+            f"Expected {count} lines {settings.line_pitch * 1e6:g} um apart over the pocket; found "
+            f"{np.unique(place[inside]).size} different ones among {y.size}. Check line_pitch against the profiler's "
+            "trigger, and encoder_pitch."
+        )
+    out: Heights = np.full((count, heights.shape[1]), np.nan, dtype=np.float32)
+    out[place[inside]] = heights[inside]
+    at: Array = (np.arange(count) - count // 2) * pitch + phase
+    at[place[inside]] = y[inside]
+    invalid: dict[str, int] = {}
+    for part in parts:
+        for reason, points in part.invalid.items():
+            invalid[reason] = invalid.get(reason, 0) + points
+    return at, out, parts[0].x, {"dropped": sum(part.dropped for part in parts), "invalid": invalid}

@@ -1,0 +1,80 @@
+"""Scans that exist already as files, brought into the form of scans as recorded: what follows is the same for both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.acquisition.schedule import Schedule
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+
+def record_files(
+    profiler: Any, settings: Settings, plan: Schedule, static: xr.Dataset, done: xr.Dataset | None
+) -> Iterator[xr.Dataset]:
+    """Yield the scans of files, one chunk along ``line`` for each.
+
+    The files follow each other cycle by cycle, artefact by artefact. The middle of an artefact's first scan is its
+    ``position``; the y of its further scans count from the same zero. All scans are as long as the first one. Their
+    times are the planned ones.
+
+    Parameters
+    ----------
+    profiler : ProfileFiles
+    settings : Settings
+    plan : Schedule
+    static : Dataset
+        See ``acquisition.static_part``.
+    done : Dataset, optional
+        What an interrupted run holds; files that are in it whole are passed over.
+
+    Raises
+    ------
+    MethodError
+        Not one file for each artefact and pass; the points on the line differ from file to file.
+    """
+    artefacts = len(settings.positions)
+    names = list(profiler.identify().details["files"])
+    if len(names) != plan.cycles * artefacts:
+        raise MethodError(
+            f"Expected {plan.cycles * artefacts} files, pass by pass and artefact by artefact: {plan.cycles} passes "
+            f"({plan.cold} cold and {plan.cycles - plan.cold} warm) over {artefacts} artefacts; found {len(names)}. "
+            "See the settings 'positions', 'warm_up' and 'cold_repeats'."
+        )
+    before = 0 if done is None else int(done.sizes["line"])
+    zero = np.zeros(artefacts)
+    length, first_x = 0.0, None
+    read = 0
+    for number, scan in enumerate(profiler.scans()):
+        cycle, artefact = divmod(number, artefacts)
+        y, heights = (scan.y, scan.heights) if scan.y[0] < scan.y[-1] else (scan.y[::-1], scan.heights[::-1])
+        if first_x is None:
+            first_x, length = scan.x, float(y[-1] - y[0]) * y.size / (y.size - 1)
+        if scan.x.shape != first_x.shape or not np.allclose(scan.x, first_x, atol=1e-7, rtol=0):
+            raise MethodError(
+                f"{scan.path} has {scan.x.size} points from {scan.x[0]:.6f} to {scan.x[-1]:.6f} m on its line; "
+                f"expected {first_x.size} from {first_x[0]:.6f} to {first_x[-1]:.6f} m as in the first file."
+            )
+        if cycle == 0:
+            zero[artefact] = (y[0] + y[-1]) / 2
+        read += y.size
+        if read <= before:
+            continue
+        fresh = slice(max(0, y.size - (read - before)), None)
+        place = settings.positions[artefact] + y[fresh] - zero[artefact]
+        lines = place.size
+        time = np.full(lines, plan.warm_up[cycle] if cycle >= plan.cold else plan.of_cycle(cycle).start)
+        yield static.assign(
+            x=("point", scan.x, {"units": "m"}),
+            scan_length=((), length, {"units": "m"}),
+            record=(("line", "point"), heights[fresh].astype(np.float32), {"units": "m"}),
+            encoder=("line", (place - settings.encoder_zero) / settings.encoder_pitch),
+            cycle_of_line=("line", np.full(lines, cycle, np.int32)),
+            line_time=("line", time, {"units": "s"}),
+        )

@@ -1,0 +1,371 @@
+"""Measuring scans: pass after pass over the artefacts while the machine warms up, each line with its encoder count.
+
+Every line goes into the raw dataset before anything is computed from it; scans are cut out of it later (``cutting``).
+A line of NaN, encoder and all, marks where the warm-up begins (its time is 0) and where a stream broke.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.errors import InstrumentError, MethodError
+from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
+from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
+from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pass_ends, warm_up_piece
+from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, Schedule, program_texts, schedule
+from errormotion.methods.crossbeam_scan.identification.cutting import interruption
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.plugins import Bench
+
+    Array = Array
+
+log = logging.getLogger(__name__)
+
+SCHEMA = "errormotion.raw.crossbeam_scan/1"
+HAND_OVER_SECONDS = 0.4
+"""A chunk is handed over at least this often, so that a crash loses little."""
+HAND_OVER_LINES = 512
+PATIENCE = 3
+"""So many passes in a row may break before the campaign is given up."""
+
+
+def record_scans(
+    bench: Bench, settings: Settings, pose: xr.Dataset | None, done: xr.Dataset | None
+) -> Iterator[xr.Dataset]:
+    """Yield the scans as recorded, chunk by chunk along ``line``.
+
+    Parameters
+    ----------
+    bench : Bench
+        With a ``line_profiler``; a ``controller`` where there is one, else the operator is asked.
+    settings : Settings
+    pose : Dataset, optional
+        Error dataset of a test that found the profiler's pose; without it ``settings.profiler_pose`` counts.
+    done : Dataset, optional
+        What an interrupted run holds. Its last pass stays as it is. On a real machine the warm-up went on meanwhile: of
+        the passes that are overdue only the last one is made.
+
+    Raises
+    ------
+    MethodError
+        No pose, no places, times too close; lines come, but none of them where a scan is.
+    InstrumentError
+        Three passes in a row broke.
+    """
+    profiler = bench.of_kind("line_profiler")
+    plan = schedule(settings)
+    static = static_part(bench, settings, plan, pose)
+    if hasattr(profiler, "scans"):
+        from errormotion.methods.crossbeam_scan.acquisition.scan_files import record_files
+
+        return record_files(profiler, settings, plan, static, done)
+    return _Campaign(profiler, mover(bench), settings, plan, static, done).chunks()
+
+
+def expected_lines(settings: Settings) -> int:
+    """Return how many lines a campaign keeps, about: what its progress counts."""
+    length = settings.scan_length + 2 * settings.margin
+    return (
+        (1 + settings.cold_repeats + len(settings.warm_up))
+        * len(settings.positions)
+        * round(length / settings.line_pitch)
+    )
+
+
+def static_part(bench: Bench, settings: Settings, plan: Schedule, pose: xr.Dataset | None) -> xr.Dataset:
+    """Return everything of a raw dataset that is known before its first line."""
+    m = {"units": "m"}
+    matrix, covariance = pose_of(settings, pose)
+    return xr.Dataset(
+        {
+            "position": ("artefact", np.array(settings.positions), m),
+            "warm_up": ("cycle", np.array(plan.warm_up), {"units": "s"}),
+            "encoder_pitch": ((), settings.encoder_pitch, m),
+            "encoder_zero": ((), settings.encoder_zero, m),
+            "scan_length": ((), settings.scan_length, m),
+            "profiler_pose": (("row", "column"), matrix),
+            "pose_covariance": (("p", "p_"), covariance),
+            "lever": ("direction", np.array(settings.lever), m),
+            "lever_uncertainty": ("direction", np.array(settings.lever_uncertainty), m),
+            "height_noise": ((), settings.height_noise, m),
+        },
+        coords={"direction": list("xyz")},
+        attrs={
+            "schema": SCHEMA,
+            "machine": bench.machine,
+            "schedule": plan.to_json(),
+            "programs": json.dumps(program_texts(settings)),
+        },
+    )
+
+
+def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]:
+    """Return pose (4, 4) of the profiler in the tool frame and its covariance (6, 6), from a test or the settings.
+
+    Raises
+    ------
+    MethodError
+        Neither says it.
+    """
+    if found is not None:
+        return np.asarray(found["profiler_pose"].values, float), np.asarray(found["pose_covariance"].values, float)
+    stated = settings.profiler_pose
+    if stated is None:
+        raise MethodError(
+            "The scans need the profiler's pose in the tool frame. Make a test with procedure = 'profiler_pose' before "
+            "this one and name it here, inputs = { pose = 'its name' }; or give the setting 'profiler_pose'."
+        )
+    matrix = calibration.pose(stated.a, stated.b, stated.g, stated.dx, stated.dy, stated.dz).as_matrix()
+    size = np.repeat([stated.angle_uncertainty, stated.place_uncertainty], 3)
+    return np.asarray(matrix), np.diag(size**2)
+
+
+class _Campaign:
+    """One campaign from here to its end."""
+
+    def __init__(
+        self,
+        profiler: Any,
+        move: Mover,
+        settings: Settings,
+        plan: Schedule,
+        static: xr.Dataset,
+        done: xr.Dataset | None,
+    ) -> None:
+        self.profiler, self.move, self.settings, self.plan = profiler, move, settings, plan
+        self.low, self.high = pass_ends(settings)
+        middles, half = np.array(settings.positions), settings.scan_length / 2
+        self.scans = middles - half, middles + half
+        self.windows = self.scans[0] - settings.margin, self.scans[1] + settings.margin
+        self.origin = move.now()
+        self.zero: float | None = None  # when the warm-up began, by the mover's clock
+        self.next = 0
+        self.pending = Pending(static)
+        if done is None:
+            static.attrs["start"] = datetime.now(UTC).isoformat(timespec="milliseconds")
+        else:
+            self._take_up(done)
+
+    def _take_up(self, done: xr.Dataset) -> None:
+        """Find out what was done, and when the warm-up began."""
+        cycle, since, clock = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
+        self.pending.x = np.asarray(done["x"].values, dtype=float)
+        tried = cycle[since != 0]  # time 0 is that of the mark
+        self.next = int(tried.max()) + 1 if tried.size else 0
+        if 0 < self.next <= self.plan.cold and not _whole(done, self.next - 1, self.high - self.settings.margin):
+            self.next -= 1  # nothing has warmed up yet: a cold pass can be made again
+        if self.move.virtual:
+            return
+        start = str(done.attrs.get("start", ""))
+        try:
+            self.origin = datetime.fromisoformat(start).timestamp()
+        except ValueError as error:
+            raise MethodError(
+                f"The interrupted record does not say when it began (attribute start = '{start}'; expected UTC such as "
+                "2025-03-01T08:00:00+00:00), so that it cannot be gone on with. Start a new run."
+            ) from error
+        warm = np.flatnonzero(cycle >= self.plan.cold)
+        if warm.size:
+            self.zero = self.origin + float(clock[warm[-1]] - since[warm[-1]])
+            self._skip_overdue(self.move.now() - self.zero)
+
+    def _skip_overdue(self, now: float) -> None:
+        self.next = max(self.next, self.plan.cold)
+        while self.next + 1 < self.plan.cycles and self.plan.warm_up[self.next + 1] < now:
+            log.warning("pass %d was due while nobody measured; it is left out", self.next)
+            self.next += 1
+
+    def chunks(self) -> Iterator[xr.Dataset]:
+        """Yield all that is still to be measured."""
+        broken = 0
+        if not self.move.virtual:
+            prepare_profiler(self.profiler)
+        while self.next < self.plan.cycles:
+            if self.next >= self.plan.cold:
+                yield from self._warm_up()
+            try:
+                yield from self._pass()
+            except BrokenPassError as error:
+                log.warning("pass %d: %s", self.next, error)
+                broken += 1
+                yield from self._interrupted(error)
+                if broken == PATIENCE:
+                    raise InstrumentError(
+                        f"{PATIENCE} passes in a row broke, the last one, number {self.next}: {error.reason}"
+                    ) from error
+                reopen(self.profiler)
+                if self.next < self.plan.cold:
+                    continue  # the machine is still cold: once more
+            else:
+                broken = 0
+            self.next += 1
+
+    def _warm_up(self) -> Iterator[xr.Dataset]:
+        """Have the axis move until the next pass is due; the first time, mark when it began."""
+        item, due = self.plan.before(self.next), self.plan.warm_up[self.next]
+        if item is not None and (piece := self._piece(item.program, due)) is not None:
+            begun = self.move.begin(piece)
+            if self.zero is None:
+                self.zero = begun
+                if self.next == self.plan.cold:
+                    yield from self._mark(0.0, begun)
+        if self.zero is not None:
+            self.move.wait_until(self.zero + due)
+
+    def _piece(self, name: str, due: float) -> Program | None:
+        """Return the warm-up moves for the time that is left, None where there is hardly any."""
+        planned = self.plan.programs[name]
+        if self.zero is None:
+            return planned
+        left = self.zero + due - self.move.now() - PAUSE
+        if left > planned.seconds(self.high) - 2 * PAUSE:
+            return planned
+        if left < PAUSE:
+            return None
+        number = int(name.removesuffix(".nc").rpartition("_")[2])
+        return warm_up_piece(self.settings, number, left, self.high)
+
+    def _pass(self) -> Iterator[xr.Dataset]:
+        item = self.plan.of_cycle(self.next)
+        ordered = self.move.now()
+        zero = ordered - item.start if self.zero is None or self.next < self.plan.cold else self.zero
+        came, kept, reach = 0, 0, [np.inf, -np.inf]
+        program = self.plan.programs[item.program]
+        try:
+            with closing(listen(self.profiler, self.move, program, self.settings, self.low, self.high)) as listening:
+                for lines in listening:
+                    part = lines.within(*self.windows)
+                    if lines.within(*self.scans) is not lines:  # points beside the artefacts are not missed
+                        part = replace(part, invalid={})
+                    came, kept = came + lines.encoder.size, kept + part.encoder.size
+                    reach = [
+                        np.nanmin(lines.position, initial=reach[0]), np.nanmax(lines.position, initial=reach[1])
+                    ]  # fmt: skip
+                    self.pending.add(part, self.next, zero, self.origin)
+                    if self.pending.due:
+                        yield self.pending.hand_over()
+        except BrokenPassError:
+            if came and not kept:
+                raise MethodError(self._missed(came, *reach)) from None
+            raise
+        if self.pending.lines:
+            yield self.pending.hand_over()
+
+    def _missed(self, came: int, low: float, high: float) -> str:
+        s = self.settings
+        return (
+            f"Pass {self.next}: {came} lines came, at positions from {low:.6g} to {high:.6g} m, and none of them in a "
+            f"scan; those are at {', '.join(f'{y:g}' for y in s.positions)} m. Check encoder_pitch "
+            f"({s.encoder_pitch:g} m a count, negative where it counts backwards), encoder_zero ({s.encoder_zero:g} m) "
+            "and which way of the axis triggers the profiler."
+        )
+
+    def _interrupted(self, error: BrokenPassError) -> Iterator[xr.Dataset]:
+        """Hand over what came, with a mark behind it and the reason among the counts of what is invalid."""
+        text = interruption(self.next, error.position, error.reason)
+        self.pending.invalid[text] = self.pending.invalid.get(text, 0) + 1
+        now = self.move.now()
+        zero = self.zero if self.zero is not None and self.next >= self.plan.cold else None
+        since = now - zero if zero is not None else self.plan.of_cycle(self.next).end
+        yield from self._mark(since, now)
+
+    def _mark(self, since: float, now: float) -> Iterator[xr.Dataset]:
+        """Yield a line of NaN, where the length of a line is known yet."""
+        if self.pending.x is None:
+            return
+        unknown = np.full(1, np.nan)
+        line = Lines(
+            np.full((1, self.pending.x.size), np.nan, np.float32), unknown, unknown, np.array([now]), self.pending.x,
+            0, {},
+        )  # fmt: skip
+        self.pending.add(line, self.next, now - since, self.origin)
+        yield self.pending.hand_over()
+
+
+def reopen(profiler: Any) -> None:
+    """Begin anew with a profiler; where it does not come back the next pass breaks as well."""
+    with suppress(InstrumentError):
+        profiler.close()
+    try:
+        profiler.open()
+    except InstrumentError as error:
+        log.warning("the profiler does not come back: %s", error)
+
+
+def prepare_profiler(profiler: Any) -> None:
+    """Listen once while nothing moves: whatever a driver has to prepare is prepared when the axis begins."""
+    with suppress(InstrumentError), closing(profiler.stream(block=1)) as stream:
+        next(stream, None)
+
+
+def _whole(done: xr.Dataset, cycle: int, end: float) -> bool:
+    """Whether a pass came past its last scan, m."""
+    counts = np.asarray(done["encoder"].values, dtype=float)[np.asarray(done["cycle_of_line"].values) == cycle]
+    places = float(done["encoder_zero"]) + float(done["encoder_pitch"]) * counts
+    return bool(np.nanmax(places, initial=-np.inf) >= end - 1e-3)
+
+
+@dataclass
+class Pending:
+    """Lines on their way from the profiler to the next chunk."""
+
+    static: xr.Dataset
+    x: Array | None = None
+    lines: int = 0
+    dropped: int = 0
+    invalid: dict[str, int] = field(default_factory=dict)
+    _parts: dict[str, list[Any]] = field(default_factory=dict)
+    _since: float = field(default_factory=time.monotonic)
+
+    @property
+    def due(self) -> bool:
+        """Whether there is a chunk, and it is large or old enough."""
+        old = time.monotonic() - self._since >= HAND_OVER_SECONDS
+        return self.lines >= HAND_OVER_LINES or (self.lines > 0 and old)
+
+    def add(self, lines: Lines, cycle: int, zero: float, origin: float) -> None:
+        """Take in lines of a pass; ``zero`` is when the warm-up began, ``origin`` when the record did."""
+        self.x = lines.x
+        size = lines.encoder.size
+        if not size:
+            return
+        columns = {
+            "record": lines.heights,
+            "encoder": lines.encoder,
+            "cycle_of_line": np.full(size, cycle, np.int32),
+            "line_time": lines.time - zero,
+            "line_clock": lines.time - origin,
+        }
+        for name, values in columns.items():
+            self._parts.setdefault(name, []).append(values)
+        self.lines += size
+        self.dropped += lines.dropped
+        for reason, count in lines.invalid.items():
+            self.invalid[reason] = self.invalid.get(reason, 0) + count
+
+    def hand_over(self) -> xr.Dataset:
+        """Return all pending lines as a dataset."""
+        units = {"record": "m", "line_time": "s", "line_clock": "s"}
+        found = {name: np.concatenate(parts) for name, parts in self._parts.items()}
+        ds = self.static.assign(x=("point", self.x, {"units": "m"}))
+        for name, values in found.items():
+            dims = ("line", "point") if name == "record" else ("line",)
+            ds[name] = (dims, values, {"units": units[name]} if name in units else {})
+        ds.attrs |= {"dropped": self.dropped, "invalid": dict(self.invalid)}
+        self._parts, self.lines, self.dropped, self.invalid = {}, 0, 0, {}
+        self._since = time.monotonic()
+        return ds

@@ -1,0 +1,157 @@
+"""What is done when: cold passes, then for each warm-up time the moves until then and a measuring pass.
+
+Time 0 is when the warm-up begins. A warm-up time counts everything since then, the measuring passes included: they move
+the axis as well, if more slowly. A pass begins at its warm-up time; when each of its artefacts was scanned is measured.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.acquisition.programs import (
+    DWELL,
+    MINUTE,
+    Program,
+    measuring_pass,
+    pass_ends,
+    pocket_pass,
+    texts,
+    warm_up_piece,
+)
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+PAUSE = 5.0
+"""Time between two programs, s: until the control has begun the next one."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One program of the campaign.
+
+    Attributes
+    ----------
+    program : str
+        Name of its file.
+    start, seconds : float
+        When it begins, since the warm-up began, and how long it takes, by the plan; s.
+    cycle : int
+        Number of the measuring pass; -1 for warm-up moves.
+    """
+
+    program: str
+    start: float
+    seconds: float
+    cycle: int = -1
+
+    @property
+    def end(self) -> float:
+        """When it ends, s."""
+        return self.start + self.seconds
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The campaign in its order.
+
+    Attributes
+    ----------
+    items : tuple of Item
+    programs : mapping of str to Program
+        By the names of their files.
+    warm_up : tuple of float
+        Warm-up time of each pass, 0 for the cold ones, s.
+    """
+
+    items: tuple[Item, ...]
+    programs: Mapping[str, Program]
+    warm_up: tuple[float, ...]
+
+    @property
+    def cycles(self) -> int:
+        """Measuring passes."""
+        return len(self.warm_up)
+
+    @property
+    def cold(self) -> int:
+        """Measuring passes on the cold machine."""
+        return self.warm_up.count(0.0)
+
+    @property
+    def seconds(self) -> float:
+        """How long all of it takes."""
+        return self.items[-1].end - self.items[0].start
+
+    def of_cycle(self, cycle: int) -> Item:
+        """Return the measuring pass of this number."""
+        return next(item for item in self.items if item.cycle == cycle)
+
+    def before(self, cycle: int) -> Item | None:
+        """Return the warm-up moves before a pass; None before a cold one."""
+        place = self.items.index(self.of_cycle(cycle))
+        return self.items[place - 1] if place and self.items[place - 1].cycle < 0 else None
+
+    def to_json(self) -> str:
+        """Return the items as JSON."""
+        return json.dumps([item.__dict__ for item in self.items])
+
+
+def schedule(settings: Settings) -> Schedule:
+    """Return what a campaign does when.
+
+    Raises
+    ------
+    MethodError
+        No artefacts, a program that leaves the travel, or warm-up times with no time for the pass between them.
+    """
+    passing = measuring_pass(settings)
+    low, high = pass_ends(settings)
+    first, again = passing.seconds(low), passing.seconds(high)
+    cold = 1 + settings.cold_repeats
+    begin = -(first + PAUSE + settings.cold_repeats * (again + PAUSE))
+    items: list[Item] = []
+    for number in range(cold):
+        items.append(Item(passing.name, begin, again if number else first, number))
+        begin = items[-1].end + PAUSE
+    programs = {passing.name: passing}
+    free = 0.0  # when the axis is free
+    for number, due in enumerate(settings.warm_up, 1):
+        seconds = due - PAUSE - free
+        if seconds <= 0:
+            raise MethodError(
+                f"warm_up: at {due / MINUTE:g} min the axis is not free before {(free + PAUSE) / MINUTE:.1f} min, a "
+                f"measuring pass takes {first / MINUTE:.1f} min; expected times further apart."
+            )
+        piece = warm_up_piece(settings, number, seconds, high)
+        programs[piece.name] = piece
+        items.append(Item(piece.name, free, piece.seconds(high)))
+        items.append(Item(passing.name, due, passing.seconds(piece.end), cold + number - 1))
+        free = items[-1].end + PAUSE
+    for program in programs.values():
+        program.check(settings.travel)
+    return Schedule(tuple(items), programs, (*[0.0] * cold, *settings.warm_up))
+
+
+def scan_times(plan: Schedule, settings: Settings) -> list[list[float]]:
+    """Return when each pass is over the middle of each artefact, s since the warm-up began, by the plan."""
+    low, _ = pass_ends(settings)
+    begins = [item.end - plan.programs[item.program].seconds(low) for item in plan.items if item.cycle >= 0]
+    return [[begin + DWELL + (y - low) / settings.measuring_feed for y in settings.positions] for begin in begins]
+
+
+def program_texts(settings: Settings) -> dict[str, str]:
+    """Return the NC programs of a test by the names of their files, of scans or of the pocket.
+
+    Raises
+    ------
+    MethodError
+        As for `schedule`.
+    """
+    if settings.procedure == "profiler_pose":
+        return texts([pocket_pass(settings, k) for k in range(1, len(settings.pocket_lifts) + 1)], settings)
+    return texts(list(schedule(settings).programs.values()), settings)

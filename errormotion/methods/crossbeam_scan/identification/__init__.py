@@ -1,0 +1,1 @@
+"""Identification: crossbeam scans, from raw data to errors with covariance."""

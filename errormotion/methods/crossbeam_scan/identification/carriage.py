@@ -1,0 +1,178 @@
+"""From the registrations of a campaign to the errors of the carriage over time and position, with what they share.
+
+All is linear in the registrations once the weights of the guide are fixed: E = A(H, lever) K W(H) y, with W from maps
+to the profiler's motion, K what the guide makes of it (1 without) and A the adjoint to the carriage. What a wrong pose
+or lever does is found by moving H and the lever by one standard uncertainty both ways.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.arrays import Array
+from errormotion.kinematics.twists import transform, transform_covariance
+from errormotion.methods.crossbeam_scan.identification import chain, strain
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How the profiler hangs on the carriage, and how well that is known.
+
+    Attributes
+    ----------
+    pose : RigidTransform
+        H, profiler to tool frame.
+    lever : ndarray, (3,)
+        Carriage to tool frame, m.
+    pose_covariance : ndarray, (6, 6), or None
+        Of (a, b, g, dx, dy, dz).
+    lever_uncertainty : ndarray, (3,)
+        m.
+    """
+
+    pose: RigidTransform
+    lever: Array
+    pose_covariance: Array | None
+    lever_uncertainty: Array
+
+    def changed(self) -> list[tuple[tuple[RigidTransform, Array], tuple[RigidTransform, Array]]]:
+        """Return (pose, lever) after one standard uncertainty of every source of `chain.SOURCES`, up and down."""
+        p = calibration.parameters(self.pose)
+        out = []
+        for row in chain.root(self.pose_covariance):
+            up, down = (calibration.pose(*(p + sign * row)) for sign in (1, -1))
+            out.append(((up, self.lever), (down, self.lever)))
+        for axis, u in enumerate(self.lever_uncertainty):
+            step = u * np.eye(3)[axis]
+            out.append(((self.pose, self.lever + step), (self.pose, self.lever - step)))
+        return out
+
+
+@dataclass(frozen=True)
+class Carriage:
+    """Errors of the carriage at its origin over (cycle, artefact), relative to the cold scan.
+
+    Attributes
+    ----------
+    profiler : ndarray, (cycle, artefact, 6)
+        How the profiler moved, at its origin and in its frame, m and rad.
+    profiler_covariance : ndarray, (cycle, artefact, 6, 6)
+        By the registrations.
+    values : ndarray, (cycle, artefact, 6)
+        EX EY EZ (m), EA EB EC (rad); NaN where there is no registration.
+    covariance : ndarray, (cycle, artefact, 6, 6)
+        By the registrations alone.
+    influence : ndarray, (source, cycle, artefact, 6)
+        Of pose, lever and cold scans.
+    sources, source_groups : list of str
+    predicted : ndarray, (artefact, 6, 6)
+        Covariance by surface and stated noise alone.
+    drift : ndarray, (cycle, artefact, 3)
+        g, change of the profiler's place per metre of feed, profiler frame.
+    """
+
+    profiler: Array
+    profiler_covariance: Array
+    values: Array
+    covariance: Array
+    influence: Array
+    sources: list[str]
+    source_groups: list[str]
+    predicted: Array
+    drift: Array
+
+
+def carriage(found: Registrations, places: ArrayLike, rig: Rig, *, guide: float | None) -> Carriage:
+    """Return the errors of the carriage from all registrations.
+
+    Parameters
+    ----------
+    found : Registrations
+    places : (artefact,)
+        Positions of the axis, m, rising.
+    rig : Rig
+    guide : float or None
+        Standard uncertainty, rad, with which the carriage follows its guide, see `strain.guided`; None: not used.
+    """
+    y = np.asarray(places, dtype=float)
+    cycles, artefacts = found.cold_share.shape
+    W, A = strain.from_maps(rig.pose), chain.carriage_adjoint(rig.pose, rig.lever)
+    changed = rig.changed()
+    e = np.full((cycles, artefacts, 6), np.nan)
+    C = np.full((cycles, artefacts, 6, 6), np.nan)
+    drift = np.full((cycles, artefacts, 3), np.nan)
+    influence = np.full((len(changed), cycles, artefacts, 6), np.nan)
+    for c in range(cycles):
+        known = np.isfinite(found.twist[c, :, 0])
+        own = known & (found.cold == c)
+        e[c, own], C[c, own], drift[c, own], influence[:, c, own] = 0.0, 0.0, 0.0, 0.0
+        used = np.flatnonzero(known & ~own)
+        if used.size == 0:
+            continue
+        maps = found.twist[c, used]
+        seen = maps @ W.T
+        noise = W[:6] @ found.covariance[c, used] @ W[:6].T
+        e[c, used], C[c, used], gain = _settled(seen[:, :6], noise, y[used], A, guide)
+        drift[c, used] = seen[:, 6:]
+        for s, (up, down) in enumerate(changed):
+            there, back = (_errors(maps, gain, *rig_) for rig_ in (up, down))
+            influence[s, c, used] = (there - back) / 2
+    covariance = transform_covariance(C, A)
+    cold = _cold_influence(covariance, found)
+    names = [f"cold scan {k + 1}, part {i + 1}" for k in range(artefacts) for i in range(6)]
+    return Carriage(
+        profiler=e,
+        profiler_covariance=C,
+        values=transform(e, A),
+        covariance=covariance,
+        influence=np.concatenate([influence, cold]),
+        sources=[*chain.SOURCES, *names],
+        source_groups=[*chain.SOURCE_GROUPS, *["cold scan"] * len(names)],
+        predicted=_predicted(found, y, W, A, guide),
+        drift=drift,
+    )
+
+
+def _settled(
+    twist: Array, covariance: Array, places: Array, to_carriage: Array, guide: float | None
+) -> tuple[Array, Array, Array]:
+    """Return twists, covariance and gain of one cycle, the guide taken into account where it is to be."""
+    if guide is None:
+        return twist, covariance, np.eye(twist.size)
+    found = strain.guided(twist, covariance, places, to_carriage, guide)
+    return found.twist, found.covariance, found.gain
+
+
+def _errors(maps: Array, gain: Array, pose: RigidTransform, lever: Array) -> Array:
+    """Return the errors (n, 6) that registrations (n, 9) mean with another pose and lever, the same gain."""
+    motion = (gain @ (maps @ strain.from_maps(pose)[:6].T).ravel()).reshape(-1, 6)
+    return transform(motion, chain.carriage_adjoint(pose, lever))
+
+
+def _cold_influence(covariance: Array, found: Registrations) -> Array:
+    """Return the influence (6 per artefact, cycle, artefact, 6) of the cold scans' noise: one draw for all cycles."""
+    cycles, artefacts = found.cold_share.shape
+    out = np.where(np.isfinite(covariance[..., 0])[None], 0.0, np.nan) * np.ones((6 * artefacts, 1, 1, 1))
+    unit = np.array([1e-6] * 3 + [1e-6] * 3)
+    for c, k in np.ndindex(cycles, artefacts):
+        C = covariance[c, k] / np.outer(unit, unit)
+        if np.isfinite(C).all() and C.any():
+            factor = np.linalg.cholesky(C + 1e-12 * np.trace(C) * np.eye(6))
+            out[6 * k : 6 * k + 6, c, k] = np.sqrt(found.cold_share[c, k]) * unit * factor.T
+    return out
+
+
+def _predicted(found: Registrations, y: Array, W: Array, A: Array, guide: float | None) -> Array:
+    """Return what the bound of every registration makes of the errors' covariance, (artefact, 6, 6)."""
+    out = np.full((y.size, 6, 6), np.nan)
+    known = np.flatnonzero(np.isfinite(found.bound[:, 0, 0]))
+    if known.size:
+        C = W[:6] @ found.bound[known] @ W[:6].T
+        out[known] = transform_covariance(_settled(np.zeros((known.size, 6)), C, y[known], A, guide)[1], A)
+    return out

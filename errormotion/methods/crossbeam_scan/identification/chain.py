@@ -1,0 +1,177 @@
+"""From the registered motion of the profiler's frame to the six errors of the carriage, and what a wrong pose does.
+
+A warm scan registers onto the cold one with M: a point seen at p in the warm profiler frame is seen at M p in the cold
+one. With H the pose of the profiler in the tool frame and S the shift by the lever (x_y, 0, z_y), the error of the
+carriage is the conjugate E = S H M (S H)^-1 (eq. 3 of Zhao et al.), for small motions the adjoint of S H applied to the
+twist of M. What is left out is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
+
+A scan is put together along the feed. The carriage travels along Y of the machine, so line y lies off the profiler's
+plane by y times `feed_direction`, which is Y turned into the profiler's frame, and not by y along the frame's own Y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.kinematics.poses import adjoint_of
+from errormotion.kinematics.twists import adjoint, cross_matrix, transform, transform_covariance
+
+#: names of the influences and what they belong to in the budget
+SOURCES = (*(f"profiler pose {k}" for k in range(1, 7)), "lever x", "lever y", "lever z")
+SOURCE_GROUPS = ("profiler pose",) * 6 + ("lever",) * 3
+
+
+@dataclass(frozen=True)
+class CarriageErrors:
+    """Thermal errors of the carriage at its origin, in machine directions.
+
+    Attributes
+    ----------
+    values : ndarray, (..., 6)
+        EX EY EZ in m, EA EB EC in rad; NaN where there was no registration.
+    covariance : ndarray, (..., 6, 6)
+        Of the registration and the influences together.
+    influence : ndarray, (source, ..., 6)
+        Effect of one standard uncertainty of each source, the same draw for all values.
+    sources, source_groups : tuple of str
+        What the influences are, as `errormotion.datasets.build_errors` takes them.
+    """
+
+    values: Array
+    covariance: Array
+    influence: Array
+    sources: tuple[str, ...] = SOURCES
+    source_groups: tuple[str, ...] = SOURCE_GROUPS
+
+
+def feed_direction(profiler_pose: RigidTransform) -> Array:
+    """Return the direction of the feed (Y of the machine) in the profiler's frame, (3,)."""
+    return np.asarray(profiler_pose.rotation.inv().apply([0.0, 1.0, 0.0]))
+
+
+def carriage_errors(
+    motion: ArrayLike,
+    covariance: ArrayLike,
+    profiler_pose: RigidTransform,
+    lever: ArrayLike,
+    *,
+    pose_covariance: ArrayLike | None = None,
+    lever_uncertainty: ArrayLike = (0.0, 0.0, 0.0),
+) -> CarriageErrors:
+    """Return the errors of the carriage from the registered motions of the profiler's frame.
+
+    Parameters
+    ----------
+    motion : (..., 6)
+        Twists of M at the origin of the profiler's frame, in that frame: warm onto cold; m and rad.
+    covariance : (..., 6, 6)
+        Of these, by the registration alone.
+    profiler_pose : RigidTransform
+        H, profiler to tool frame.
+    lever : (3,)
+        (x_y, 0, z_y), carriage to tool frame, m.
+    pose_covariance : (6, 6), optional
+        Of (a, b, g, dx, dy, dz), as the calibration gives it; without it the pose counts as exact.
+    lever_uncertainty : (3,)
+        Standard uncertainty of the lever, m.
+
+    Raises
+    ------
+    MethodError
+        Shapes that do not fit.
+    """
+    M, C, x = (np.asarray(value, dtype=float) for value in (motion, covariance, lever))
+    if M.shape[-1:] != (6,) or C.shape != (*M.shape, 6) or x.shape != (3,):
+        raise MethodError(
+            "The chain needs motions (..., 6), covariances (..., 6, 6) and a lever (3,); found "
+            f"{M.shape}, {C.shape} and {x.shape}."
+        )
+    to_carriage = carriage_adjoint(profiler_pose, x)
+    E = transform(M, to_carriage)
+    errors = np.concatenate(
+        [
+            root(pose_covariance) @ pose_twists(profiler_pose, x),
+            np.asarray(lever_uncertainty, dtype=float)[:, None] * np.eye(3, 6),
+        ]
+    )
+    influence = np.stack([commutator(error, E) for error in errors])
+    total = transform_covariance(C, to_carriage) + np.einsum("s...i,s...j->...ij", influence, influence)
+    return CarriageErrors(E, total, influence)
+
+
+def carriage_adjoint(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
+    """Return the matrix (6, 6) that takes twists in the profiler's frame to twists of the carriage."""
+    shift = np.asarray(lever, dtype=float)
+    return adjoint(shift=-shift) @ adjoint_of(profiler_pose)
+
+
+def pose_twists(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:
+    """Return what each parameter (a, b, g, dx, dy, dz) of the pose does to S H: twists of the carriage, (6, 6).
+
+    Row k is the motion per radian or metre of parameter k from where the profiler is to where it would be, in the
+    carriage's frame and at its origin.
+    """
+    a, b, _ = profiler_pose.rotation.as_euler("XYZ")
+    axes = np.array(
+        [[1, 0, 0], Rotation.from_euler("X", a).apply([0, 1, 0]), Rotation.from_euler("XY", [a, b]).apply([0, 0, 1])]
+    )
+    centre = np.asarray(lever, dtype=float) + profiler_pose.translation  # all angles turn about the profiler's origin
+    return np.block([[np.cross(centre, axes), axes], [np.eye(3), np.zeros((3, 3))]])
+
+
+def commutator(error: ArrayLike, twist: ArrayLike) -> Array:
+    """Return how a twist changes when its frame is off by a small motion: the Lie bracket of the two, (..., 6).
+
+    Parameters
+    ----------
+    error : (6,)
+        Small motion of the frame, m and rad.
+    twist : (..., 6)
+        m and rad; both in the same frame and at the same point.
+    """
+    v, w = np.split(np.asarray(error, dtype=float), 2)
+    bracket = np.zeros((6, 6))
+    bracket[:3, :3] = bracket[3:, 3:] = cross_matrix(w)
+    bracket[:3, 3:] = cross_matrix(v)
+    return transform(np.asarray(twist, dtype=float), bracket)
+
+
+def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: ArrayLike, change: ArrayLike) -> Array:
+    """Return how the errors of the carriage would change with the pose of the profiler, to first order (eq. 14).
+
+    Parameters
+    ----------
+    errors : (..., 6)
+        Errors of the carriage by this pose, m and rad.
+    profiler_pose : RigidTransform
+        Pose that they were found with.
+    lever : (3,)
+        m.
+    change : (6,)
+        Changes of (a, b, g, dx, dy, dz), rad and m.
+
+    Returns
+    -------
+    ndarray, (..., 6)
+        What to add to the errors; of the size of change times error. Scans that are put together along the
+        `feed_direction` of a wrong pose add an effect of the same order, which depends on artefact and registration.
+    """
+    return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
+
+
+def root(covariance: ArrayLike | None) -> Array:
+    """Return rows whose outer products add up to the covariance, (6, 6), largest first in units of 10 um and 1 mrad."""
+    if covariance is None:
+        return np.zeros((6, 6))
+    C = np.asarray(covariance, dtype=float)
+    if C.shape != (6, 6) or not np.allclose(C, C.T, rtol=1e-6, atol=0) or np.any(np.diag(C) < 0):
+        raise MethodError(f"The covariance of the profiler's pose is a symmetric (6, 6); found shape {C.shape}.")
+    unit = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
+    size, vectors = np.linalg.eigh(C / np.outer(unit, unit))
+    return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0)) * unit[:, None]).T[::-1])

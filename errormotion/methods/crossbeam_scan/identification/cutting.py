@@ -1,0 +1,289 @@
+"""Scans cut out of a record of lines, one at a time: a campaign may be larger than memory.
+
+A scan is the lines whose encoder says that the axis was within half a scan's length of an artefact. They are put in
+order, lines that came twice are taken once, and lines that were lost stand as NaN where they would have been.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.acquisition.listening import OVERFLOW, folded
+
+Scan = tuple[NDArray[np.float32], Array, Array, float]
+
+log = logging.getLogger(__name__)
+
+GAP = 0.5e-3
+"""Longest piece without lines, m, that is left open in a scan."""
+LOST_SHARE = 0.05
+"""Share of its lines that a scan may have lost."""
+END = 0.01
+"""Share of a scan's length that may lack at each end."""
+DISORDER = 0.05
+"""Share of lines that may lie behind the one before them."""
+FEWEST_LINES = 16
+FINEST_PITCH = 1e-6
+"""m; lines closer than this come from a wrong encoder_pitch."""
+
+_INTERRUPTION = re.compile(r"pass (\d+) broke at (\S+) m: (.*)", re.DOTALL)
+
+
+def interruption(cycle: int, position: float, reason: str) -> str:
+    """Return how the raw dataset's counts of what is invalid name a pass that broke (``interruptions`` reads it)."""
+    return f"pass {cycle} broke at {position:.3f} m: {reason}"
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """A pass that broke: its number, the last place (m; NaN where it had not begun), and why."""
+
+    cycle: int
+    position: float
+    reason: str
+
+
+def interruptions(raw: xr.Dataset) -> list[Interruption]:
+    """Return the passes that broke, as a raw dataset tells them."""
+    counts = raw.attrs.get("invalid", "{}")
+    counts = json.loads(counts) if isinstance(counts, str) else counts
+    found = [_INTERRUPTION.fullmatch(str(text)) for text in counts]
+    return [Interruption(int(m[1]), float(m[2]), m[3]) for m in found if m is not None]
+
+
+class Scans:
+    """The scans of a campaign, each loaded when it is asked for; of both variants of the raw dataset.
+
+    Parameters
+    ----------
+    raw : Dataset
+        Schema ``errormotion.raw.crossbeam_scan/1``, variant "scans" or "scans as recorded". Stays as it is.
+
+    Raises
+    ------
+    MethodError
+        It is neither.
+
+    Attributes
+    ----------
+    cycles, artefacts : int
+    notes : list of str
+        What was mended so far, in sentences.
+    """
+
+    def __init__(self, raw: xr.Dataset) -> None:
+        if "record" not in raw and not {"height", "y"} <= set(raw.variables):
+            raise MethodError(
+                "Expected scans: a raw dataset of crossbeam_scan with record(line, point), or with height and y; found "
+                f"{', '.join(map(str, raw.data_vars))}."
+            )
+        self._raw = raw
+        self.notes: list[str] = []
+        self.artefacts = int(raw.sizes["artefact"])
+        self._x = np.asarray(raw["x"].values, dtype=float)
+        self._record = _Record(raw, self._note) if "record" in raw else None
+        self.cycles = int(raw.sizes["cycle"]) if self._record is None else self._record.cycles
+
+    def scan(self, cycle: int, artefact: int) -> Scan:
+        """Return one scan: height (profile, point) m, x (point,) m, y (profile,) m, and its time, s.
+
+        y counts from the ``position`` of the artefact and rises. The time of a recorded scan is the mean of its lines.
+
+        Raises
+        ------
+        MethodError
+            There is no such scan, or not all of it; or its places make no sense. The message says why.
+        """
+        if self._record is not None:
+            height, y, time = self._record.scan(cycle, artefact)
+            return height, self._x, y, time
+        part = self._raw.isel(cycle=cycle, artefact=artefact)
+        y = np.asarray(part["y"].values, dtype=float)
+        height = part["height"].transpose("profile", "point").values
+        known = np.isfinite(y)
+        if not known.any() or not np.isfinite(height).any():
+            raise MethodError("there is no scan: all of it is NaN")
+        y, height = y[known], height[known]
+        if y[0] > y[-1]:
+            y, height = y[::-1], height[::-1]
+        _refuse_disorder(y)
+        return np.ascontiguousarray(height, dtype=np.float32), self._x, y, float(part["time"])
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            log.info(text)
+            self.notes.append(text)
+
+
+class _Record:
+    """Where the scans are in a record of lines."""
+
+    def __init__(self, raw: xr.Dataset, note: Any) -> None:
+        self._note = note
+        self._raw = raw
+        self._record = raw["record"].transpose("line", "point")
+        self._positions = np.asarray(raw["position"].values, dtype=float)
+        self._length = float(raw["scan_length"])
+        counts = np.asarray(raw["encoder"].values, dtype=float)
+        pitch, zero = float(raw["encoder_pitch"]), float(raw["encoder_zero"])
+        mended = folded(counts, (float(self._positions.mean()) - zero) / pitch)
+        jumped = np.isfinite(counts) & (mended != counts)
+        if jumped.any():
+            note(f"The encoder's count had overflowed ({OVERFLOW:.0f}) in {int(jumped.sum())} lines; it was mended.")
+        self._place = zero + pitch * mended
+        self._cycle = np.asarray(raw["cycle_of_line"].values).astype(np.int64)
+        self._time = np.asarray(raw["line_time"].values, dtype=float)
+        planned = int(raw.sizes["cycle"]) if "warm_up" in raw else 0
+        self.cycles = max(planned, int(self._cycle.max(initial=-1)) + 1)
+        self._broken = {found.cycle: found for found in interruptions(raw)}
+        self._check_units()
+
+    def _check_units(self) -> None:
+        """Refuse an encoder pitch that puts no line, a few of them, or all into a scan."""
+        known = self._place[np.isfinite(self._place)]
+        inside = (np.abs(known[:, None] - self._positions) <= self._length / 2).any(axis=1)
+        step = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else np.nan
+        where = ", ".join(f"{y:g}" for y in self._positions)
+        pitch = float(self._raw["encoder_pitch"])
+        if inside.any() and not (step < FINEST_PITCH or step > self._length / FEWEST_LINES):
+            return
+        found = (
+            f"{step * 1e6:.3g} um from line to line"
+            if inside.any()
+            else f"none of {known.size} lines there, but at {known.min(initial=np.inf):.6g} to "
+            f"{known.max(initial=-np.inf):.6g} m"
+        )
+        raise MethodError(
+            f"Expected lines at the artefacts ({where} m), tens of micrometres apart; found {found}. Check "
+            f"encoder_pitch ({pitch:g} m a count: metres, not millimetres) and encoder_zero."
+        )
+
+    def scan(self, cycle: int, artefact: int) -> tuple[NDArray[np.float32], Array, float]:
+        middle = self._positions[artefact]
+        attempts = list(self._attempts(cycle, middle))
+        if not attempts:
+            raise MethodError(self._missing(cycle, "there is no line of it"))
+        rows, y = max(reversed(attempts), key=lambda attempt: float(np.ptp(attempt[1])))
+        at = f"Pass {cycle} at {middle:g} m"
+        order, y = self._ordered(y, at)
+        rows = rows[order]
+        self._check_whole(y, cycle)
+        height = self._load(rows)
+        time = float(np.mean(self._time[rows]))
+        height, y, lost = _evened(height, y)
+        if lost:
+            self._note(f"{at}: {lost} lost lines of {y.size} are left open.")
+        return height, y, time
+
+    def _attempts(self, cycle: int, middle: float) -> Iterator[tuple[NDArray[np.int64], Array]]:
+        """Yield, for each time that the axis passed, the lines within the scan (n,) and their places y (n,), m."""
+        lines = np.flatnonzero((self._cycle == cycle) & np.isfinite(self._place))
+        if not lines.size:
+            return
+        steps = np.diff(self._place[lines])
+        forwards = 1.0 if np.count_nonzero(steps > 0) >= steps.size / 2 else -1.0
+        back = np.flatnonzero(steps * forwards < -self._length / 2) + 1
+        for low, high in pairwise([0, *back.tolist(), lines.size]):
+            rows = lines[low:high]
+            y = self._place[rows] - middle
+            inside = np.abs(y) <= self._length / 2
+            if inside.any():
+                yield rows[inside], y[inside]
+
+    def _ordered(self, y: Array, at: str) -> tuple[NDArray[np.int64], Array]:
+        """Return the order that makes y rise, each place once, and y in that order."""
+        steps = np.diff(y)
+        if np.count_nonzero(steps < 0) > steps.size / 2:
+            backwards = np.arange(y.size)[::-1]
+            order, sorted_y = self._ordered(y[::-1], at)
+            return backwards[order], sorted_y
+        behind = int(np.count_nonzero(steps < 0))
+        if behind > DISORDER * y.size:
+            _refuse_disorder(y)
+        order = np.argsort(y, kind="stable")
+        fresh = np.concatenate([[True], np.diff(y[order]) > FINEST_PITCH / 10])
+        if behind:
+            self._note(f"{at}: {behind} lines lay behind the one before them; all were put in order.")
+        if not fresh.all():
+            self._note(f"{at}: {int(np.count_nonzero(~fresh))} lines came twice.")
+        order = order[fresh]
+        return order, y[order]
+
+    def _check_whole(self, y: Array, cycle: int) -> None:
+        if y.size < FEWEST_LINES:
+            raise MethodError(self._missing(cycle, f"there are {y.size} lines of it"))
+        pitch = float(np.median(np.diff(y)))
+        lacking = -self._length / 2, self._length / 2
+        short = max(y[0] - lacking[0], lacking[1] - y[-1]) - pitch
+        if short > END * self._length:
+            part = float(np.ptp(y)) / self._length
+            raise MethodError(self._missing(cycle, f"{part:.0%} of it is there, from {y[0]:+.4f} to {y[-1]:+.4f} m"))
+        gap = int(np.argmax(np.diff(y)))
+        if y[gap + 1] - y[gap] > GAP + pitch:
+            raise MethodError(
+                f"lines are lost over {(y[gap + 1] - y[gap]) * 1e3:.2f} mm at {y[gap]:+.4f} m from the artefact"
+            )
+        unknown = 1 - y.size * pitch / (np.ptp(y) + pitch)
+        if unknown > LOST_SHARE:
+            raise MethodError(f"{unknown:.0%} of its lines are lost; at most {LOST_SHARE:.0%} may be")
+
+    def _missing(self, cycle: int, what: str) -> str:
+        """Return why a scan is not there, or not whole."""
+        broken = self._broken.get(cycle)
+        if broken is not None:
+            where = f" at {broken.position:.3f} m" if np.isfinite(broken.position) else " before its first line"
+            return f"{what}: pass {cycle} broke{where} ({broken.reason})"
+        if not np.any(self._cycle == cycle):
+            return f"pass {cycle} was not made"
+        if cycle == int(self._cycle.max()):
+            return f"{what}: the record ends in pass {cycle}"
+        reach = float(np.nanmax(self._place[self._cycle == cycle], initial=-np.inf))
+        if reach < self._positions.max() + self._length * (0.5 - END):
+            return f"{what}: pass {cycle} was cut off at {reach:.3f} m"
+        return f"{what} in pass {cycle}"
+
+    def _load(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return lines of the record, read in one go."""
+        first = int(rows.min())
+        block = self._record.isel(line=slice(first, int(rows.max()) + 1)).values
+        if rows.size == len(block) and rows[0] == first and np.all(np.diff(rows) == 1):
+            return np.ascontiguousarray(block, dtype=np.float32)
+        return np.ascontiguousarray(block[rows - first], dtype=np.float32)
+
+
+def _evened(height: NDArray[np.float32], y: Array) -> tuple[NDArray[np.float32], Array, int]:
+    """Put a line of NaN where one lacks; return heights, y, and how many lines are lost."""
+    steps = np.diff(y)
+    pitch = float(np.median(steps))
+    lacking = np.maximum(np.rint(steps / pitch).astype(np.int64) - 1, 0)
+    lost = int(lacking.sum())
+    if not lost:
+        return height, y, 0
+    rows = np.concatenate([[0], np.cumsum(1 + lacking)])
+    full = np.full((rows[-1] + 1, height.shape[1]), np.nan, dtype=np.float32)
+    full[rows] = height
+    return full, np.interp(np.arange(full.shape[0]), rows, y), lost
+
+
+def _refuse_disorder(y: Array) -> None:
+    steps = np.diff(y)
+    behind = int(np.count_nonzero(steps <= 0))
+    if behind:
+        k = int(np.argmax(steps <= 0))
+        raise MethodError(
+            f"expected y to rise from line to line; {behind} of {y.size} lines lie behind the one before them "
+            f"or on it, the first at {y[k]:.6f} m followed by {y[k + 1]:.6f} m. Is there noise on the encoder's "
+            "wires, did the axis stand or turn?"
+        )

@@ -1,0 +1,122 @@
+"""Whether the artefacts stayed where they were: by cold scans made again, and by what their neighbours say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
+from errormotion.methods.crossbeam_scan.identification.consistency import Consistency, cold_repeats, moved_artefacts
+from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+
+MOVED = "the artefact had moved"
+"""Reason of errors that are left out because of it."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Which errors are those of the axis, and which are the artefact's.
+
+    Attributes
+    ----------
+    wrong : ndarray of bool, (cycle, artefact)
+        Scans of artefacts after they had moved.
+    since : ndarray, (artefact,)
+        Time of the first scan after an artefact moved, s; NaN where it did not.
+    notes : list of str
+        For people.
+    """
+
+    wrong: NDArray[np.bool_]
+    since: Array
+    notes: list[str]
+
+    def extras(self) -> dict[str, Any]:
+        """Return these as extra results of the error dataset."""
+        return {
+            "moved": ("position", np.isfinite(self.since)),
+            "moved_since": ("position", self.since, {"units": "s"}),
+        }
+
+
+def judge(
+    axis: Carriage,
+    found: Registrations,
+    settings: Settings,
+    places: Array,
+    time: Array,
+    cold: list[int],
+    warm: list[int],
+) -> Trust:
+    """Return what the repeated cold scans and the neighbours say of every artefact.
+
+    Parameters
+    ----------
+    axis : Carriage
+    found : Registrations
+    settings : Settings
+    places : (artefact,)
+        m.
+    time : (warm cycle,)
+        s, increasing.
+    cold, warm : list of int
+        Cycles; those of ``cold`` after the first repeat it.
+    """
+    repeatability = (settings.repeatability_shift, settings.repeatability_turn)
+    wrong, since = np.zeros(found.reason.shape, dtype=bool), np.full(places.size, np.nan)
+    notes = _cold_notes(axis, places, cold[1:], repeatability)
+    consistency = moved_artefacts(
+        time,
+        places,
+        axis.profiler[warm],
+        axis.profiler_covariance[warm],
+        repeatability=repeatability,
+        cold_share=found.cold_share[warm],
+    )
+    if not consistency.tested:
+        notes.append("Too few artefacts to tell by the others whether one has moved: four are needed.")
+    for one in consistency.moved:
+        wrong[warm[one.since :], one.artefact] = True
+        since[one.artefact] = time[one.since]
+    notes += _moved_notes(consistency, places, time, settings.moved == "exclude")
+    return Trust(wrong, since, notes)
+
+
+def _cold_notes(axis: Carriage, places: Array, repeats: list[int], repeatability: tuple[float, float]) -> list[str]:
+    if not repeats:
+        return []
+    found = cold_repeats(axis.profiler[repeats], axis.profiler_covariance[repeats], repeatability=repeatability)
+    notes = []
+    for repeat, k in np.argwhere(found.suspicious):
+        shift, turn = _size(axis.profiler[repeats[repeat], k])
+        notes.append(
+            f"The artefact at {places[k]:g} m was not where it had been when its cold scan was repeated "
+            f"({shift:.1f} um, {turn:.1f} urad off): is it clamped, and was the machine in thermal rest?"
+        )
+    return notes
+
+
+def _moved_notes(found: Consistency, places: Array, time: Array, excluded: bool) -> list[str]:
+    notes = []
+    for one in found.moved:
+        shift, turn = _size(one.step)
+        notes.append(
+            f"The artefact at {places[one.artefact]:g} m moved before the scan at {time[one.since] / 60:.1f} min, by "
+            f"{shift:.1f} um and {turn:.1f} urad against the others; its errors from there on are "
+            + ("left out." if excluded else "kept, but not trusted.")
+        )
+    return notes
+
+
+def _size(twist: Array) -> tuple[float, float]:
+    """Return the lengths of displacement and rotation, um and urad."""
+    shift, turn = np.linalg.norm(np.nan_to_num(twist).reshape(2, 3), axis=1) * 1e6
+    return float(shift), float(turn)

@@ -1,0 +1,300 @@
+"""Pose of the profiler in the tool frame, from scans of a level plate with a circular pocket of known place.
+
+A point (x, 0, z) of a line is, in the tool frame at its place over the pocket, H (x, 0, z) + s, with s how far the
+carriage is from there and H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g). The rim obeys
+
+    (X - X0)^2 + (Y - Y0)^2 = r^2,   Z = Z0,
+
+and the plate gives the tilt dz/dx. The feed s is along Y of the machine, not of the profiler: that is what g shows by,
+since the circle is sheared in (x, s) and not turned. A turned circle (s put in the profiler's frame, as eq. (7) of Zhao
+et al. has it) would be a circle still and would not tell g from the place of its centre. For the same reason a shows
+only when the plate is seen at two heights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from errormotion.arrays import Array
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import edges
+from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges import Tilt
+
+#: a, b, g (rad), dx, dy, dz (m)
+PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")
+#: least |cos| of the angle at which a line crosses the rim, seen from the centre
+OBLIQUE = 0.35
+#: half differences and half sums of the edges' radii beyond this many standard deviations are left out. Edges scatter
+#: with long tails, as points at the rim are lost or not: a tighter limit cuts into them and makes the covariance too
+#: small
+CLIP = 10.0
+#: a standard uncertainty beyond which a parameter counts as not determined: rad, m
+WORST_ANGLE, WORST_PLACE = 0.05, 2e-3
+
+_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 1e-5])
+
+
+def pose(a: float, b: float, g: float, dx: float, dy: float, dz: float) -> RigidTransform:
+    """Return H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g), profiler to tool frame (eq. 5 of Zhao et al.); rad, m."""
+    return RigidTransform.from_components([dx, dy, dz], Rotation.from_euler("XYZ", [a, b, g]))
+
+
+def parameters(H: RigidTransform) -> Array:
+    """Return (a, b, g, dx, dy, dz) of a pose, rad and m; the inverse of `pose`."""
+    return np.concatenate([H.rotation.as_euler("XYZ"), H.translation])
+
+
+@dataclass(frozen=True)
+class Pocket:
+    """A circular pocket whose place in the tool frame is known, because the machine has cut it.
+
+    Attributes
+    ----------
+    radius, radius_uncertainty : float
+        m; the radius is a parameter of the fit with this prior.
+    centre : ndarray, (3,)
+        (X0, Y0, Z0) of the rim, in the tool frame at its place over the pocket, m.
+    centre_uncertainty : ndarray, (3,)
+        Standard uncertainty, m.
+    """
+
+    radius: float
+    radius_uncertainty: float = 1e-6
+    centre: ArrayLike = (0.0, 0.0, 0.0)
+    centre_uncertainty: ArrayLike = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ProfilerPose:
+    """Where the profiler is in the tool frame.
+
+    Attributes
+    ----------
+    values : ndarray, (6,)
+        (a, b, g, dx, dy, dz), rad and m.
+    covariance : ndarray, (6, 6)
+        Of these.
+    radius : float
+        Of the pocket, as fitted, m.
+    residual_x, residual_y : float
+        Scatter of one edge along the profile, and of one line along the feed, m.
+    lines : int
+        Lines used.
+    """
+
+    values: Array
+    covariance: Array
+    radius: float
+    residual_x: float
+    residual_y: float
+    lines: int
+
+    @property
+    def transform(self) -> RigidTransform:
+        """The pose, profiler to tool frame."""
+        a, b, g, dx, dy, dz = self.values
+        return pose(a, b, g, dx, dy, dz)
+
+    @property
+    def matrix(self) -> Array:
+        """The pose as a homogeneous matrix, (4, 4)."""
+        return np.asarray(self.transform.as_matrix())
+
+
+def calibrate(
+    x: ArrayLike,
+    height: ArrayLike,
+    stage: ArrayLike,
+    pocket: Pocket,
+    *,
+    angle_prior: float | None = None,
+) -> ProfilerPose:
+    """Return the pose of the profiler from scans of a pocket.
+
+    Parameters
+    ----------
+    x : (point,)
+        Places along the profile, m.
+    height : (scan, line, point)
+        m; NaN = no reading. One scan leaves ``a`` open unless there is a prior; two at heights apart determine it.
+    stage : (scan, line, 3)
+        Where the tool frame is at each line, off its place over the pocket, m, in machine directions; one height per
+        scan.
+    pocket : Pocket
+        What is scanned.
+    angle_prior : float, optional
+        Standard uncertainty of the angles a, b, g about 0 when the profiler was set up, rad.
+
+    Raises
+    ------
+    MethodError
+        Shapes that do not fit, no pocket to be seen, or parameters that the scans do not determine, by name.
+    """
+    points, z, s = (np.asarray(value, dtype=float) for value in (x, height, stage))
+    if z.ndim != 3 or points.shape != z.shape[2:] or s.shape != (*z.shape[:2], 3):
+        raise MethodError(
+            "The calibration needs x (point), height (scan, line, point) and stage (scan, line, 3); found "
+            f"{points.shape}, {z.shape} and {s.shape}."
+        )
+    if np.ptp(s[..., 2], axis=1).max() > 1e-6:
+        raise MethodError(
+            "Each scan of the pocket needs one height of the spindle; the stage's Z changes within a scan."
+        )
+    fit = _Fit([_scan(points, *pair) for pair in zip(z, s, strict=True)], pocket, angle_prior)
+    return fit.solve()
+
+
+def calibrate_dataset(raw: xr.Dataset, *, angle_prior: float | None = None) -> ProfilerPose:
+    """Return the pose of the profiler from a raw dataset, variant "profiler pose" of the crossbeam scan.
+
+    Parameters
+    ----------
+    raw : Dataset
+        Schema ``errormotion.raw.crossbeam_scan/1`` with ``pocket_radius``.
+    angle_prior : float, optional
+        As in `calibrate`, rad.
+
+    Raises
+    ------
+    DatasetError
+        The dataset breaks its schema.
+    MethodError
+        It holds no scans of a pocket, or as in `calibrate`.
+    """
+    validate(raw)
+    if "pocket_radius" not in raw:
+        raise MethodError(
+            "The calibration needs scans of a pocket (a raw dataset of crossbeam_scan with pocket_radius); found "
+            f"{raw.attrs['schema']} with {', '.join(map(str, raw.data_vars))}."
+        )
+    names = ("radius", "radius_uncertainty", "centre", "centre_uncertainty")
+    known: dict[str, Any] = {name: raw[f"pocket_{name}"].values for name in names if f"pocket_{name}" in raw}
+    place = ("scan", "profile")
+    height, stage = raw.height.transpose(*place, "point"), raw.stage.transpose(*place, "direction")
+    return calibrate(raw.x.values, height.values, stage.values, Pocket(**known), angle_prior=angle_prior)
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """What the fit takes of one scan: edges (n, 2, 3) in the profiler's frame, and the plate."""
+
+    edges: Array
+    stage: Array  # (n, 3) of the lines of the edges
+    plate: Array  # z of the plate at x = 0, per line
+    lift: float
+    tilt: Tilt
+
+
+def _scan(x: Array, height: Array, stage: Array) -> _Scan:
+    plate, rim = edges.pocket(x, height)
+    heights = plate.height[np.isfinite(plate.height)]
+    # the carriage goes straight and the plate is level: all lines see the rim at one height, best known by their mean
+    z = heights.mean() + plate.slope * rim.x
+    places = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
+    return _Scan(places, stage[rim.line], heights, float(stage[0, 2]), plate)
+
+
+class _Fit:
+    """Least squares over half sums and half differences of the radii of both edges of a line, the plate and the priors.
+
+    Jitter of a line along the feed moves both its edges together: only the half sum has it.
+    """
+
+    def __init__(self, scans: Sequence[_Scan], pocket: Pocket, angle_prior: float | None) -> None:
+        self.scans, self.pocket, self.angle_prior = scans, pocket, angle_prior
+        self.edges = np.concatenate([scan.edges for scan in scans])
+        self.centre = np.array(pocket.centre, dtype=float)
+        self.shift = np.concatenate([scan.stage for scan in scans])[:, None] - self.centre
+        self.size_x = self.size_y = 2e-6
+
+    def solve(self) -> ProfilerPose:
+        """Return the fit, its weights from its own residuals."""
+        p = self._start()
+        used = self._rim(p)[2] > OBLIQUE
+        fitted = used
+        for _ in range(4):
+            solution = least_squares(self._residuals, p / _UNIT, args=(used,), method="lm")
+            p, fitted = solution.x * _UNIT, used
+            used = self._weigh(p, used)
+        lines = int(fitted.sum())
+        if lines < 10:
+            raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
+        covariance = self._covariance(np.array(solution.jac), np.array(solution.fun), 2 * lines)
+        return ProfilerPose(p[:6], covariance, float(p[6]), self.size_x, self.size_y, lines)
+
+    def _start(self) -> Array:
+        middle = (self.edges.mean(axis=1) + self.shift[:, 0]).mean(axis=0)
+        b = np.mean([-np.arctan(scan.tilt.slope) for scan in self.scans])
+        return np.array([0.0, b, 0.0, *-middle, self.pocket.radius])
+
+    def _rim(self, p: Array) -> tuple[Array, Array, Array, Array]:
+        """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of their places, (n,) each."""
+        P = pose(*p[:6]).apply(self.edges.reshape(-1, 3)).reshape(self.edges.shape) + self.shift
+        R = np.hypot(P[..., 0], P[..., 1])
+        cos, sin = np.abs(P[..., 0] / R).min(axis=1), np.abs((P[..., 1] / R).mean(axis=1))
+        return R.mean(axis=1) - p[6], (R[:, 1] - R[:, 0]) / 2, cos, sin
+
+    def _residuals(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
+        """Return everything over its standard deviation."""
+        p = scaled * _UNIT
+        half_sum, half_difference, cos, sin = self._rim(p)
+        size = cos * self.size_x / np.sqrt(2)
+        rows = [(half_sum / np.hypot(size, sin * self.size_y))[used], (half_difference / size)[used]]
+        rows.append(np.array([(p[6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9)]))
+        H = pose(*p[:6])
+        R = H.rotation.as_matrix()
+        for scan in self.scans:
+            Z = R[2, 2] * scan.plate.mean() + H.translation[2] + scan.lift - self.centre[2]  # at x = 0
+            size_Z = scan.plate.std(ddof=1) / np.sqrt(scan.plate.size)
+            slope = -R[2, 0] / R[2, 2]
+            misses = Z / max(size_Z, 1e-9), (scan.tilt.slope - slope) / max(scan.tilt.uncertainty, 1e-9)
+            rows.append(np.array(misses))
+        if self.angle_prior is not None:
+            rows.append(p[:3] / self.angle_prior)
+        return np.concatenate(rows)
+
+    def _weigh(self, p: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Estimate both scatters from the residuals; return the lines that fit."""
+        half_sum, half_difference, cos, sin = self._rim(p)
+        right = np.sqrt(2) * half_difference / cos
+        rough = max(1.4826 * float(np.median(np.abs(right[used]))), 1e-9)
+        fits = (cos > OBLIQUE) & (np.abs(right) < CLIP * rough)
+        self.size_x = max(float(np.sqrt(np.mean(right[fits] ** 2))), 1e-9)
+        size = np.hypot(cos * self.size_x / np.sqrt(2), sin * self.size_y)
+        rough = max(1.4826 * float(np.median(np.abs(half_sum[fits] / size[fits]))), 1e-3)
+        fits &= np.abs(half_sum) < CLIP * rough * size
+        along = (half_sum**2 - (cos * self.size_x) ** 2 / 2) * sin**2
+        self.size_y = float(np.sqrt(max(along[fits].sum() / np.sum(sin[fits] ** 4), 1e-18)))
+        return np.asarray(fits)
+
+    def _covariance(self, J: Array, misses: Array, edges_end: int) -> Array:
+        """Return the covariance (6, 6) of the pose, or refuse what is not determined.
+
+        The first ``edges_end`` residuals are the edges'. What they scatter depends on how obliquely a line crosses the
+        rim, so they enter with their own squares (White 1980), the others with the variance that they have.
+        """
+        _, s, V = np.linalg.svd(J, full_matrices=False)
+        inverse = V.T / np.maximum(s, 1e-12 * s[0])
+        squares = np.ones(misses.size)
+        squares[:edges_end] = misses[:edges_end] ** 2 * edges_end / (edges_end - _UNIT.size)
+        gain = (inverse @ inverse.T) @ J.T
+        covariance = np.asarray((gain * squares) @ gain.T * np.outer(_UNIT, _UNIT))[:6, :6]
+        size = np.sqrt(np.diag(covariance))
+        worst = np.repeat([WORST_ANGLE, WORST_PLACE], 3)
+        unknown = [name for name, too_much in zip(PARAMETERS, size > worst, strict=True) if too_much]
+        if unknown:
+            raise MethodError(
+                f"The scans of the pocket do not determine {', '.join(unknown)} of the profiler's pose. The angle a "
+                "needs scans at two heights of the spindle, some millimetres apart, or an angle_prior, as 0.005 rad."
+            )
+        covariance[3:, 3:] += np.diag(np.asarray(self.pocket.centre_uncertainty, dtype=float) ** 2)
+        return covariance

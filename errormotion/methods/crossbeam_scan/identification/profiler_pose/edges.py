@@ -1,0 +1,172 @@
+"""What a scan of a level plate with a circular pocket shows: tilt and height of each line, and the edges of the pocket.
+
+An edge is found to a fraction of the point pitch from the area under the step: with the height g between floor (0) and
+plate (1), the edge of a step that falls at the right of the window lies where the sum of g times the pitch ends. That
+holds for any symmetrical spot, at any sampling phase.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+Mask = NDArray[np.bool_]
+
+#: what stray light may spoil beside an edge, and how far the floor is looked at from there, m
+TRIM, FLOOR = 250e-6, 1.5e-3
+#: a point farther off its line than this many standard deviations is left out
+CLIP = 4.5
+#: an edge is given up where more of its window is missing
+GAPS = 0.4
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """The common slope of the lines on a plane.
+
+    Attributes
+    ----------
+    slope, uncertainty : float
+        dz/dx and its standard uncertainty, from the scatter of the lines, so whatever is correlated along a line is in.
+    height : ndarray, (line,)
+        z of each line at x = 0 under the common slope, m; NaN without points.
+    """
+
+    slope: float
+    uncertainty: float
+    height: Array
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Both edges of a pocket on the lines that cross it.
+
+    Attributes
+    ----------
+    line : ndarray of int, (n,)
+        Which line.
+    x : ndarray, (n, 2)
+        Left and right edge, m.
+    z : ndarray, (n, 2)
+        Height of the plate there, m.
+    """
+
+    line: NDArray[np.int64]
+    x: Array
+    z: Array
+
+
+def tilt(x: Array, height: Array) -> Tilt:
+    """Return the slope of a plane along the profiles, and the height of each of them.
+
+    Parameters
+    ----------
+    x : (point,)
+        m.
+    height : (line, point)
+        m; NaN = no reading, or no part of the plane.
+
+    Raises
+    ------
+    MethodError
+        Fewer than three lines with a hundred points each.
+    """
+    used = np.isfinite(height)
+    for _ in range(3):
+        n = used.sum(axis=1)
+        full = n >= 100
+        if full.sum() < 3:
+            raise MethodError(
+                f"The tilt needs three lines with 100 points on the plane; found {int(full.sum())} of {len(height)} "
+                "lines. Check the unit of the heights and that the plane lies in the measuring range."
+            )
+        z = np.where(used, height, 0.0)
+        mean_x, mean_z = (used @ x) / np.maximum(n, 1), z.sum(axis=1) / np.maximum(n, 1)
+        spread = used @ x**2 - n * mean_x**2
+        slopes = (z @ x - n * mean_x * mean_z)[full] / spread[full]
+        weights = spread[full] / spread[full].sum()
+        slope = float(weights @ slopes)
+        residual = height - np.where(n > 0, mean_z - slope * mean_x, np.nan)[:, None] - slope * x
+        size = 1.4826 * np.nanmedian(np.abs(residual[used]))
+        used &= np.abs(np.where(np.isfinite(residual), residual, np.inf)) <= CLIP * max(size, 1e-12)
+    count = slopes.size
+    # the variance of a weighted mean, from the scatter about it
+    variance = float(weights**2 @ (slopes - slope) ** 2) * count / (count - 1)
+    return Tilt(slope, float(np.sqrt(variance)), np.where(full, mean_z - slope * mean_x, np.nan))
+
+
+def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
+    """Return the plate around a pocket and the edges of the pocket.
+
+    Parameters
+    ----------
+    x : (point,)
+        Evenly spaced, increasing, m.
+    height : (line, point)
+        m; NaN = no reading.
+
+    Raises
+    ------
+    MethodError
+        There are no two levels, or fewer than ten lines with both edges.
+    """
+    pitch = float(x[1] - x[0])
+    low, high = np.nanpercentile(height, [2, 98]) if np.isfinite(height).any() else (np.nan, np.nan)
+    deep = height < (low + high) / 2
+    inside = _spans(deep)
+    if high - low < 0.2e-3 or inside.sum() < 10:
+        raise MethodError(
+            f"A circular pocket at least 0.2 mm deep is needed, with ten lines across it; found levels {low * 1e3:.4g} "
+            f"and {high * 1e3:.4g} mm, and {int(inside.sum())} lines. Check the unit and that the pocket was scanned."
+        )
+    trim = max(round(TRIM / pitch), 3)
+    first, last = np.argmax(deep, axis=1), x.size - 1 - np.argmax(deep[:, ::-1], axis=1)
+    index = np.arange(x.size)
+    beside = ~np.any(deep, axis=1, keepdims=True) | (index < first[:, None] - trim) | (index > last[:, None] + trim)
+    seen = np.isfinite(height)
+    begin, end = np.argmax(seen, axis=1), x.size - 1 - np.argmax(seen[:, ::-1], axis=1)
+    within = (index >= begin[:, None] + trim) & (index <= end[:, None] - trim)
+    plate = tilt(x, np.where(beside & within, height, np.nan))
+    lines, places = [], []
+    for k in np.flatnonzero(inside & np.isfinite(plate.height)):
+        top = plate.height[k] + plate.slope * x
+        ends = [_edge(x, height[k], top, i, side * trim) for i, side in ((first[k], 1), (last[k], -1))]
+        if np.isfinite(ends).all():
+            lines.append(k)
+            places.append(ends)
+    if len(lines) < 10:
+        raise MethodError(
+            f"Ten lines with both edges of the pocket are needed; found {len(lines)}. Too many readings are missing at "
+            "the edges, or the pocket is not wholly in the scan."
+        )
+    line, at = np.array(lines, dtype=np.int64), np.array(places)
+    return plate, Edges(line, at, plate.height[line, None] + plate.slope * at)
+
+
+def _spans(deep: Mask) -> Mask:
+    """Return the lines that are deep over a good part of their width, and not at its ends."""
+    many = deep.sum(axis=1) >= max(0.02 * deep.shape[1], 8)
+    return np.asarray(many & ~deep[:, :4].any(axis=1) & ~deep[:, -4:].any(axis=1))
+
+
+def _edge(x: Array, z: Array, top: Array, index: int, trim: int) -> float:
+    """Return the place of an edge near a point, m; ``trim`` is positive where the floor is at the right."""
+    pitch, reach, side = float(x[1] - x[0]), abs(trim), int(np.sign(trim))
+    begin, end = index - reach, index + reach
+    far = sorted((index + trim, index + side * (reach + round(FLOOR / pitch))))
+    if begin < 0 or end >= x.size or far[0] < 0 or far[1] >= x.size:
+        return np.nan
+    floor = z[far[0] : far[1]] - top[far[0] : far[1]]
+    if np.isfinite(floor).sum() < reach:
+        return np.nan
+    g = 1 - (z - top)[begin : end + 1] / np.nanmedian(floor)
+    known = np.isfinite(g)
+    if np.mean(~known) > GAPS or not (known[0] and known[-1]):
+        return np.nan
+    share = np.interp(np.arange(g.size), np.flatnonzero(known), np.clip(g[known], 0.0, 1.0)).sum() * pitch
+    return float(x[begin] - pitch / 2 + share if side > 0 else x[end] + pitch / 2 - share)

@@ -1,0 +1,244 @@
+"""A height map reduced to blocks of 4 profiles by 16 points: height, slopes and noise of each, in one pass.
+
+The mean of a block of width h is the height at its centre plus z'' h^2 / 24, for points at a pitch p plus
+z'' (h^2 - p^2) / 24. Second differences of the means take this out. A block in which points are missing or wrong is
+fitted again by medians and a plane through what lies near it; the same correction follows from the points that are
+left. A block with too few points, or that no plane explains, is dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.registration import kernels, sums
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
+from errormotion.methods.crossbeam_scan.identification.registration.kernels import COLUMNS, POINTS, ROWS
+from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface, repaired
+
+LARGEST = 1.0
+"""No artefact is larger than this, m: larger numbers are millimetres."""
+FEWEST_BLOCKS = 8
+BESIDE_HOLE = 3.0
+"""A block beside a hole counts with its variance times this: what fills the hole is no measurement."""
+THIN = 4
+_SAMPLED = 64
+_FEW = 2500
+
+
+@dataclass(frozen=True)
+class BlockMap:
+    """A scan as `prepare` leaves it.
+
+    Attributes
+    ----------
+    x, y : ndarray
+        Centres of the block columns and block rows in the profiler's frame, m, evenly spaced.
+    height : ndarray (block row, block column)
+        Height of the surface at the centres, m; filled in from around where ``variance`` is infinite.
+    slope_x, slope_y : ndarray (block row, block column)
+        Slopes of the blocks.
+    variance : ndarray (block row, block column)
+        Variance of the height as the scatter of the points says, m^2; infinite where the block was dropped.
+    points : ndarray (block row, block column)
+        Points used.
+    noise : float
+        Standard deviation of a point about the surface, m; line jitter shows in it in part.
+    slope_noise : float
+        Standard deviation of the blocks' slopes, the larger of both directions.
+    scan : tuple of ndarray
+        The height map, its x and its y, as given.
+    """
+
+    x: Array
+    y: Array
+    height: Array
+    slope_x: Array
+    slope_y: Array
+    variance: Array
+    points: NDArray[np.int64]
+    noise: float
+    slope_noise: float
+    scan: tuple[NDArray[np.float32], Array, Array] = field(repr=False)
+
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """Distance of the block centres along x and y, m."""
+        return float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0])
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which blocks say something, (block row, block column)."""
+        return np.isfinite(self.variance)
+
+    @cached_property
+    def centre(self) -> Array:
+        """Middle of the known surface, (3,), m."""
+        return np.asarray(sums.middle(self.height, self.variance, self.x, self.y))
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The surface between the blocks, as a spline."""
+        return Surface.through(self.height, self.x, self.y)
+
+    @property
+    def bending(self) -> float:
+        """Standard deviation of a block's points about its plane because the surface is curved, m.
+
+        Beyond 1.5 times the noise the blocks are too large for the surface: what lies between them is not known to the
+        covariance that a registration states.
+        """
+        along_x, along_y = np.diff(self.height, 2, axis=1), np.diff(self.height, 2, axis=0)
+        # x^2 / 2 over a width h has the variance h^4 / 720.
+        return float(np.sqrt((np.mean(along_x**2) + np.mean(along_y**2)) / 720.0))
+
+    @cached_property
+    def usual_variance(self) -> float:
+        """Median variance of a block's height, m^2."""
+        return sampled_median(self.variance)
+
+    @cached_property
+    def moments(self) -> Moments:
+        """What the slopes of every fourth block along both directions tell about motions."""
+        q = sums.normals_by_place(
+            self.height, self.slope_x, self.slope_y, self.variance, self.x, self.y, self.centre, THIN
+        )
+        return Moments(q @ q.T, q[8:] @ q[8:].T, q.shape[1])
+
+
+def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
+    """Reduce a scan to blocks.
+
+    Parameters
+    ----------
+    height : array_like (row, column)
+        Heights z in the profiler's frame, m; NaN where the sensor gave no value. float32 is read as it is.
+    x : array_like (column,)
+        Places of the points along the profile, m, evenly spaced and rising.
+    y : array_like (row,)
+        Places of the profiles along the feed, m, rising; uneven by less than their pitch.
+
+    Returns
+    -------
+    BlockMap
+
+    Raises
+    ------
+    MethodError
+        Shapes do not fit, places do not rise or are not even, numbers that are no metres, or hardly any points.
+    """
+    z = np.ascontiguousarray(height, dtype=np.float32)
+    x, y = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(y, dtype=float)
+    if z.ndim != 2 or z.shape != (y.size, x.size):
+        raise MethodError(
+            f"expected heights of shape (rows, columns) = ({y.size}, {x.size}) as y and x say, found {z.shape}; "
+            "give z[row, column] with one y for every profile and one x for every point of a profile"
+        )
+    rows, columns = z.shape[0] // ROWS, z.shape[1] // COLUMNS
+    if min(rows, columns) < FEWEST_BLOCKS:
+        raise MethodError(
+            f"expected at least {FEWEST_BLOCKS * ROWS} profiles of {FEWEST_BLOCKS * COLUMNS} points, found "
+            f"{z.shape[0]} of {z.shape[1]}; scan a longer piece of the artefact"
+        )
+    xc, dx = _centres("x", x, columns, COLUMNS, 0.01)
+    yc, dy = _centres("y", y, rows, ROWS, 1.0)
+    scales = kernels.block_scales(z, dx[0], dy, max(1, rows * columns // _SAMPLED))
+    scales = scales[np.isfinite(scales)]
+    if scales.size < FEWEST_BLOCKS:
+        raise MethodError(
+            f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
+            f"{kernels.FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
+        )
+    out = np.empty((9, rows, columns))
+    # A scan without any noise still has the last bit of its numbers; a few of them tell how large they are.
+    least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
+    kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least), out)
+    return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y))
+
+
+def _centres(name: str, places: Array, blocks: int, size: int, tolerance: float) -> tuple[Array, Array]:
+    """Return evenly spaced centres of the blocks and the places of the points about them, (block, point)."""
+    step = np.diff(places)
+    if not np.isfinite(places).all() or not (step > 0).all():
+        wrong = int(np.argmax(~(step > 0)))
+        raise MethodError(
+            f"expected {name} to rise from point to point, found {places[wrong]:.9g} m followed by "
+            f"{places[wrong + 1]:.9g} m at index {wrong + 1}; check the encoder's count (overflow, reversal) and "
+            "sort or cut the scan"
+        )
+    if places[-1] - places[0] > LARGEST:
+        raise MethodError(
+            f"expected {name} in metres over less than {LARGEST:g} m, found {places[-1] - places[0]:.6g} m; "
+            "if these are millimetres, divide by 1000"
+        )
+    used = places[: blocks * size]
+    pitch = (used[-1] - used[0]) / (used.size - 1)
+    even = used[0] + pitch * np.arange(used.size)
+    even += np.median(used - even)
+    uneven = float(np.max(np.abs(used - even)))
+    if uneven > tolerance * pitch:
+        raise MethodError(
+            f"expected {name} evenly spaced within {tolerance:g} of the pitch {pitch * 1e6:.3f} um, found "
+            f"{uneven * 1e6:.3f} um; check the trigger for lost pulses, or resample the scan"
+        )
+    centres = even[0] + pitch * (np.arange(blocks) * size + (size - 1) / 2)
+    return centres, used.reshape(blocks, size) - centres[:, None]
+
+
+def _deblurred(
+    out: Array, x: Array, y: Array, dx: Array, dy: Array, least: float, scan: tuple[NDArray[np.float32], Array, Array]
+) -> BlockMap:
+    """Return the block map of the kernel's columns: filled, sharpened, its noise estimated."""
+    mean, sx, sy, gain = out[0], out[1], out[2], out[5]
+    pitch_x, pitch_y = x[1] - x[0], y[1] - y[0]
+    known = np.isfinite(mean)
+    if np.count_nonzero(known) < FEWEST_BLOCKS:
+        raise MethodError(
+            "expected a smooth surface, found none: no plane explains the blocks of 16 x 4 points; "
+            "check that heights are in metres and that the scan is of the artefact"
+        )
+    if not known.all():
+        out[0], out[1], out[2] = repaired(mean, sx, sy, pitch_x, pitch_y)
+    # A curved block scatters about its plane without any noise.
+    share = POINTS / (POINTS - 3)
+    bends = share * np.array([np.var(0.5 * dx**2), np.var(0.5 * dy**2), np.var(dx) * np.var(dy)])
+    height, rest = np.empty((2, *mean.shape))
+    kernels.sharpen(out, pitch_x, pitch_y, bends, height, rest)
+    noise = np.sqrt(max(sampled_median(rest), least**2))
+    variance = gain * noise**2
+    if not known.all():
+        variance = np.where(known, np.where(_beside(~known), BESIDE_HOLE, 1.0) * variance, np.inf)
+    slope_noise = max(_slope_noise(out[1], height, pitch_x, 1), _slope_noise(out[2], height, pitch_y, 0))
+    points = out[4].astype(np.int64)
+    return BlockMap(x, y, height, out[1], out[2], variance, points, float(noise), slope_noise, scan)
+
+
+def _beside(lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which blocks have a lost one among their eight neighbours."""
+    wide = np.pad(lost, 1)
+    along = wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
+    beside: NDArray[np.bool_] = along[:-2] | along[1:-1] | along[2:]
+    return beside
+
+
+def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
+    """Return by how much slopes within blocks differ from those between blocks, robustly."""
+    if axis == 0:
+        slope, height = slope.T, height.T
+    step = max(1, slope.size // _FEW)
+    slope, height = slope[::step], height[::step]
+    inner = np.abs(slope[:, 1:-1] - (height[:, 2:] - height[:, :-2]) / (2 * pitch))
+    return 1.4826 * sampled_median(inner)
+
+
+def sampled_median(values: Array) -> float:
+    """Return the median of the finite out of some thousand evenly chosen values: a robust scale needs no more."""
+    flat = values.reshape(-1)
+    step = flat.size // _FEW | 1  # odd: not the same columns of every row
+    found = sums.median_of_some(flat, step)
+    return found if found == found else float(np.median(flat[np.isfinite(flat)]))

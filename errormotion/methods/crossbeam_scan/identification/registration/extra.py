@@ -1,0 +1,146 @@
+"""Further parameters of a registration: linear displacements of the surface beside the rigid motion.
+
+A carriage that turns while it feeds carries a picture of the artefact that is sheared or stretched, and a warm artefact
+one that is larger. Every such parameter e displaces a point P of the cold frame by e G (P - c), with G a 3 x 3 matrix
+and c the point of the twist. Its units are those of a slope (m per m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.kinematics.twists import adjoint, known_product
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import (
+    MOTIONS,
+    Freedoms,
+    scales,
+    undetermined,
+)
+
+
+def _entry(i: int, j: int) -> Array:
+    G = np.zeros((3, 3))
+    G[i, j] = 1.0
+    return G
+
+
+BASES: dict[str, Array] = {
+    "feed_x": _entry(0, 1),
+    "feed_y": _entry(1, 1),
+    "feed_z": _entry(2, 1),
+    "scale_x": _entry(0, 0),
+    "scale_z": _entry(2, 2),
+    "expansion": np.eye(3),
+}
+"""Drift along x, y, z per metre of feed (that along y: its scale), scales of the sensor, expansion of the artefact."""
+
+WIDE = 0.05
+"""A prior wider than this holds nothing: the parameter counts as free."""
+_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Extra:
+    """The parameters that are asked for.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Keys of `BASES`.
+    bases : ndarray (k, 3, 3)
+        Their matrices G.
+    prior : ndarray (k,)
+        Standard deviations of their priors about 0; infinite where they are free.
+    """
+
+    names: tuple[str, ...]
+    bases: Array
+    prior: Array
+
+    @classmethod
+    def of(cls, asked: Mapping[str, float] | None) -> Extra:
+        """Return the parameters of a mapping from name to standard deviation.
+
+        Raises
+        ------
+        MethodError
+            A name is unknown, or a standard deviation is no positive number.
+        """
+        asked = dict(asked or {})
+        if unknown := sorted(set(asked) - set(BASES)):
+            raise MethodError(
+                f"expected extra parameters out of {', '.join(BASES)}, found {', '.join(map(repr, unknown))}; "
+                "leave out or rename what is not in the list"
+            )
+        if wrong := {name: sigma for name, sigma in asked.items() if not sigma > 0}:
+            raise MethodError(
+                f"expected the standard deviation of the prior of every extra parameter as a positive number, found "
+                f"{', '.join(f'{name} = {sigma}' for name, sigma in wrong.items())}; "
+                "give inf for a free one, and leave out what shall stay 0"
+            )
+        bases = np.array([BASES[name] for name in asked]).reshape(-1, 3, 3)
+        return cls(tuple(asked), bases, np.array([float(sigma) for sigma in asked.values()]))
+
+    @property
+    def motions(self) -> Array:
+        """Displacement of a point by a unit of twist or parameter, affine in its place: (6 + k, 3, 4)."""
+        own = np.zeros((len(self.names), 3, 4))
+        own[:, :, 1:] = self.bases
+        return np.concatenate([MOTIONS, own])
+
+    def stretch(self, values: Array) -> Array:
+        """Return 1 + sum of e G, (3, 3)."""
+        total: Array = np.eye(3) + np.tensordot(values, self.bases, 1)
+        return total
+
+    def moved(self, covariance: Array, shift: Array) -> Array:
+        """Return the covariance of twist and parameters (6 + k, 6 + k) about a point that is ``shift`` (3,) further."""
+        A = np.eye(6 + len(self.names))
+        A[:6, :6] = adjoint(shift=shift)
+        A[:3, 6:] = (self.bases @ shift).T
+        moved = known_product(A, known_product(A, covariance).T)
+        return 0.5 * (moved + moved.T)
+
+    def pose_about(self, pose: RigidTransform, values: Array, shift: Array) -> RigidTransform:
+        """Return the pose that, with the same values about a point ``shift`` (3,) further, moves everything alike."""
+        if not len(values):
+            return pose
+        stretch = self.stretch(values)
+        return RigidTransform.from_translation(np.linalg.solve(stretch, (stretch - np.eye(3)) @ shift)) * pose
+
+    def refuse_undetermined(self, information: Array, blocks: int, free: Freedoms) -> None:
+        """Raise where free parameters cannot be told from the motion, or from one another.
+
+        Parameters
+        ----------
+        information : ndarray (6 + k, 6 + k)
+            Sum of J^T J over the blocks, without what may come from noise alone.
+        blocks : int
+            Number of blocks in the sum.
+        free : Freedoms
+            What the artefact determines of the motion alone.
+        """
+        loose = np.flatnonzero(self.prior > WIDE)
+        if not len(loose):
+            return
+        kept = np.concatenate([np.arange(6), 6 + loose])
+        scale = scales(free.radius, len(loose))
+        scaled = information[np.ix_(kept, kept)] * np.outer(scale, scale)
+        motions = np.vstack([free.motions, np.zeros((len(loose), free.motions.shape[1]))])
+        basis = np.linalg.svd(motions)[0][:, motions.shape[1] :] if motions.shape[1] else np.eye(len(scale))
+        _, vectors = undetermined(basis.T @ scaled @ basis, np.ones(basis.shape[1]), blocks)
+        open_ = (basis @ vectors)[6:]
+        share = np.max(np.abs(open_), axis=1, initial=0.0)
+        names = [self.names[loose[i]] for i in np.flatnonzero(share > _SHARE * share.max(initial=0.0))]
+        if names:
+            raise MethodError(
+                f"expected extra parameters that the artefact's surface tells from its motion and from one another, "
+                f"found undetermined: {', '.join(names)}; leave some of them out, or give the standard deviation of "
+                f"their prior, of at most {WIDE:g}"
+            )

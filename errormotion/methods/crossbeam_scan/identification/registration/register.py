@@ -1,0 +1,266 @@
+"""The registration of two block maps, and the choice of what does it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.datasets import DOF
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.registration.blocks import THIN, BlockMap
+from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Freedoms, freedoms, refuse, scales
+from errormotion.methods.crossbeam_scan.identification.registration.kernels import ROWS
+from errormotion.methods.crossbeam_scan.identification.registration.result import Registration
+from errormotion.methods.crossbeam_scan.identification.registration.solver import (
+    Noise,
+    Problem,
+    State,
+    Sums,
+    estimate_noise,
+    inverse,
+    normal_equations,
+    solve,
+)
+from errormotion.methods.crossbeam_scan.identification.registration.start import Start, descend, search
+from errormotion.methods.crossbeam_scan.identification.registration.sums import within
+
+Backend = Literal["height_map", "open3d_plane", "paper"]
+
+GATE = 5.0
+"""Blocks further off than this many robust standard deviations are dirt, and left out."""
+LARGEST_SHIFT, LARGEST_TURN = 4e-3, 0.1
+"""Beyond these, m and rad, a scan is off its place: twice what the start is made for."""
+LEAST_OVERLAP = 0.5
+"""Share of the warm blocks that must have cold surface beneath them."""
+LARGEST_MISFIT = 0.02
+"""Residuals may be this share of the surface's relief before the scans count as two artefacts."""
+NOISY = 10.0
+"""Information counts beyond this many times what the slopes' noise makes of nothing."""
+NEAR = 0.01
+"""The noise is estimated once a step would change its variance by no more than this share."""
+STRAIGHT = 400.0
+"""Over steps of this squared length, in standard deviations, residuals change in proportion: 0.01 of one is left."""
+_STEPS = 12
+
+
+def register(
+    cold: BlockMap,
+    warm: BlockMap,
+    *,
+    registration: Backend = "height_map",
+    point: ArrayLike | None = None,
+    line_effects: bool = True,
+    loose: Literal["refuse", "report"] = "refuse",
+    extra: Mapping[str, float] | None = None,
+) -> Registration:
+    """Find how the profiler's frame has moved between two scans of one artefact.
+
+    Parameters
+    ----------
+    cold, warm : BlockMap
+        The scans, from `prepare`. The motion may be up to 2 mm and 0.05 rad.
+    registration : {"height_map", "open3d_plane", "paper"}
+        Gauss-Newton on the height map; point-to-plane ICP of Open3D; trimming, statistical outlier removal, NDT and
+        point-to-point ICP as published. The latter two need the extra ``open3d`` and are there for comparison.
+    point : array_like (3,), optional
+        Functional point of the result in profiler coordinates, m; default: the middle of the cold surface.
+    line_effects : bool
+        Whether jitter from profile to profile is looked for, and taken out where it shows.
+    loose : {"refuse", "report"}
+        What to do with an artefact that leaves freedoms undetermined: raise, or find the others and name these.
+    extra : mapping of str to float, optional
+        Further parameters to be found with the motion, out of `extra.BASES`: name and standard deviation of the prior
+        about 0, in m per m; inf for a free one.
+
+    Returns
+    -------
+    Registration
+
+    Raises
+    ------
+    MethodError
+        The artefact leaves freedoms or extra parameters undetermined (they are named), the scans do not overlap or show
+        two surfaces, an unknown backend or parameter is asked for, the backend is not installed, or the steps do not
+        settle.
+    """
+    if registration not in ("height_map", "open3d_plane", "paper"):
+        raise MethodError(
+            f"expected registration 'height_map', 'open3d_plane' or 'paper', found {registration!r}; choose one of them"
+        )
+    terms = Extra.of(extra)
+    if terms.names and registration != "height_map":
+        raise MethodError(
+            f"expected registration 'height_map' for the extra parameters {', '.join(terms.names)}, found "
+            f"{registration!r}, which knows the rigid motion only; choose one of both"
+        )
+    free = _determined(cold, warm, loose, terms)
+    begun = _begin(cold, warm, free)
+    problem = Problem.of(cold, warm, extra=terms)
+    at = problem.centre if point is None else np.asarray(point, dtype=float)
+    if registration == "height_map":
+        found = _refined(problem, begun, free, line_effects)
+        rms, missed = None, np.zeros(6 + len(terms.names))
+    else:
+        from errormotion.methods.crossbeam_scan.identification.registration import clouds
+
+        pose, rms, steps = clouds.BACKENDS[registration](cold.scan, warm.scan)
+        state = State.of(pose)
+        gate = GATE * problem.evaluate(state).scale()
+        sums = problem.evaluate(state, gate)
+        found = _Found(state, sums, Noise(), gate, steps)
+        # What the height map still sees of this pose's error is the honest part of its covariance.
+        missed = solve(*normal_equations(sums, found.noise), free.motions, free.radius)
+    sums, state = found.sums, found.state
+    C = _covariance(problem, found, found.noise, free)
+    share = _cold_share(problem, warm, found, free, C)
+    C = terms.moved(_unknown(C + np.outer(missed, missed), free), at - problem.centre)
+    square, used, points = within(sums.residual, warm.points, found.gate)
+    if rms is None:
+        rms = float(np.sqrt(square / used))
+    return Registration(
+        backend=registration, pose=terms.pose_about(state.pose, state.values, at - problem.centre), point=at,
+        covariance=C[:6, :6], residual=sums.residual, x=warm.x, y=warm.y,
+        rms=rms, points=int(points), noise=(cold.noise, warm.noise),
+        line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
+        condition=free.condition, loose=free.loose, iterations=found.steps,
+        extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Found:
+    state: State
+    sums: Sums
+    noise: Noise
+    gate: float
+    steps: int
+
+
+def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Freedoms:
+    """Return what both scans determine, from the surfaces alone: each laid on itself."""
+    found = []
+    for block_map, what in ((cold, "a cold scan"), (warm, "a warm scan")):
+        of_slopes, of_noise = block_map.moments.information(extra.motions)
+        of_noise *= NOISY * block_map.slope_noise**2
+        blocks = block_map.moments.blocks
+        free = freedoms(of_slopes[:6, :6], blocks, of_noise[:6, :6])
+        if loose == "refuse":
+            refuse(free, what)
+        extra.refuse_undetermined(of_slopes - of_noise, blocks, free)
+        found.append(free)
+    return max(found, key=lambda free: (len(free.loose), free.condition))
+
+
+def _covariance(problem: Problem, found: _Found, noise: Noise, free: Freedoms) -> Array:
+    """Return the covariance (n, n) of twist and extra parameters at the problem's centre."""
+    H, _ = problem.equations(found.sums, noise, found.state)
+    scale = scales(free.radius, len(H) - 6)
+    C: Array = noise.k * np.outer(scale, scale) * inverse(H * np.outer(scale, scale), free.motions)
+    return C
+
+
+def _cold_share(problem: Problem, warm: BlockMap, found: _Found, free: Freedoms, covariance: Array) -> float:
+    """Return the share of the covariance that comes from the cold scan: that of its noise, and half of the jitter."""
+    white = problem.cold.usual_variance / (problem.cold.usual_variance + warm.usual_variance)
+    if not any(found.noise.tau):
+        return white
+    alone = _covariance(problem, found, Noise(found.noise.k), free)
+    known = np.diag(covariance) > 0
+    part = float(np.mean(np.diag(alone)[known] / np.diag(covariance)[known]))
+    return part * white + (1.0 - part) * 0.5
+
+
+def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
+    """Return where to start, or refuse scans that show no common surface."""
+    thin = Problem.of(cold, warm, THIN)
+    noise = 30 * cold.usual_variance**0.5
+    start = descend(thin, thin.rest, free.motions, free.radius)
+    if not start.scale < noise:
+        found = search(thin, free.motions, free.radius)
+        start = found if found.scale < start.scale else start
+    if np.isinf(start.scale):
+        raise MethodError(
+            f"expected two scans of one place, found the cold one at {_extent(cold)} and the warm one at "
+            f"{_extent(warm)}; make both begin at the same place, and count their places from the same zero"
+        )
+    if not start.scale < noise and not start.scale < LARGEST_MISFIT * (relief := _relief(cold)):
+        raise MethodError(
+            f"expected two scans of one artefact moved by at most 2 mm and 0.05 rad, found surfaces that stay "
+            f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) wherever one is laid on the other; "
+            "check that both scans are of the same artefact, begin at the same place and have the same units"
+        )
+    M = start.state.matrix
+    shift, turn = M[:, :3] @ cold.centre + M[:, 3] - cold.centre, start.state.turn
+    if np.hypot(*shift[:2]) > LARGEST_SHIFT or turn > LARGEST_TURN:
+        raise MethodError(
+            f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
+            f"{turn:.3f} rad; let both scans begin at the same place of the artefact"
+        )
+    if start.overlap < LEAST_OVERLAP:
+        raise MethodError(
+            f"expected at least {LEAST_OVERLAP:.0%} of the warm scan to lie on the cold one, found {start.overlap:.0%}"
+            "; scan the same piece of the artefact"
+        )
+    return start
+
+
+def _extent(block_map: BlockMap) -> str:
+    """Return where a scan lies, in words."""
+    return " and ".join(
+        f"{name} from {places[0] * 1e3:.1f} to {places[-1] * 1e3:.1f} mm"
+        for name, places in (("x", block_map.x), ("y", block_map.y))
+    )
+
+
+def _relief(block_map: BlockMap) -> float:
+    """Return the robust deviation of a surface from its plane, m."""
+    x, y = np.meshgrid(block_map.x - block_map.centre[0], block_map.y - block_map.centre[1])
+    known = block_map.known
+    rows = np.column_stack([np.ones(known.sum()), x[known], y[known]])
+    rest = block_map.height[known] - rows @ np.linalg.lstsq(rows, block_map.height[known], rcond=None)[0]
+    return float(1.4826 * np.median(np.abs(rest)))
+
+
+def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool) -> _Found:
+    """Take Gauss-Newton steps with all blocks; the noise is estimated once the pose is near."""
+    state, noise, gate = State(start.state.matrix, problem.rest.values), Noise(), GATE * start.scale
+    near, steps = False, start.steps
+    for _ in range(_STEPS):
+        steps += 1
+        sums = problem.evaluate(state, gate)
+        for _ in range(2):
+            if near:
+                noise = estimate_noise(problem, state, sums, line_effects)
+            H, h = problem.equations(sums, noise, state)
+            move = solve(H, h, free.motions, free.radius)
+            before, state = state, problem.stepped(state, move)
+            # Squared length in standard deviations: after one of 3, the next is far below a hundredth.
+            length = float(move @ H @ move) / noise.k
+            if near or not length < min(NEAR * sums.used, STRAIGHT):
+                break
+            near, sums = True, problem.after(before, sums, move)
+        if near and length < 0.1:
+            break
+        near = near or length < NEAR * sums.used
+        gate = GATE * sums.scale()
+    else:
+        raise MethodError(
+            f"expected the registration to settle within {_STEPS} steps, found it still {length**0.5:.1f} standard "
+            "deviations from rest; look at both scans for a part that moved"
+        )
+    return _Found(state, sums, noise, gate, steps)
+
+
+def _unknown(covariance: Array, free: Freedoms) -> Array:
+    """Return the covariance with NaN for the freedoms of which a hundredth or more is not determined."""
+    if not free.loose:
+        return covariance
+    share = np.sum(free.motions**2, axis=1)
+    spoilt = (share > 0.01) | np.array([name in free.loose for name in DOF])
+    return np.where(spoilt[:, None] | spoilt[None, :], np.nan, covariance)

@@ -1,0 +1,288 @@
+"""Every warm scan of a campaign laid on its cold one: what the maps say, what it is worth, and why there is none.
+
+Scans are read one at a time, artefact by artefact, while the last one is being registered: the campaign may be larger
+than memory.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
+from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem
+from errormotion.methods.crossbeam_scan.identification.strain import DRIFT, FEED
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+Scan = tuple[NDArray[np.float32], Array, Array, float]
+
+log = logging.getLogger(__name__)
+
+COARSE = 1.5
+"""Bending of a block over the noise of a point, beyond which registrations are said to be doubtful."""
+MAP_SIZE = 40
+"""Differences of surfaces are kept thinned to about so many places along both directions."""
+
+
+class Scans(Protocol):
+    """The scans of a campaign, each loaded when it is asked for."""
+
+    @property
+    def cycles(self) -> int:
+        """Cold and warm passes."""
+
+    @property
+    def artefacts(self) -> int:
+        """Places."""
+
+    def scan(self, cycle: int, artefact: int) -> Scan:
+        """Return heights (profile, point), x (point,), y (profile,), m, and time, s; MethodError says what is wrong."""
+
+
+@dataclass
+class Registrations:
+    """Registrations over (cycle, artefact), of the cold reference too: zero there.
+
+    Attributes
+    ----------
+    cold : ndarray of int, (artefact,)
+        Cycle that the others are laid on; -1 where no cold scan is usable.
+    twist : ndarray, (cycle, artefact, 9)
+        (T_Q, R_Q, drift per feed) at the map's origin; NaN where there is none.
+    covariance : ndarray, (cycle, artefact, 9, 9)
+        Of these.
+    cold_share : ndarray, (cycle, artefact)
+        Share of the covariance that is the cold scan's noise.
+    bound : ndarray, (artefact, 9, 9)
+        Covariance by surface and stated noise alone.
+    reason : ndarray of str, (cycle, artefact)
+        Why there is none.
+    quality : dict of str to ndarray, (cycle, artefact)
+        residual_rms, noise_found, jitter_z, jitter_y (m), condition, points_used.
+    time : ndarray, (cycle, artefact)
+        Of each scan, s.
+    maps : list of Maps or None
+        By artefact.
+    notes : list of str
+        What to know of them.
+    """
+
+    cold: NDArray[np.int64]
+    twist: Array
+    covariance: Array
+    cold_share: Array
+    bound: Array
+    reason: NDArray[np.object_]
+    quality: dict[str, Array]
+    time: Array
+    maps: list[Maps | None] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def without(self, gone: NDArray[np.bool_]) -> Registrations:
+        """Return these with NaN for some, (cycle, artefact)."""
+        twist, covariance = self.twist.copy(), self.covariance.copy()
+        twist[gone], covariance[gone] = np.nan, np.nan
+        return replace(self, twist=twist, covariance=covariance)
+
+
+@dataclass
+class Maps:
+    """Thinned maps of one artefact: places (m), cold heights, and warm minus cold before and after registration, m."""
+
+    x: Array
+    y: Array
+    surface: Array
+    before: dict[int, Array] = field(default_factory=dict)
+    after: dict[int, Array] = field(default_factory=dict)
+
+
+QUALITY = ("residual_rms", "noise_found", "jitter_z", "jitter_y", "condition", "points_used")
+
+
+def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, settings: Settings) -> Registrations:
+    """Lay every scan on the first usable cold scan of its artefact.
+
+    Parameters
+    ----------
+    scans : Scans
+    cold_cycles : sequence of int
+        Cycles that may serve as reference, the one to prefer first.
+    height_noise : float
+        Stated standard deviation of one height, m: for the bound.
+    settings : Settings
+    """
+    shape = scans.cycles, scans.artefacts
+    found = Registrations(
+        cold=np.full(shape[1], -1),
+        twist=np.full((*shape, 9), np.nan),
+        covariance=np.full((*shape, 9, 9), np.nan),
+        cold_share=np.full(shape, np.nan),
+        bound=np.full((shape[1], 9, 9), np.nan),
+        reason=np.full(shape, "", dtype=object),
+        quality={name: np.full(shape, np.nan) for name in QUALITY},
+        time=np.full(shape, np.nan),
+    )
+    found.quality["points_used"][:] = 0
+    for artefact in range(shape[1]):
+        found.maps.append(_artefact(scans, artefact, cold_cycles, height_noise, settings, found))
+    return found
+
+
+def _artefact(
+    scans: Scans, k: int, cold_cycles: Sequence[int], noise: float, settings: Settings, found: Registrations
+) -> Maps | None:
+    """Register all scans of one artefact; return its maps."""
+    order = [*cold_cycles, *(c for c in range(scans.cycles) if c not in cold_cycles)]
+    cold: BlockMap | None = None
+    maps: Maps | None = None
+    for cycle, scan in zip(order, _ahead(scans, order, k), strict=True):
+        if cold is None and cycle not in cold_cycles:
+            found.reason[cycle, k] = "there is no cold scan to lay it on"
+            continue
+        try:
+            if isinstance(scan, MethodError):
+                raise scan
+            height, x, y, found.time[cycle, k] = scan
+            warm = prepare(height, x, y)
+            if cold is None:
+                cold, maps = warm, _maps(warm)
+                found.cold[k] = cycle
+                found.bound[k] = bound(cold, noise, with_drift=settings.strain != "rigid")
+                found.twist[cycle, k] = 0.0
+                found.covariance[cycle, k] = 0.0
+                found.cold_share[cycle, k] = 0.0
+                found.notes += _coarse(cold, k)
+                found.quality["noise_found"][cycle, k] = cold.noise
+                found.quality["points_used"][cycle, k] = cold.points.sum()
+                continue
+            result = _lay(cold, warm, settings)
+            _keep(result, found, cycle, k)
+            _keep_maps(maps, cold, warm, result, cycle)
+            _judge(result, warm, found.quality, cycle, k)
+        except MethodError as error:
+            found.reason[cycle, k] = str(error)
+            log.warning("cycle %d, artefact %d: %s", cycle, k, error)
+    return maps
+
+
+def _coarse(cold: BlockMap, artefact: int) -> list[str]:
+    """Return what to say of points that are too far apart for the relief."""
+    if cold.bending < COARSE * cold.noise:
+        return []
+    return [
+        f"Artefact {artefact + 1}: blocks of 16 points and 4 lines are bent by {cold.bending * 1e6:.1f} um, where the "
+        f"noise is {cold.noise * 1e6:.1f} um; the uncertainty of its registrations may be stated too small. Take "
+        "points and lines closer to one another, or a smoother artefact."
+    ]
+
+
+def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:
+    """Yield scans, the next one being loaded meanwhile."""
+
+    def load(cycle: int) -> Scan | MethodError:
+        try:
+            return scans.scan(cycle, artefact)
+        except MethodError as error:
+            return error
+
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(load, cycles[0])
+        for following in cycles[1:]:
+            scan = coming.result()
+            coming = pool.submit(load, following)
+            yield scan
+        yield coming.result()
+
+
+def _lay(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
+    extra: dict[str, float] = {}
+    if settings.registration == "height_map":
+        if settings.strain != "rigid":
+            extra |= dict.fromkeys(FEED, DRIFT)
+        if settings.scale_uncertainty > 0:
+            extra |= dict.fromkeys(("scale_x", "scale_z"), settings.scale_uncertainty)
+        if settings.expansion_uncertainty > 0:
+            extra["expansion"] = settings.expansion_uncertainty
+    return register(
+        cold, warm, registration=settings.registration, point=np.zeros(3), line_effects=settings.line_effects,
+        extra=extra,
+    )  # fmt: skip
+
+
+def _keep(result: Registration, found: Registrations, cycle: int, k: int) -> None:
+    """Take over the twist and the drift along the feed; what is not a parameter is 0 and certain."""
+    names = [name for name in FEED if name in result.extra_names]
+    chosen = [*range(6), *(6 + result.extra_names.index(name) for name in names)]
+    there = [*range(6), *(6 + FEED.index(name) for name in names)]
+    found.twist[cycle, k] = 0.0
+    found.twist[cycle, k, there] = np.concatenate([result.twist, result.extra])[chosen]
+    found.covariance[cycle, k] = 0.0
+    found.covariance[cycle, k][np.ix_(there, there)] = result.joint_covariance[np.ix_(chosen, chosen)]
+    found.cold_share[cycle, k] = result.cold_share
+
+
+def _judge(result: Registration, warm: BlockMap, quality: dict[str, Array], cycle: int, k: int) -> None:
+    values: dict[str, Any] = {
+        "residual_rms": result.rms,
+        "noise_found": warm.noise,
+        "jitter_z": result.line_jitter[0],
+        "jitter_y": result.line_jitter[1],
+        "condition": result.condition,
+        "points_used": result.points,
+    }
+    for name, value in values.items():
+        quality[name][cycle, k] = value
+
+
+def bound(cold: BlockMap, noise: float, *, with_drift: bool) -> Array:
+    """Return the covariance (9, 9) of (T_Q, R_Q, drift) that white noise (m) of two scans of this surface allows.
+
+    Rows and columns of the drift are 0 where it is no parameter.
+    """
+    known = cold.known
+    x, y = np.meshgrid(cold.x, cold.y)
+    Q = np.stack([x, y, cold.height], axis=-1)[known]
+    n = np.stack([-cold.slope_x, -cold.slope_y, np.ones_like(x)], axis=-1)[known]
+    J = np.concatenate([n, np.cross(Q, n), n * Q[:, 1:2]], axis=-1)
+    used = 9 if with_drift else 6
+    J, weight = J[:, :used], cold.points[known] / (2 * noise**2)
+    scale = 1 / np.linalg.norm(J, axis=0)
+    C = np.zeros((9, 9))
+    information = (J * weight[:, None]).T @ J
+    information[range(6, used), range(6, used)] += DRIFT**-2
+    C[:used, :used] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    return C
+
+
+def _maps(cold: BlockMap) -> Maps:
+    rows, columns = _thin(cold)
+    surface = np.where(cold.known, cold.height, np.nan)[rows][:, columns]
+    return Maps(cold.x[columns], cold.y[rows], surface)
+
+
+def _thin(block_map: BlockMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which block rows and columns are kept."""
+    rows, columns = (np.linspace(0, n - 1, min(n, MAP_SIZE)).round().astype(int) for n in block_map.height.shape)
+    return rows, columns
+
+
+def _keep_maps(maps: Maps | None, cold: BlockMap, warm: BlockMap, result: Registration, cycle: int) -> None:
+    if maps is None or result.residual.size == 0:
+        return
+    rows, columns = _thin(warm)
+    if (rows.size, columns.size) != maps.surface.shape:
+        return
+    problem = Problem.of(cold, warm)
+    before = problem.evaluate(problem.rest).residual
+    maps.before[cycle] = before[rows][:, columns]
+    maps.after[cycle] = result.residual[rows][:, columns]

@@ -1,0 +1,286 @@
+"""From a campaign of scans to the error dataset of the axis."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.arrays import Array
+from errormotion.datasets import DOF, build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig, carriage
+from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
+from errormotion.methods.crossbeam_scan.identification.curves import curves
+from errormotion.methods.crossbeam_scan.identification.cutting import Scans
+from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, Trust, judge
+from errormotion.methods.crossbeam_scan.identification.registrations import Maps, Registrations, register_all
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+
+log = logging.getLogger(__name__)
+
+_METRES = {"units": "m"}
+_SPOILT = 10.0
+"""EYY that is so many times less certain than EXY and EZY is worth a note."""
+_STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]
+
+
+def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return the errors of the axis over time and position.
+
+    Parameters
+    ----------
+    raw : Dataset
+        Variant "scans" or "scans as recorded"; read scan by scan.
+    settings : Settings
+    method, version : str
+        Of the plugin.
+
+    Raises
+    ------
+    MethodError
+        Not one scan could be registered; the reasons are named.
+    """
+    scans = Scans(raw)
+    places = np.asarray(raw["position"].values, dtype=float)
+    if np.any(np.diff(places) <= 0):
+        raise MethodError(f"position: expected places of the artefacts that rise; found {places.tolist()} m")
+    cold = cold_cycles(raw, scans.cycles)
+    found = register_all(scans, cold, float(raw["height_noise"]), settings)
+    rig = rig_of(raw)
+    axis = carriage(found, places, rig, guide=None)
+    warm = [c for c in range(scans.cycles) if c not in cold]
+    if not warm:
+        raise MethodError(f"Expected warm scans after the cold ones; found {scans.cycles} cycles, all of them cold")
+    if not np.isfinite(axis.values[warm]).any():
+        reasons = sorted({reason for reason in found.reason.ravel() if reason})
+        raise MethodError(
+            f"Not one of {len(warm) * places.size} warm scans could be laid on its cold one: " + "; ".join(reasons[:3])
+        )
+    rows = [cold[0], *warm]
+    time = cycle_times(found.time, rows, _planned(raw, scans.cycles))
+    trust = judge(axis, found, settings, places, time[1:], cold, warm)  # each by itself: a guide joins neighbours
+    if settings.strain == "guided":
+        gone = trust.wrong & (settings.moved == "exclude")
+        axis = carriage(found.without(gone), places, rig, guide=settings.guide_uncertainty)
+    return _dataset(raw, settings, method, version, found, axis, rig, trust, cold, rows, time, scans.notes)
+
+
+def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
+    """Return the cycles without a warm-up before them: cycle 0, and those that ``warm_up`` says."""
+    if "warm_up" not in raw:
+        return [0]
+    warm_up = np.asarray(raw["warm_up"].values, dtype=float)[:cycles]
+    return [0, *(int(c) for c in np.flatnonzero(warm_up == 0) if c > 0)]
+
+
+def rig_of(raw: xr.Dataset) -> Rig:
+    """Return how the profiler hangs on the carriage, as a raw dataset states it."""
+    matrix = np.asarray(raw["profiler_pose"].transpose("row", "column").values, dtype=float)
+    if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(matrix[:3, :3]) < 0:
+        raise MethodError("profiler_pose: expected a rotation in its first three rows and columns; found none")
+
+    def known(name: str) -> Array | None:
+        return np.asarray(raw[name].values, dtype=float) if name in raw else None
+
+    uncertainty = known("lever_uncertainty")
+    return Rig(
+        RigidTransform.from_matrix(matrix),
+        np.asarray(raw["lever"].values, dtype=float),
+        known("pose_covariance"),
+        np.zeros(3) if uncertainty is None else uncertainty,
+    )
+
+
+def _dataset(
+    raw: xr.Dataset,
+    settings: Settings,
+    method: str,
+    version: str,
+    found: Registrations,
+    axis: Carriage,
+    rig: Rig,
+    trust: Trust,
+    cold: list[int],
+    rows: list[int],
+    time: Array,
+    mended: list[str],
+) -> xr.Dataset:
+    warm = rows[1:]
+    place = np.asarray(raw["position"].values, dtype=float)
+    reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
+    values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
+    values[0] = np.where(reference[:, None], 0.0, np.nan)  # whichever cold scan the others are laid on
+    own[0] = np.where(reference[:, None, None], 0.0, np.nan)
+    influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
+    reason = found.reason[rows]
+    reason[0, reference] = ""
+    if settings.moved == "exclude":
+        gone = trust.wrong[rows]
+        values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan
+        reason[gone] = MOVED
+    notes = [*_notes(reason, place, rig), *trust.notes, *mended]
+    notes += found.notes
+    if settings.strain == "free":
+        notes += _pitch_note(own)
+    for note in notes:
+        log.warning(note)
+    curve = curves(axis, found, rig, place, time[1:], warm, trust.wrong)
+    rig_share = influence[: len(SOURCES)]  # the noise of the cold scans is in `own` already
+    total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
+    ds = build_errors(
+        values,
+        total,
+        dims=("time", "position"),
+        coords={"time": time, "y": ("position", place, _METRES)},
+        component="Y",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame="carriage, machine directions",
+        functional_point=np.zeros(3),
+        reference="cold scans of the artefacts, before the warm-up",
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, raw, None, steps=_STEPS),
+        influence=influence,
+        sources=axis.sources,
+        source_groups=axis.source_groups,
+        extras=_extras(found, axis, rig, rows, cold, reason, own, curve | trust.extras()),
+    )
+    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
+
+
+def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:
+    """Return the time of every cycle, s since the warm-up began: the middle of its scans; the cold one is 0.
+
+    A cycle without a scan is put between its neighbours, or behind the last one, as it was ``planned`` (cycle,); evenly
+    where no plan is known.
+    """
+    time = np.array([np.nanmean(scan_time[c]) if np.isfinite(scan_time[c]).any() else np.nan for c in rows])
+    first = max(time[0], 0.0) if np.isfinite(time[0]) else 0.0
+    time[0] = 0.0
+    time[1:] -= first
+    plan = np.arange(len(rows), dtype=float) if planned is None else planned[rows]
+    known = np.flatnonzero(np.isfinite(time))
+    last = known[-1]
+    pace = 1.0 if planned is not None else time[last] / max(last, 1)
+    behind = time[last] + pace * np.maximum(plan - plan[last], 0.0)
+    time = np.where(np.isfinite(time), time, np.interp(plan, plan[known], time[known]) + behind - time[last])
+    if np.any(np.diff(time) <= 0):
+        raise MethodError(f"time: expected cycles one after the other; found {np.round(time, 1).tolist()} s")
+    return time
+
+
+def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
+    """Return when every cycle was to be, s: as a raw dataset states it for scans, or else by its warm-up times."""
+    name = next((name for name in ("time", "warm_up") if name in raw.variables and raw[name].dims == ("cycle",)), None)
+    if name is None or raw.sizes["cycle"] < cycles:
+        return None
+    return np.asarray(raw[name].values, dtype=float)
+
+
+def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
+    notes = []
+    lost = np.argwhere((reason[1:] != "") & (reason[1:] != MOVED))
+    if len(lost):
+        where = sorted({f"{place[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
+        notes.append(
+            f"{len(lost)} of {reason[1:].size} warm scans gave no errors (at {', '.join(where)}); the table of "
+            "registrations says why."
+        )
+    if rig.pose_covariance is None:
+        notes.append("The pose of the profiler is taken as exact: the raw dataset states no pose_covariance.")
+    if not rig.lever_uncertainty.any():
+        notes.append("The lever is taken as exact: the raw dataset states no lever_uncertainty.")
+    return notes
+
+
+def _pitch_note(own: Array) -> list[str]:
+    """Return what to do where the pitch, told by the relief alone, spoils EYY over the lever."""
+    u = np.sqrt(np.nanmedian(np.diagonal(own[1:], axis1=-2, axis2=-1), axis=(0, 1)))
+    if not u[1] > _SPOILT * u[[0, 2]].max():
+        return []
+    return [
+        f"EYY is known to {u[1] * 1e6:.1f} um only (standard uncertainty): the pitch EAY ({u[3] * 1e6:.1f} urad) is "
+        "told by the artefacts' relief alone and acts over the lever. Both together are known far better, so move "
+        "the errors to the tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' says more."
+    ]
+
+
+def _extras(
+    found: Registrations,
+    axis: Carriage,
+    rig: Rig,
+    rows: list[int],
+    cold: list[int],
+    reason: NDArray[np.object_],
+    own: Array,
+    further: dict[str, Any],
+) -> Mapping[str, xr.DataArray]:
+    two = ("time", "position")
+    quality = {name: values[rows] for name, values in found.quality.items()}
+    deviation = np.sqrt(np.diagonal(own, axis1=-2, axis2=-1))
+    predicted = np.broadcast_to(np.sqrt(np.diagonal(axis.predicted, axis1=-2, axis2=-1)), deviation.shape)
+    jitter = np.stack([quality["jitter_z"], quality["jitter_y"]], axis=-1)
+    out: dict[str, Any] = {
+        "reason": (two, reason.astype(str)),
+        "scan_time": (two, found.time[rows], {"units": "s"}),
+        "registration_u": ((*two, "dof"), deviation),
+        "predicted_u": ((*two, "dof"), predicted),
+        "residual_rms": (two, quality["residual_rms"], _METRES),
+        "points_used": (two, quality["points_used"].astype(np.int64)),
+        "noise_found": (two, quality["noise_found"], _METRES),
+        "line_jitter": ((*two, "jitter"), jitter, _METRES),
+        "condition": (two, quality["condition"]),
+        "strain": ((*two, "direction"), axis.drift[rows]),
+        "profiler_pose": (("row", "column"), rig.pose.as_matrix()),
+        "lever": ("direction", rig.lever, _METRES),
+    }
+    if rig.pose_covariance is not None:
+        out["pose_u"] = ("pose_parameter", np.sqrt(np.diag(rig.pose_covariance)))
+    repeats = [c for c in cold[1:] if np.isfinite(axis.values[c]).any()]
+    if repeats:
+        out["cold_repeat"] = (("repeat", "position", "dof"), axis.values[repeats])
+        u = np.sqrt(np.diagonal(axis.covariance[repeats], axis1=-2, axis2=-1))
+        out["cold_repeat_u"] = (("repeat", "position", "dof"), u)
+    out |= _map_extras(found.maps, rows) | further
+    coords = {"jitter": ["z", "y"], "direction": list("xyz"), "pose_parameter": ["a", "b", "g", "dx", "dy", "dz"]}
+    ds = xr.Dataset(out).assign_coords(
+        {name: labels for name, labels in coords.items() if name in xr.Dataset(out).dims}
+    )
+    return {str(name): ds[name] for name in ds.data_vars}
+
+
+def _map_extras(maps: list[Maps | None], rows: list[int]) -> dict[str, Any]:
+    """Return cold surfaces and differences over (time, position, v, u), of the artefacts that agree in size."""
+    first = next((m for m in maps if m is not None), None)
+    if first is None:
+        return {}
+    shape = first.surface.shape
+    surface = np.full((len(maps), *shape), np.nan, dtype=np.float32)
+    before, after = (np.full((len(rows), len(maps), *shape), np.nan, dtype=np.float32) for _ in range(2))
+    for k, m in enumerate(maps):
+        if m is None or m.surface.shape != shape:
+            continue
+        surface[k] = m.surface
+        for t, cycle in enumerate(rows):
+            if cycle in m.after:
+                before[t, k], after[t, k] = m.before[cycle], m.after[cycle]
+    two = ("time", "position", "v", "u")
+    return {
+        "surface": (("position", "v", "u"), surface, _METRES),
+        "surface_x": ("u", first.x, _METRES),
+        "surface_y": ("v", first.y, _METRES),
+        "difference_before": (two, before, _METRES),
+        "difference_after": (two, after, _METRES),
+    }
+
+
+__all__ = ["DOF", "cold_cycles", "cycle_times", "identify_scans", "rig_of"]

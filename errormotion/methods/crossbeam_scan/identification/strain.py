@@ -1,0 +1,135 @@
+"""From what the maps say to how the profiler moved: a scan is no rigid picture, because the carriage turns on its way.
+
+A line at the feed s shows (x, 0, z) in the profiler's frame. In the cold frame of the artefact's middle it lies at
+(x, 0, z) + s f, with f the feed's direction. What is registered is the map Q = (x, s, z), so P = B Q with
+
+    B = 1 + (f - e_y) e_y^T .
+
+The warm carriage displaces a point by T + r x (x, 0, z) + s g: (T, r) is the twist of the profiler at its origin when
+the axis stands over the artefact's middle, and g = dT/dY says how this changes along the scan. (A rigid picture would
+have g = r x f.) Two maps differ by B^-1 of that, which registration states as a twist (T_Q, R_Q) at the origin and
+displacements c per metre of feed. By equal coefficients of 1, x, z and s,
+
+    EC = f_y EC_Q,   EA = f_y EA_Q,   EB = EB_Q - f_z EC_Q,   T = B T_Q,   g = B (c + R_Q x e_y) .
+
+A line shows nothing of its own yaw and pitch but what its relief tells: pitch EA moves a point along the feed by -z EA.
+A rigid picture would show both by its slope along the feed, but that is g, and the carriage may turn without it. Where
+the carriage follows a guide, pitch and yaw are the slopes of the guide, EA = dEZ/dY and EC = -dEX/dY: `guided` adds
+this with a stated uncertainty, the slopes being those of a spline through the artefacts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.spatial.transform import RigidTransform
+
+from errormotion.arrays import Array
+from errormotion.kinematics.twists import cross_matrix
+from errormotion.methods.crossbeam_scan.identification.chain import feed_direction
+
+FEED = ("feed_x", "feed_y", "feed_z")
+"""Parameters of the registration that take the drift along a scan."""
+DRIFT = 1e-3
+"""Standard deviation of their prior, 1: a millimetre per metre, far more than any carriage drifts. It is there so that
+an artefact of little relief gives a large uncertainty and no refusal."""
+# Metres and radians of one size, so that the normal equations are well scaled.
+_UNIT = np.array([1e-6] * 3 + [1e-5] * 3)
+# (rotation, displacement, sign): EA = dEZ/dY, EC = -dEX/dY
+_GUIDE = ((3, 2, 1.0), (5, 0, -1.0))
+
+
+@dataclass(frozen=True)
+class Guided:
+    """Twists of the profiler at every artefact, the guide taken into account.
+
+    Attributes
+    ----------
+    twist : ndarray (n, 6)
+        (T, r) at the profiler's origin and in its frame, m and rad.
+    covariance : ndarray (n, 6, 6)
+        Of these.
+    gain : ndarray (6 n, 6 n)
+        What takes the twists given to these.
+    slope_error : ndarray (2,)
+        What the spline's slopes of EZ and EX are taken to be off by, standard deviation, 1.
+    """
+
+    twist: Array
+    covariance: Array
+    gain: Array
+    slope_error: Array
+
+
+def from_maps(profiler_pose: RigidTransform) -> Array:
+    """Return the matrix (9, 9) that takes (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
+    f = feed_direction(profiler_pose)
+    B = np.eye(3)
+    B[:, 1] = f
+    W = np.zeros((9, 9))
+    W[:3, :3] = W[6:, 6:] = B
+    W[3:6, 3:6] = np.diag([f[1], 1.0, f[1]])
+    W[4, 5] = -f[2]
+    W[6:, 3:6] = B @ -cross_matrix(np.array([0.0, 1.0, 0.0]))
+    return W
+
+
+def slopes(places: ArrayLike) -> tuple[Array, Array]:
+    """Return two matrices (n, n) that take values at places to their slopes there: by a cubic spline, and by less.
+
+    The second uses one neighbour on each side; for two places it says 0. Its difference from the first is a measure of
+    what the first misses.
+    """
+    y = np.asarray(places, dtype=float)
+    n = y.size
+    if n < 2:
+        return np.zeros((n, n)), np.zeros((n, n))
+    fine = np.asarray(CubicSpline(y, np.eye(n), bc_type="not-a-knot")(y, 1))
+    if n == 2:
+        return fine, np.zeros((2, 2))
+    return fine, np.asarray(np.gradient(np.eye(n), y, axis=0, edge_order=1 if n == 3 else 2))
+
+
+def guided(
+    twist: ArrayLike, covariance: ArrayLike, places: ArrayLike, to_carriage: ArrayLike, uncertainty: float
+) -> Guided:
+    """Return the twists of one cycle when pitch and yaw of the carriage follow the guide: least squares of all places.
+
+    Parameters
+    ----------
+    twist, covariance : (n, 6), (n, 6, 6)
+        (T, r) of every artefact by its registration alone, m and rad.
+    places : (n,)
+        Of the artefacts along the axis, m, rising.
+    to_carriage : (6, 6)
+        Takes twists of the profiler to errors of the carriage.
+    uncertainty : float
+        Standard uncertainty of EA - dEZ/dY and of EC + dEX/dY, rad. What the spline misses of the slopes is added.
+    """
+    e, C, A = (np.asarray(value, dtype=float) for value in (twist, covariance, to_carriage))
+    n = len(e)
+    if n < 2:
+        return Guided(e.copy(), C.copy(), np.eye(6 * n), np.zeros(2))
+    fine, coarse = slopes(places)
+    E = e @ A.T
+    rows, errors = np.zeros((2, n, n, 6)), np.zeros(2)
+    missed = fine - coarse
+    for i, (turn, way, sign) in enumerate(_GUIDE):
+        by_noise = np.mean(missed**2 @ np.einsum("a,kab,b->k", A[way], C, A[way]))
+        errors[i] = np.sqrt(max(np.mean((missed @ E[:, way]) ** 2) - by_noise, 0.0))
+        rows[i] = np.eye(n)[:, :, None] * A[turn] - sign * fine[:, :, None] * A[way]
+    sigma = np.sqrt(uncertainty**2 + errors**2)
+    scaled = (rows * _UNIT).reshape(2, n, 6 * n) / sigma[:, None, None]
+    weight = block_diag(*np.linalg.inv(C / np.outer(_UNIT, _UNIT)))
+    prior = np.einsum("ika,ikb->ab", scaled, scaled)
+    factor = cho_factor(weight + prior)
+    gain = cho_solve(factor, weight)
+    inverse = cho_solve(factor, np.eye(6 * n))
+    blocks = np.stack([inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]) * np.outer(_UNIT, _UNIT)
+    unit = np.tile(_UNIT, n)
+    gain = gain * unit[:, None] / unit
+    return Guided((gain @ e.ravel()).reshape(n, 6), blocks, gain, errors)

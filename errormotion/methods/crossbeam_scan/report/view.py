@@ -1,0 +1,196 @@
+"""What a campaign of crossbeam scans holds, as plain arrays over (time, position), whatever of it is missing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.kinematics.iso import iso_names
+from errormotion.report.budget import FREEDOMS
+from errormotion.report.text import SECOND_OF_ARC, UM, fixed
+
+AXES = ("time", "position")
+NO_REASON = "no value, and the result states no reason"
+_ABSENT = ("missing", "no scan", "not scanned", "not recorded", "no line")
+
+
+def is_campaign(errors: xr.Dataset) -> bool:
+    """Return whether a dataset is the result of a campaign of crossbeam scans, and not of a step before it."""
+    return errors.attrs.get("method") == "crossbeam_scan" and set(AXES) <= set(errors["EX"].dims)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The six errors of an axis over warm-up time and position, and what the method says of each.
+
+    Attributes
+    ----------
+    errors : Dataset
+        Where it comes from.
+    time : (t,)
+        Warm-up time of each cycle, s.
+    position : (p,)
+        Of the axis over each artefact, m.
+    scan_time : (t, p)
+        When each scan was taken, s of warm-up; that of the cycle where it is not known.
+    values, sigma : (t, p, 6)
+        Errors and standard uncertainties, m and rad; NaN where unknown.
+    reason : (t, p) of str
+        Why there is no value; empty where there is one.
+    reference : (t,) of bool
+        Which cycles are the cold state that all others are relative to.
+    """
+
+    errors: xr.Dataset
+    time: Array
+    position: Array
+    scan_time: Array
+    values: Array
+    sigma: Array
+    reason: NDArray[np.str_]
+    reference: NDArray[np.bool_]
+
+    @property
+    def names(self) -> dict[str, str]:
+        """ISO 230-1 name of each freedom; the freedom's own where the standard has none."""
+        try:
+            return iso_names(str(self.errors.attrs.get("component", "")))
+        except ValueError:
+            return {name: name for name in FREEDOMS}
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Where there is any value, (t, p)."""
+        return np.asarray(np.isfinite(self.values).any(axis=2))
+
+    @property
+    def warm(self) -> NDArray[np.intp]:
+        """Indices of the cycles that are compared with the cold state."""
+        return np.flatnonzero(~self.reference)
+
+    @property
+    def absent(self) -> NDArray[np.bool_]:
+        """Where there was no scan to register, (t, p)."""
+        holes: NDArray[np.bool_] = ~self.known
+        if "scan_time" in self.errors:
+            taken = np.isfinite(field(self.errors, "scan_time", *AXES))
+            if taken.any():
+                return np.asarray(holes & ~taken)
+        said = np.array([[any(word in text.lower() for word in _ABSENT) for text in row] for row in self.reason])
+        return np.asarray(holes & said.reshape(holes.shape))
+
+    def get(self, name: str, *dims: str) -> Array:
+        """Return a variable over (time, position, and these dims); all NaN where the dataset does not hold it."""
+        if name in self.errors and set(self.errors[name].dims) == {*AXES, *dims}:
+            return field(self.errors, name, *AXES, *dims)
+        sizes = tuple(self.errors.sizes.get(dim, 1) for dim in (*AXES, *dims))
+        return np.full(sizes, np.nan)
+
+    def largest(self, freedom: int) -> tuple[int, int] | None:
+        """Return (cycle, artefact) of the largest error of a freedom when warm; None where it is unknown."""
+        size = np.where(self.reference[:, None], np.nan, np.abs(self.values[..., freedom]))
+        if not np.isfinite(size).any():
+            return None
+        cycle, artefact = np.unravel_index(int(np.nanargmax(size)), size.shape)
+        return int(cycle), int(artefact)
+
+    def shown(self) -> tuple[int, int] | None:
+        """Return (cycle, artefact) of the registration to show: the last of the artefact with the largest error.
+
+        Displacements decide; rotations do where no displacement is known.
+        """
+        warm = np.where(self.reference[:, None, None], np.nan, np.abs(self.values))
+        for columns in (slice(0, 3), slice(3, 6)):
+            if np.isfinite(warm[..., columns]).any():
+                of_artefact = np.nanmax(np.where(np.isfinite(warm), warm, -1.0)[..., columns], axis=(0, 2))
+                artefact = int(np.argmax(of_artefact))
+                cycles = np.flatnonzero(self.known[:, artefact] & ~self.reference)
+                return int(cycles[-1]), artefact
+        return None
+
+    def where(self, cycle: int, artefact: int) -> str:
+        """Return place and time of one registration in words."""
+        return f"{at_y(self.position[artefact])}, {after(self.time[cycle])}"
+
+
+def field(errors: xr.Dataset, name: str, *dims: str) -> Array:
+    """Return a variable as floats in the order of these dims."""
+    return np.asarray(errors[name].transpose(*dims).values, dtype=float)
+
+
+def campaign(errors: xr.Dataset) -> Campaign:
+    """Return the view of a dataset over time and position."""
+    values = np.stack([field(errors, name, *AXES) for name in FREEDOMS], axis=-1)
+    variance = field(errors, "covariance", *AXES, "dof", "dof_")
+    variance = np.diagonal(variance, axis1=2, axis2=3)
+    sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    shape = values.shape[:2]
+    time = np.asarray(errors["time"].values, float) if "time" in errors.coords else np.arange(1.0, shape[0] + 1)
+    scan_time = np.broadcast_to(time[:, None], shape)
+    if "scan_time" in errors:
+        stated = field(errors, "scan_time", *AXES)
+        scan_time = np.where(np.isfinite(stated), stated, scan_time)
+    zero = np.nan_to_num(values) == 0
+    reference = (zero & (np.nan_to_num(sigma) == 0)).all(axis=(1, 2)) & (time <= 0)
+    scan_time = np.where(reference[:, None], time[:, None], scan_time)  # the cold scan stands for time 0
+    return Campaign(errors, time, _positions(errors), scan_time, values, sigma, _reasons(errors, values), reference)
+
+
+def _positions(errors: xr.Dataset) -> Array:
+    for name in (str(errors.attrs.get("component", "")).lower(), "y", "position"):
+        if name in errors.coords and errors[name].dims == ("position",) and errors[name].dtype.kind in "iuf":
+            return np.asarray(errors[name].values, float)
+    return np.arange(1.0, errors.sizes["position"] + 1) * 1e-3
+
+
+def _reasons(errors: xr.Dataset, values: Array) -> NDArray[np.str_]:
+    holes = ~np.isfinite(values).any(axis=2)
+    stated = np.full(holes.shape, "", dtype=object)
+    if "reason" in errors and set(errors["reason"].dims) == set(AXES):
+        stated = errors["reason"].transpose(*AXES).values.astype(str).astype(object)
+    text = [str(words).strip().rstrip(".") or NO_REASON for words in stated.ravel()]
+    return np.where(holes, np.array(text, dtype=str).reshape(holes.shape), "")
+
+
+def unit_of(freedom: int) -> tuple[str, float]:
+    """Return the field unit of a freedom by its index, and its size in SI."""
+    return UM if freedom < 3 else SECOND_OF_ARC
+
+
+def millimetres(position: float) -> str:
+    """Return a position in mm, with decimals where it has any."""
+    return trimmed(fixed(1e3 * position, 3))
+
+
+def at_y(position: float) -> str:
+    """Return a position in words that stay on one line."""
+    return f"y\u00a0=\u00a0{millimetres(position)}\u00a0mm"
+
+
+def after(seconds: float) -> str:
+    """Return a warm-up time in words."""
+    return "cold" if seconds == 0 else f"{trimmed(fixed(seconds / 60, 1))}\u00a0min"
+
+
+def trimmed(number: str) -> str:
+    """Return a number without zeros behind its decimal point."""
+    return number.rstrip("0").rstrip(".") if "." in number else number
+
+
+def remarks(errors: xr.Dataset) -> list[str]:
+    """Return the method's own sentences; they are kept as a JSON list."""
+    found = errors.attrs.get("notes", [])
+    if isinstance(found, str):
+        try:
+            found = json.loads(found)
+        except ValueError:
+            found = [found]
+    if isinstance(found, str) or not isinstance(found, Sequence | np.ndarray):
+        found = [found]
+    return [str(note) for note in found if str(note).strip() and not isinstance(note, Mapping)]

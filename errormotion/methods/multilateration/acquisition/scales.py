@@ -1,0 +1,68 @@
+"""Temperature of the machine's scales during a set-up, from a thermometer on the bench."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import InstrumentError, MethodError
+
+if TYPE_CHECKING:
+    from errormotion.plugins import Bench
+
+    Array = Array
+
+log = logging.getLogger(__name__)
+
+
+class Scales:
+    """Sensors on the scales of X, Y and Z; without their names nothing is recorded.
+
+    Raises
+    ------
+    MethodError
+        Names, and no thermometer or not these sensors.
+    """
+
+    def __init__(self, bench: Bench, sensors: tuple[str, str, str] | None) -> None:
+        self.sensors = sensors
+        self._read: list[Array] = []
+        if sensors is None:
+            return
+        if not bench.has_kind("thermometer"):
+            raise MethodError(
+                f"Sensors {', '.join(sensors)} on the scales (measuring.scale_sensors) need an instrument of kind "
+                "'thermometer' on the bench; there is none. Add it, or leave them out."
+            )
+        self._thermometer: Any = bench.of_kind("thermometer")
+        found = [str(name) for name in self._thermometer.read()]
+        if missing := [name for name in sensors if name not in found]:
+            raise MethodError(
+                f"measuring.scale_sensors: the thermometer has no {', '.join(dict.fromkeys(missing))}; expected names "
+                f"from {', '.join(found)}."
+            )
+
+    def poll(self) -> None:
+        """Read the sensors once; a failure is told and counts as not known."""
+        if self.sensors is None:
+            return
+        try:
+            reading = self._thermometer.read()
+        except InstrumentError as error:
+            log.warning("no temperatures of the scales: %s", error)
+            return
+        self._read.append(np.array([reading.get(name, np.nan) for name in self.sensors], np.float64))
+
+    def taken(self) -> dict[str, Any]:
+        """Return the mean since the last time as a variable (station, direction), degC; none without sensors."""
+        if self.sensors is None:
+            return {}
+        read = np.array(self._read).reshape(-1, 3)
+        self._read = []
+        known = np.isfinite(read)
+        count = known.sum(axis=0)
+        mean = np.where(count > 0, np.where(known, read, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+        return {"scale_temperature": (("station", "direction"), mean[None], {"units": "degC"})}

@@ -1,0 +1,1 @@
+"""Identification: multilateration, from raw data to errors with covariance."""

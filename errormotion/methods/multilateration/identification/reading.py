@@ -1,0 +1,112 @@
+"""What identification takes out of a raw dataset: arrays in a fixed order, with names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    Array = Array
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Raw data as arrays.
+
+    Attributes
+    ----------
+    displacement : ndarray (n, m)
+        m; NaN where the beam was broken.
+    noise : float
+        Standard deviation of one reading, m.
+    nominal : ndarray (m, 3)
+        Commanded places of the reflector, m.
+    reflector : ndarray (m, 3)
+        Where it is with all axes at zero, m; 0 where the data do not say.
+    station : ndarray (n, 3) or None
+        Rough places, m.
+    time : ndarray (n, m)
+        Of each reading, s; its number where the data do not say.
+    timed : bool
+        Whether they do.
+    stations, targets : list of str
+        Names.
+    """
+
+    displacement: Array
+    noise: float
+    nominal: Array
+    reflector: Array
+    station: Array | None
+    time: Array
+    timed: bool
+    stations: list[str]
+    targets: list[str]
+
+    @property
+    def position(self) -> Array:
+        """Commanded axis positions (m, 3), m."""
+        return self.nominal - self.reflector
+
+
+def read(raw: xr.Dataset, notes: list[str]) -> Readings:
+    """Return the readings of a raw dataset.
+
+    Raises
+    ------
+    MethodError
+        A noise that is not positive; nothing measured.
+    """
+    d = _array(raw, "displacement", "station", "target")
+    n, m = d.shape
+    nominal = _array(raw, "target_nominal", "target", "direction")
+    noise = float(raw["displacement_noise"])
+    if not noise > 0:
+        raise MethodError(f"expected displacement_noise above 0, found {noise:g} m; state the instrument's noise")
+    if not np.isfinite(d).any():
+        raise MethodError("displacement: expected readings; found NaN only. Was the beam broken all the time?")
+    names = {dim: _names(raw, dim, letter) for dim, letter in (("station", "S"), ("target", "T"))}
+    silent = [name for name, row in zip(names["station"], d, strict=True) if not np.isfinite(row).any()]
+    if silent:
+        raise MethodError(f"No reading of station {', '.join(silent)}: leave it out, or measure from there.")
+    few = np.count_nonzero(np.isfinite(d), axis=0) < 3
+    if few.any():
+        first = short([name for name, lost in zip(names["target"], few, strict=True) if lost])
+        notes.append(f"{int(few.sum())} of {m} targets have fewer than three readings and are not known: {first}.")
+    station = None
+    if "station_nominal" in raw:
+        station = _array(raw, "station_nominal", "station", "direction")
+        if np.isnan(station).any():
+            station = None
+            notes.append("Not every station has a rough place (station_nominal): all are looked for anywhere.")
+    if "reflector" in raw:
+        reflector = _array(raw, "reflector", "target", "direction")
+        if np.isnan(reflector).any():
+            raise MethodError("reflector: expected its place for every target; found NaN. Leave it out if not known.")
+    else:
+        reflector = np.zeros_like(nominal)
+    timed = "reading_time" in raw
+    time = _array(raw, "reading_time", "station", "target") if timed else np.tile(np.arange(m, dtype=float), (n, 1))
+    return Readings(d, noise, nominal, reflector, station, time, timed, names["station"], names["target"])
+
+
+def _array(raw: xr.Dataset, name: str, *dims: str) -> Array:
+    return np.array(raw[name].transpose(*dims).values, dtype=np.float64)
+
+
+def _names(raw: xr.Dataset, dim: str, letter: str) -> list[str]:
+    if dim in raw.coords and raw[dim].dtype.kind in "UOT":
+        return [str(name) for name in raw[dim].values]
+    return [f"{letter}{i + 1}" for i in range(raw.sizes[dim])]
+
+
+def short(names: list[str]) -> str:
+    """Return names as a text, the first eight of them."""
+    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:8])} and {len(names) - 8} more"

@@ -1,0 +1,234 @@
+"""The errors of the axes in a dataset, and what they make of the volume: any grid, slices, diagonals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.identification.parameters import ALIKE, AXES, Chain, Parametric, Term
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = Array
+
+CURVE_POINTS = 41
+"""Positions at which an error motion is tabulated."""
+_DOFS = 6
+
+
+def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
+    """Return the errors of the axes as variables of an error dataset.
+
+    ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen, with the reason
+    as attribute ``unseen``; the attribute ``includes`` names errors that are not told from this one; ``EC0Y`` ...
+    and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and what `volumetric_errors`
+    needs.
+    """
+    extras: dict[str, xr.DataArray] = {}
+    chain = axes.chain
+    includes = _includes(axes.unseen)
+    for k, axis in enumerate(AXES):
+        dim = f"{axis}_position"
+        q = np.linspace(chain.low[k], chain.high[k], CURVE_POINTS)
+        coords = {dim: (dim, q, {"units": "m"})}
+        for error in chain.machine.error_names[6 * k : 6 * k + 6]:
+            unit = _unit(error)
+            attrs = {
+                "units": unit, "order": axes.orders.get(error, 0), "unseen": axes.unseen.get(error, ""),
+                "includes": includes.get(error, ""),
+            }  # fmt: skip
+            value, u = axes.curve(error, q)
+            extras[error] = xr.DataArray(value, coords, dim, attrs=attrs)
+            extras[f"{error}_u"] = xr.DataArray(u, coords, dim, attrs={"units": unit})
+    for error, (number, uncertainty) in axes.squareness().items():
+        attrs = {"units": "rad", "unseen": axes.unseen.get(error, ""), "includes": includes.get(error, "")}
+        extras[error] = xr.DataArray(number, attrs=attrs)
+        extras[f"{error}_u"] = xr.DataArray(uncertainty, attrs={"units": "rad"})
+    terms = {
+        "term_error": ("term", [term.error for term in axes.terms]),
+        "term_order": ("term", [term.order for term in axes.terms]),
+    }
+    about = {"chain": chain.machine.chain, "unseen": [f"{k}: {why}" for k, why in axes.unseen.items()] or [""]}
+    extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=about)
+    extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
+    extras["determined"] = xr.DataArray(
+        axes.determined, dims="term", attrs={"units": "1", "long_name": "by the targets: 1, by the prior: 0"}
+    )
+    extras["axes_datum"] = xr.DataArray(axes.datum, dims=("motion", "term"))
+    m = {"units": "m"}
+    for name, vector in {
+        "axes_centre": axes.centre,
+        "axes_reference": chain.reference,
+        "axes_low": chain.low,
+        "axes_high": chain.high,
+    }.items():
+        extras[name] = xr.DataArray(vector, {"direction": list("xyz")}, "direction", attrs=m)
+    extras["axes_sigma0"] = xr.DataArray(axes.sigma0, attrs={"units": "1"})
+    extras["axes_freedom"] = xr.DataArray(axes.freedom)
+    return extras
+
+
+def _includes(unseen: Mapping[str, str]) -> dict[str, str]:
+    """Return for each error what of others is in it, since at the reflector they do the same."""
+    found: dict[str, list[str]] = {}
+    for error, why in unseen.items():
+        if why.startswith(ALIKE):
+            for name in why.removeprefix(ALIKE).split(" and "):
+                found.setdefault(name, []).append(error)
+    return {name: f"what {' and '.join(others)} do at the reflector" for name, others in found.items()}
+
+
+def axes_of(errors: xr.Dataset) -> Parametric:
+    """Return the errors of the axes that a dataset of this method holds.
+
+    Raises
+    ------
+    MethodError
+        It holds none.
+    """
+    if "coefficient" not in errors:
+        raise MethodError(
+            "The dataset holds no errors of the axes: identify it with the chain of the machine (setting 'chain')."
+        )
+    c = errors["coefficient"]
+    pairs = zip(c["term_error"].values, c["term_order"].values, strict=True)
+    terms = [Term(str(error), int(order)) for error, order in pairs]
+    vector = {name: np.asarray(errors[f"axes_{name}"].values, dtype=float) for name in
+              ("centre", "reference", "low", "high")}  # fmt: skip
+    model = Chain.of(str(c.attrs["chain"]), np.stack([vector["low"], vector["high"]]), vector["reference"][None])
+    told = [str(text) for text in np.atleast_1d(c.attrs["unseen"])]
+    unseen = dict(text.split(": ", 1) for text in told if ": " in text)
+    covariance, datum = errors["coefficient_covariance"].values, errors["axes_datum"].values
+    return Parametric(
+        model, terms, c.values, covariance, errors["determined"].values, unseen, float(errors["axes_sigma0"]),
+        float(errors["axes_freedom"]), datum, vector["centre"],
+    )  # fmt: skip
+
+
+def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike | None = None) -> xr.Dataset:
+    """Return the volumetric errors at any axis positions, from the errors of the axes.
+
+    Parameters
+    ----------
+    errors : Dataset
+        Of this method, with errors of the axes.
+    position : array_like (k, 3)
+        Commanded axis positions, m. Outside of what was measured the errors are NaN.
+    tool : array_like (3,), optional
+        Where the tool is with all axes at zero, m; where the reflector was, without it. At another place, errors that
+        no reflector showed matter: what they touch is NaN.
+
+    Returns
+    -------
+    Dataset
+        Error dataset over ``target`` in the datum of ``errors``; its covariance follows from that of the coefficients,
+        whose parts are the sources of ``influence``.
+
+    Raises
+    ------
+    MethodError
+        No errors of the axes, or positions that are not (k, 3).
+    """
+    axes = axes_of(errors)
+    q = np.atleast_2d(np.asarray(position, dtype=float))
+    if q.ndim != 2 or q.shape[1] != 3 or not np.isfinite(q).all():
+        raise MethodError(f"expected axis positions (k, 3) in m, finite; found shape {q.shape}")
+    at = axes.chain.reference if tool is None else np.asarray(tool, dtype=float)
+    A = _field(axes, q, at)
+    values = A @ axes.coefficient
+    unknown = ~(_known_dofs(axes, q, at) & _inside(axes, q)[:, None])
+    root = _root(axes.covariance)
+    influence = np.moveaxis(A @ root, 2, 0)
+    values[unknown] = np.nan
+    influence[:, unknown] = np.nan
+    covariance = np.einsum("ska,skb->kab", influence, influence)
+    notes = []
+    if outside := int(np.count_nonzero(~_inside(axes, q))):
+        notes.append(f"{outside} of {len(q)} positions lie outside of what was measured: their errors are not known.")
+    attrs = errors.attrs
+    ds = build_errors(
+        values,
+        covariance,
+        dims=("target",),
+        coords={name: ("target", q[:, k], {"units": "m"}) for k, name in enumerate("xyz")},
+        component="tool",
+        machine=str(attrs["machine"]),
+        frame=str(attrs["frame"]),
+        functional_point=at,
+        reference=str(attrs["reference"]),
+        method=str(attrs["method"]),
+        method_version=str(attrs["method_version"]),
+        provenance=provenance.make({}, errors, (), steps=["volumetric errors from the errors of the axes"]),
+        influence=influence,
+        sources=[f"axes.{k}" for k in range(len(influence))],
+        source_groups=["errors of the axes"] * len(influence),
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+def grid(low: Sequence[float], high: Sequence[float], count: Sequence[int]) -> Array:
+    """Return the axis positions of a grid, (k, 3), m; a count of 1 is a slice at the middle of low and high."""
+    axes = [
+        np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2]) for a, b, n in zip(low, high, count, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def diagonals(low: Sequence[float], high: Sequence[float], count: int = 11) -> Array:
+    """Return positions along the four body diagonals, (4, count, 3), m; each begins at low Z (ISO 230-6)."""
+    a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    starts = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], dtype=float)
+    way = np.linspace(0.0, 1.0, count)[None, :, None]
+    share = starts[:, None] + way * (1 - 2 * starts[:, None])
+    return np.asarray(a + share * (b - a))
+
+
+def _unit(error: str) -> str:
+    return "m" if error[1] in AXES else "rad"
+
+
+def _inside(axes: Parametric, q: Array) -> NDArray[np.bool_]:
+    low, high = axes.chain.low, axes.chain.high
+    return np.asarray(((q >= low - 1e-9) & (q <= high + 1e-9)).all(axis=1), dtype=bool)
+
+
+def _field(axes: Parametric, q: Array, tool: Array) -> Array:
+    """Return twists by the coefficients, (k, 6, term), in the datum."""
+    A = axes.chain.columns(axes.terms, q, np.tile(tool, (len(q), 1)), _DOFS)
+    A[:, :3] -= axes.chain.motions(q + tool, axes.centre) @ axes.datum
+    A[:, 3:] -= axes.datum[3:]
+    return A
+
+
+def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
+    """Return whether each freedom is known, (k, 6).
+
+    Displacements where the reflector was are: what is not told apart does the same there. Elsewhere, and for rotations,
+    every error that matters must have been seen.
+    """
+    J = axes.chain.machine.jacobian(q, tool)
+    unseen = [axes.chain.machine.error_names.index(name) for name in axes.unseen]
+    known = np.asarray((J[:, :, unseen] == 0).all(axis=2), dtype=bool)
+    if np.allclose(tool, axes.chain.reference, rtol=0, atol=1e-9):
+        known[:, :3] = True
+    return known
+
+
+def _root(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(_scaled(covariance)[0])
+    kept = values > 1e-14 * values[-1]
+    root: Array = _scaled(covariance)[1][:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return root
+
+
+def _scaled(covariance: Array) -> tuple[Array, Array]:
+    size: Any = np.sqrt(np.diag(covariance))
+    return covariance / np.outer(size, size), size

@@ -1,0 +1,1 @@
+"""The network of stations and targets: model, solver, datum, outliers, covariance."""

@@ -1,0 +1,129 @@
+"""The scheme of the paper: stations from targets, targets from stations, and again, relative to the first target.
+
+Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The first target's readings then say
+nothing about the first target, which stays where it is; everything else is counted from it. Each half is a
+least-squares problem of three unknowns at a time. Together they creep: a station moves only by what the targets have
+not taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.network.model import Stations
+from errormotion.methods.multilateration.network.turning import fitted
+
+TOLERANCE = 1e-9
+_HALF_STEPS = 2
+
+
+@dataclass(frozen=True)
+class Alternated:
+    """Where the alternating scheme has come to.
+
+    Attributes
+    ----------
+    target : ndarray (m, 3)
+        m, fitted to the nominal targets as a free network.
+    station : ndarray (n, 3)
+        m, likewise.
+    iterations : int
+        Pairs of steps (i) and (ii) taken.
+    converged : bool
+        Whether the last pair moved no target by more than the tolerance. It says that the scheme hardly moves, not that
+        it has arrived: at a rate of 1 - 1e-4 what is left is ten thousand times the last step.
+    moved : float
+        How far the last pair moved a target at most, m.
+    rate : float
+        Ratio of the last two moves: 1 where it creeps.
+    rms : float
+        Root mean square of the residuals, m.
+    """
+
+    target: Array
+    station: Array
+    iterations: int
+    converged: bool
+    moved: float
+    rate: float
+    rms: float
+
+    @property
+    def left(self) -> float:
+        """How far the targets may still have to go, m: the rest of a geometric series."""
+        return float(self.moved * self.rate / (1.0 - self.rate)) if self.rate < 1.0 else np.inf
+
+
+def alternate(
+    displacement: ArrayLike,
+    target: ArrayLike,
+    station: ArrayLike,
+    *,
+    tolerance: float = TOLERANCE,
+    iterations: int = 1000,
+) -> Alternated:
+    """Estimate targets and stations by turns.
+
+    Parameters
+    ----------
+    displacement : array_like (n, m)
+        m, all known; only differences from those of the first target count.
+    target : array_like (m, 3)
+        Reference targets, m.
+    station : array_like (n, 3)
+        Rough places of the stations, m.
+    tolerance : float
+        A pair of steps that moves no target further, m, is the last.
+    iterations : int
+        Most pairs of steps.
+    """
+    d, u, U = (np.array(a, dtype=float) for a in (displacement, target, station))
+    if not np.isfinite(d).all():
+        raise MethodError("the alternating scheme expects every displacement, found NaN; use the solver")
+    d -= d[:, :1]
+    nominal, moved, rate, done = u.copy(), np.inf, 1.0, 0
+    while done < iterations:
+        done += 1
+        before, last = u.copy(), moved
+        for _ in range(_HALF_STEPS):
+            U = _stations(d, u, U)
+        length = np.linalg.norm(u[0] - U, axis=1)
+        for _ in range(_HALF_STEPS):
+            u[1:] = _targets(d[:, 1:] + length[:, None], u[1:], U)
+        moved = float(np.sqrt(((u - before) ** 2).sum(axis=1).max()))
+        rate = moved / last if last < np.inf else 1.0
+        if moved < tolerance:
+            break
+    r = d - (np.linalg.norm(u - U[:, None], axis=-1) - np.linalg.norm(u[0] - U, axis=1)[:, None])
+    stations, u, _ = fitted(Stations(U, np.zeros(len(U)), np.zeros(0)), u, nominal, np.ones(len(u), dtype=bool))
+    return Alternated(u, stations.place, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2))))
+
+
+def _stations(d: Array, u: Array, U: Array) -> Array:
+    """Return the stations after a Gauss-Newton step on equation (6)."""
+    v = u - U[:, None]
+    distance = np.linalg.norm(v, axis=-1)
+    e = v / distance[..., None]
+    r, J = d - (distance - distance[:, :1]), e[:, :1] - e
+    A = J.transpose(0, 2, 1) @ J
+    step = np.linalg.solve(A, np.einsum("jia,ji->ja", J, r)[..., None])[..., 0]
+    # No further than half the way to the nearest target.
+    share = np.minimum(1.0, 0.5 * distance.min(axis=1) / np.maximum(np.linalg.norm(step, axis=1), 1e-300))
+    moved: Array = U + share[:, None] * step
+    return moved
+
+
+def _targets(reach: Array, u: Array, U: Array) -> Array:
+    """Return the targets after a Gauss-Newton step on equation (7), the stations and their distances known."""
+    v = u - U[:, None]
+    distance = np.linalg.norm(v, axis=-1)
+    e = v / distance[..., None]
+    A = np.einsum("jia,jib->iab", e, e)
+    b = np.einsum("jia,ji->ia", e, reach - distance)
+    moved: Array = u + np.linalg.solve(A, b[..., None])[..., 0]
+    return moved

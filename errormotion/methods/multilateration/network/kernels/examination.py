@@ -1,0 +1,264 @@
+"""Compiled loops over the targets at the solution: covariances in the datum, and redundancies.
+
+The equations are those of `network`. Chunks of targets and their order are those of `kernels`, and so are the bits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
+from errormotion.methods.multilateration.network.kernels.four_examined import Flags, datum_four, examine_four
+from errormotion.methods.multilateration.network.kernels.general import sight
+
+
+@compiled()
+def _add_motions(F: Array, c: Array, out: Array) -> None:  # pragma: no cover - compiled
+    """Add G^T F (6, q), G = [1, -(c x)], to ``out``."""
+    for k in range(F.shape[1]):
+        x, y, z = F[0, k], F[1, k], F[2, k]
+        out[0, k] += x
+        out[1, k] += y
+        out[2, k] += z
+        out[3, k] += c[1] * z - c[2] * y
+        out[4, k] += c[2] * x - c[0] * z
+        out[5, k] += c[0] * y - c[1] * x
+
+
+@compiled()
+def _add_response(
+    e: Array, w: Array, D: Array, c: Array, extra: Array, i: int, v: Array, out: Array
+) -> None:  # pragma: no cover - compiled
+    """Add G^T F (6, q) to ``out``: F = D E^T (-Q) is how a target moves by the stations' parameters; v (6,) is room."""
+    n = len(e)
+    for j in range(n):
+        for a in range(3):
+            v[a] = w[j] * w[j] * (D[a, 0] * e[j, 0] + D[a, 1] * e[j, 1] + D[a, 2] * e[j, 2])
+        v[3], v[4], v[5] = c[1] * v[2] - c[2] * v[1], c[2] * v[0] - c[0] * v[2], c[0] * v[1] - c[1] * v[0]
+        for a in range(6):
+            out[a, 4 * j] += v[a] * e[j, 0]
+            out[a, 4 * j + 1] += v[a] * e[j, 1]
+            out[a, 4 * j + 2] += v[a] * e[j, 2]
+            out[a, 4 * j + 3] += v[a]
+            for p in range(len(extra)):
+                out[a, 4 * n + p] -= v[a] * extra[p, j, i]
+
+
+@compiled()
+def _spread_motions(D: Array, c: Array, DG: Array) -> None:  # pragma: no cover - compiled
+    """Fill D G (3, 6), G = [1, -(c x)]."""
+    for k in range(3):
+        DG[k, 0], DG[k, 1], DG[k, 2] = D[k, 0], D[k, 1], D[k, 2]
+        DG[k, 3] = D[k, 2] * c[1] - D[k, 1] * c[2]
+        DG[k, 4] = D[k, 0] * c[2] - D[k, 2] * c[0]
+        DG[k, 5] = D[k, 1] * c[0] - D[k, 0] * c[1]
+
+
+@compiled()
+def _datum_part(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, part: int, sums: Array
+) -> None:  # pragma: no cover - compiled
+    n, first, last = len(station), part * CHUNK, min(len(target), (part + 1) * CHUNK)
+    if n == 4 and len(extra) == 0:
+        datum_four(weight, station, target, carries, centre, first, last, sums)
+        return
+    w, c, e, distance, D = np.empty(n), np.empty(3), np.empty((n, 3)), np.empty(n), np.empty((3, 3))
+    v, DG = np.empty(6), np.empty((3, 6))
+    for i in range(first, last):
+        for j in range(n):
+            w[j] = weight[j, i]
+        if not carries[i] or not sight(w, station, target[i], e, distance, D):
+            continue
+        for k in range(3):
+            c[k] = target[i, k] - centre[k]
+        _add_response(e, w, D, c, extra, i, v, sums[:, 12:])
+        _spread_motions(D, c, DG)
+        _add_motions(DG, c, sums[:, 6:12])
+        for a in range(3):
+            sums[a, a] += 1.0
+        square = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+        for a in range(3):
+            for b in range(3):
+                sums[3 + a, 3 + b] += (square if a == b else 0.0) - c[a] * c[b]
+
+
+@compiled()
+def _datum_alone(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
+) -> None:  # pragma: no cover - compiled
+    for part in range(len(sums)):
+        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
+
+
+@compiled(parallel=True)
+def _datum_shared(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
+) -> None:  # pragma: no cover - compiled
+    for part in numba.prange(len(sums)):
+        _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
+
+
+def datum_sums(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array
+) -> tuple[Array, Array, Array]:
+    """Return sums over the targets that carry the datum of G^T G (6, 6), G^T D G (6, 6) and G^T F (6, 4 n + k).
+
+    G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
+    the stations' parameters.
+    """
+    sums = np.zeros((chunks(len(target)), 6, 12 + 4 * len(station) + len(extra)))
+    work = _datum_shared if len(target) > MANY else _datum_alone
+    work(weight, station, extra, target, carries, centre, sums)
+    total = sums.sum(axis=0)
+    return total[:, :6], total[:, 6:12], total[:, 12:]
+
+
+@compiled(fastmath=FAST)
+def _covariance(
+    D: Array, DG: Array, FW: Array, G: Array, H: Array, K: Array, room: Array, out: Array
+) -> None:  # pragma: no cover - compiled
+    """Fill the covariance (3, 3) of a target in the datum: D + F F^T - D G H G^T - G H G^T D + G K G^T."""
+    for a in range(3):
+        for k in range(6):
+            # 1/2 G K - D G H: G times its transpose, and the transpose of that, make both sides of the datum.
+            s = 0.0
+            for b in range(6):
+                s += 0.5 * G[a, b] * K[b, k] - DG[a, b] * H[b, k]
+            room[a, k] = s
+    for a in range(3):
+        for b in range(3):
+            s = D[a, b]
+            for k in range(FW.shape[1]):
+                s += FW[a, k] * FW[b, k]
+            for k in range(6):
+                s += room[a, k] * G[b, k] + room[b, k] * G[a, k]
+            out[a, b] = s
+
+
+@compiled(fastmath=FAST)
+def _examine_part(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
+    part: int,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    stations, p = len(station), W.shape[1]
+    first, last = part * CHUNK, min(len(target), (part + 1) * CHUNK)
+    if stations == 4 and len(extra) == 0:
+        examine_four(
+            weight, station, target, carries, centre, W, shift, H, K, first, last, covariance, redundancy
+        )  # fmt: skip
+        return
+    w, distance, c = np.empty(stations), np.empty(stations), np.empty(3)
+    e, D, FW, q = np.empty((stations, 3)), np.empty((3, 3)), np.empty((3, p)), np.empty((stations, p))
+    DG, G, room = np.empty((3, 6)), np.zeros((3, 6)), np.empty((3, 6))
+    for i in range(first, last):
+        for j in range(stations):
+            w[j], redundancy[j, i] = weight[j, i], np.nan
+        if not sight(w, station, target[i], e, distance, D):
+            covariance[i] = np.nan
+            continue
+        for k in range(3):
+            c[k] = target[i, k] - centre[k]
+        if carries[i]:
+            _spread_motions(D, c, DG)
+        else:
+            DG[:] = 0.0
+        # Readings by the stations' factor, then targets: both sum over the stations.
+        for j in range(stations):
+            for k in range(p):
+                s = e[j, 0] * W[4 * j, k] + e[j, 1] * W[4 * j + 1, k] + e[j, 2] * W[4 * j + 2, k]
+                q[j, k] = -w[j] * (s + W[4 * j + 3, k])
+                for a in range(len(extra)):
+                    q[j, k] += w[j] * extra[a, j, i] * W[4 * stations + a, k]
+        for a in range(3):
+            for k in range(p):
+                FW[a, k] = 0.0
+        for j in range(stations):
+            x, y, z = e[j, 0], e[j, 1], e[j, 2]
+            hat = 0.0
+            for a in range(3):
+                s = -w[j] * (D[a, 0] * x + D[a, 1] * y + D[a, 2] * z)
+                hat -= w[j] * e[j, a] * s
+                for k in range(p):
+                    FW[a, k] += s * q[j, k]
+            redundancy[j, i] = 1.0 - hat
+        # The target has taken its part of a reading, the stations take theirs of what is left.
+        for j in range(stations):
+            taken = 0.0
+            for k in range(p):
+                s = q[j, k] + w[j] * (e[j, 0] * FW[0, k] + e[j, 1] * FW[1, k] + e[j, 2] * FW[2, k])
+                taken += s * s
+            redundancy[j, i] = redundancy[j, i] - taken if w[j] > 0.0 else np.nan
+        # G times the datum's shift, taken off.
+        for k in range(p):
+            FW[0, k] -= shift[0, k] + shift[4, k] * c[2] - shift[5, k] * c[1]
+            FW[1, k] -= shift[1, k] + shift[5, k] * c[0] - shift[3, k] * c[2]
+            FW[2, k] -= shift[2, k] + shift[3, k] * c[1] - shift[4, k] * c[0]
+        G[0, 0], G[1, 1], G[2, 2] = 1.0, 1.0, 1.0
+        G[0, 4], G[0, 5], G[1, 3], G[1, 5], G[2, 3], G[2, 4] = c[2], -c[1], -c[2], c[0], c[1], -c[0]
+        _covariance(D, DG, FW, G, H, K, room, covariance[i])
+
+
+@compiled()
+def _examine_alone(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    for part in range((len(target) + CHUNK - 1) // CHUNK):
+        _examine_part(
+            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
+        )  # fmt: skip
+
+
+@compiled(parallel=True)
+def _examine_shared(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
+) -> None:  # pragma: no cover - compiled  # fmt: skip
+    for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
+        _examine_part(
+            weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
+        )  # fmt: skip
+
+
+def examine(
+    weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
+    centre: Array, W: Array, shift: Array, H: Array, K: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return covariances (m, 3, 3) of the targets, m^2, and redundancies (n, m) of the readings.
+
+    Parameters
+    ----------
+    W : ndarray (4 n + k, p)
+        Factor of the covariance of the stations' parameters, in any datum.
+    shift : ndarray (6, p)
+        How the datum's fit to the targets moves with the factor.
+    H, K : ndarray (6, 6)
+        Inverse of the sum of G^T G; and H (sum of G^T D G) H.
+    """
+    n, m = weight.shape
+    covariance, redundancy = np.empty((m, 3, 3)), np.empty((n, m))
+    work = _examine_shared if m > MANY else _examine_alone
+    work(weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy)
+    return covariance, redundancy
+
+
+@compiled()
+def residuals(
+    reading: Array, station: Array, dead_path: Array, extra: Array, value: Array, target: Array
+) -> Array:  # pragma: no cover - compiled
+    """Return readings (n, m) less what stations and targets (m, 3) make of them, m."""
+    left = np.empty(reading.shape)
+    for j in range(len(station)):
+        x, y, z, d, out = station[j, 0], station[j, 1], station[j, 2], reading[j], left[j]
+        for i in range(len(target)):
+            a, b, c = target[i, 0] - x, target[i, 1] - y, target[i, 2] - z
+            out[i] = d[i] + dead_path[j] - math.sqrt(a * a + b * b + c * c)
+        for k in range(len(value)):
+            for i in range(len(target)):
+                out[i] -= value[k] * extra[k, j, i]
+    return left

@@ -1,0 +1,441 @@
+"""Compiled loops over the targets: each is moved to where its distances put it, then its block is eliminated.
+
+With E (n, 3) the weighted directions from the stations to a target, N the rows that span what is left of them
+(N E = 0) and Q the weighted derivatives of the readings by the stations, a target says N Q ds = N r about the stations
+and nothing else: n - 3 equations, one with four stations. N comes from Householder reflections, so no digits cancel.
+
+Threads share the targets in chunks. A chunk is summed by one thread and the chunks' sums are added in their order: the
+result has the same bits on any number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
+from errormotion.methods.multilateration.network.kernels.four import reduce_four, screen_four, settle_four
+
+LANES = 128
+"""Equations whose products are added up together."""
+# A target with its directions this close to a plane is not moved.
+_FLAT = 1e-13
+# Steps of a target in one pass, and below which length, m, one is the last.
+_STEPS = 8
+_SHORT = 1e-3
+# The same where the stations are final.
+_LAST_STEPS = 30
+_SETTLED = 1e-7
+# Directions to the stations closer to a plane than this leave a target without a place.
+_NO_PLACE = 1e-6
+
+
+@compiled()
+def _locate(reach: Array, w: Array, station: Array, u: Array) -> float:  # pragma: no cover - compiled
+    """Move a target ``u`` (3,) by one Gauss-Newton step on its distances ``reach`` (n,); return how far it went, m."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    nearest = np.inf
+    for j in range(len(station)):
+        if w[j] == 0.0:
+            continue
+        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        nearest = min(nearest, distance)
+        k = w[j] / distance
+        x, y, z, r = x * k, y * k, z * k, w[j] * (reach[j] - distance)
+        a00 += x * x
+        a01 += x * y
+        a02 += x * z
+        a11 += y * y
+        a12 += y * z
+        a22 += z * z
+        b0 += x * r
+        b1 += y * r
+        b2 += z * r
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    determinant = a00 * c00 + a01 * c01 + a02 * c02
+    if not determinant > _FLAT * (a00 + a11 + a22) ** 3:
+        return 0.0
+    s0 = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
+    s1 = (c01 * b0 + (a00 * a22 - a02 * a02) * b1 + (a01 * a02 - a00 * a12) * b2) / determinant
+    s2 = (c02 * b0 + (a01 * a02 - a00 * a12) * b1 + (a00 * a11 - a01 * a01) * b2) / determinant
+    size = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+    if not size > 0.0:
+        return 0.0
+    share = min(1.0, 0.5 * nearest / size)
+    u[0] += share * s0
+    u[1] += share * s1
+    u[2] += share * s2
+    return size
+
+
+@compiled()
+def _place(
+    reach: Array, w: Array, station: Array, u: Array, steps: int, short: float
+) -> float:  # pragma: no cover - compiled
+    """Move a target to where its distances put it; return how far the first step took it, m."""
+    first = _locate(reach, w, station, u)
+    size = first
+    for _ in range(steps):
+        # The next step goes as the square of this one over the distance.
+        if size < short:
+            break
+        size = _locate(reach, w, station, u)
+    return first
+
+
+@compiled()
+def reflect(
+    reach: Array, w: Array, station: Array, u: Array, e: Array, r: Array, E: Array, Q: Array
+) -> None:  # pragma: no cover - compiled
+    """Fill directions e (n, 3), weighted residuals r (n,), and the reflections' result: E = Q^T R, Q (n, n)."""
+    n = len(station)
+    for j in range(n):
+        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        e[j, 0], e[j, 1], e[j, 2] = x / distance, y / distance, z / distance
+        r[j] = w[j] * (reach[j] - distance) if w[j] > 0.0 else 0.0
+        E[j, 0], E[j, 1], E[j, 2] = w[j] * e[j, 0], w[j] * e[j, 1], w[j] * e[j, 2]
+        for k in range(n):
+            Q[j, k] = 1.0 if j == k else 0.0
+    for c in range(3):
+        square = 0.0
+        for j in range(c, n):
+            square += E[j, c] * E[j, c]
+        if square == 0.0:
+            continue
+        alpha = -math.copysign(math.sqrt(square), E[c, c])
+        head = E[c, c] - alpha
+        # 2 / (v . v) with v = (head, E[c+1:, c]).
+        beta = 1.0 / (square - alpha * E[c, c])
+        for k in range(c + 1, 3):
+            s = head * E[c, k]
+            for j in range(c + 1, n):
+                s += E[j, c] * E[j, k]
+            s *= beta
+            E[c, k] -= s * head
+            for j in range(c + 1, n):
+                E[j, k] -= s * E[j, c]
+        for k in range(n):
+            s = head * Q[c, k]
+            for j in range(c + 1, n):
+                s += E[j, c] * Q[j, k]
+            s *= beta
+            Q[c, k] -= s * head
+            for j in range(c + 1, n):
+                Q[j, k] -= s * E[j, c]
+        E[c, c] = alpha
+
+
+@compiled(fastmath=FAST)
+def _add_products(v: Array, count: int, sums: Array) -> None:  # pragma: no cover - compiled
+    """Add v v^T over the first ``count`` columns to the upper triangle of ``sums``."""
+    for i in range(len(sums)):
+        for j in range(i, len(sums)):
+            s = 0.0
+            for t in range(count):
+                s += v[i, t] * v[j, t]
+            sums[i, j] += s
+
+
+@compiled()
+def reach_of(
+    reading: Array, weight: Array, dead_path: Array, extra: Array, value: Array, i: int, reach: Array, w: Array
+) -> None:  # pragma: no cover - compiled
+    """Fill the distances (n,) that target i's readings stand for, and their weights."""
+    for j in range(len(reach)):
+        w[j] = weight[j, i]
+        d = reading[j, i] + dead_path[j]
+        for k in range(len(value)):
+            d -= value[k] * extra[k, j, i]
+        reach[j] = d
+
+
+@compiled()
+def _reduce_chunk(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, first: int, last: int, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `reduce_targets` for some targets; return the square of the longest first step, m^2."""
+    n, more = len(station), len(value)
+    q = 4 * n + more
+    reach, w, r, u = np.empty(n), np.empty(n), np.empty(n), np.empty(3)
+    e, E, Q = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, n))
+    v, filled, furthest = np.empty((q + 1, LANES)), 0, 0.0
+    for i in range(first, last):
+        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
+        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
+        furthest = max(furthest, _place(reach, w, station, u, _STEPS, _SHORT))
+        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
+        reflect(reach, w, station, u, e, r, E, Q)
+        for a in range(3, n):
+            rest = 0.0
+            for k in range(more):
+                v[4 * n + k, filled] = 0.0
+            for j in range(n):
+                c = Q[a, j] * w[j]
+                v[4 * j, filled], v[4 * j + 1, filled] = -c * e[j, 0], -c * e[j, 1]
+                v[4 * j + 2, filled], v[4 * j + 3, filled] = -c * e[j, 2], -c
+                rest += Q[a, j] * r[j]
+                for k in range(more):
+                    v[4 * n + k, filled] += c * extra[k, j, i]
+            v[q, filled] = rest
+            filled += 1
+            if filled == LANES:
+                _add_products(v, filled, sums)
+                filled = 0
+    _add_products(v, filled, sums)
+    return furthest * furthest
+
+
+@compiled()
+def sight(
+    w: Array, station: Array, u: Array, e: Array, distance: Array, D: Array
+) -> bool:  # pragma: no cover - compiled
+    """Fill directions e (n, 3), distances (n,) and D (3, 3), the inverse of E^T E; False where that has none."""
+    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(len(station)):
+        x, y, z = u[0] - station[j, 0], u[1] - station[j, 1], u[2] - station[j, 2]
+        distance[j] = math.sqrt(x * x + y * y + z * z)
+        k = 1.0 / distance[j]
+        x, y, z = k * x, k * y, k * z
+        e[j, 0], e[j, 1], e[j, 2] = x, y, z
+        k = w[j] * w[j]
+        a00 += k * x * x
+        a01 += k * x * y
+        a02 += k * x * z
+        a11 += k * y * y
+        a12 += k * y * z
+        a22 += k * z * z
+    # E^T E = R^T R, and D = R^-1 R^-T.
+    least = _NO_PLACE * _NO_PLACE * (a00 + a11 + a22)
+    if not a00 > least:
+        return False
+    r00 = math.sqrt(a00)
+    r01, r02 = a01 / r00, a02 / r00
+    if not a11 - r01 * r01 > least:
+        return False
+    r11 = math.sqrt(a11 - r01 * r01)
+    r12 = (a12 - r01 * r02) / r11
+    if not a22 - r02 * r02 - r12 * r12 > least:
+        return False
+    i00, i11, i22 = 1.0 / r00, 1.0 / r11, 1.0 / math.sqrt(a22 - r02 * r02 - r12 * r12)
+    i01, i12 = -i00 * r01 * i11, -i11 * r12 * i22
+    i02 = -(i00 * r02 + i01 * r12) * i22
+    D[0, 0] = i00 * i00 + i01 * i01 + i02 * i02
+    D[0, 1] = i01 * i11 + i02 * i12
+    D[0, 2] = i02 * i22
+    D[1, 1] = i11 * i11 + i12 * i12
+    D[1, 2] = i12 * i22
+    D[2, 2] = i22 * i22
+    D[1, 0], D[2, 0], D[2, 1] = D[0, 1], D[0, 2], D[1, 2]
+    return True
+
+
+@compiled()
+def _settle_chunk(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, first: int, last: int, nominal: Array, centre: Array, openness: Array, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `settle_targets` for some targets; return the square of the longest first step, m^2."""
+    n = len(station)
+    reach, w, u, e = np.empty(n), np.empty(n), np.empty(3), np.empty((n, 3))
+    distance, D, furthest = np.empty(n), np.empty((3, 3)), 0.0
+    for i in range(first, last):
+        reach_of(reading, weight, dead_path, extra, value, i, reach, w)
+        u[0], u[1], u[2] = place[0, i], place[1, i], place[2, i]
+        furthest = max(furthest, _place(reach, w, station, u, _LAST_STEPS, _SETTLED))
+        place[0, i], place[1, i], place[2, i] = u[0], u[1], u[2]
+        openness[i] = math.inf
+        if not sight(w, station, u, e, distance, D):
+            continue
+        openness[i] = D[0, 0] + D[1, 1] + D[2, 2]
+        sums[0] += 1.0
+        for k in range(3):
+            sums[1 + k] += u[k] - centre[k]
+            sums[4 + k] += nominal[i, k] - centre[k]
+            for h in range(3):
+                sums[7 + 3 * k + h] += (nominal[i, k] - centre[k]) * (u[h] - centre[h])
+    return furthest * furthest
+
+
+@compiled()
+def reduce_part(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, part: int, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    """Do the work of `reduce_targets` for one chunk; return the square of the longest first step, m^2."""
+    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
+    if len(station) == 4 and len(value) == 0:
+        return reduce_four(reading, weight, station, dead_path, place, first, last, sums)
+    return _reduce_chunk(reading, weight, station, dead_path, extra, value, place, first, last, sums)
+
+
+@compiled()
+def _settle_part(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, part: int, nominal: Array, centre: Array, openness: Array, sums: Array,
+) -> float:  # pragma: no cover - compiled  # fmt: skip
+    first, last = part * CHUNK, min(place.shape[1], (part + 1) * CHUNK)
+    if len(station) == 4 and len(value) == 0:
+        return settle_four(
+            reading, weight, station, dead_path, place, first, last, nominal, centre, openness, sums
+        )  # fmt: skip
+    return _settle_chunk(
+        reading, weight, station, dead_path, extra, value, place, first, last, nominal, centre, openness, sums
+    )
+
+
+@compiled()
+def total(sums: Array) -> Array:  # pragma: no cover - compiled
+    """Return the sum of the chunks' sums (k, q, q), in their order, with the lower triangle that they leave out."""
+    q = sums.shape[1]
+    whole = np.zeros((q, q))
+    for part in range(len(sums)):
+        for i in range(q):
+            for j in range(i, q):
+                whole[i, j] += sums[part, i, j]
+    for i in range(q):
+        for j in range(i):
+            whole[i, j] = whole[j, i]
+    return whole
+
+
+@compiled()
+def _reduce_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array,
+) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
+    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
+    sums, moved = np.zeros((count, q, q)), 0.0
+    for part in range(count):
+        far = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
+        moved = max(moved, far)
+    return total(sums), math.sqrt(moved)
+
+
+@compiled(parallel=True)
+def _reduce_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array,
+) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
+    q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
+    sums, moved = np.zeros((count, q, q)), np.zeros(count)
+    for part in numba.prange(count):
+        moved[part] = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
+    return total(sums), math.sqrt(moved.max())
+
+
+@compiled()
+def _settle_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array, openness: Array,
+) -> Array:  # pragma: no cover - compiled  # fmt: skip
+    sums = np.zeros((chunks(place.shape[1]), 16))
+    for part in range(len(sums)):
+        _settle_part(
+            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
+        )
+    return sums
+
+
+@compiled(parallel=True)
+def _settle_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array, openness: Array,
+) -> Array:  # pragma: no cover - compiled  # fmt: skip
+    sums = np.zeros((chunks(place.shape[1]), 16))
+    for part in numba.prange(len(sums)):
+        _settle_part(
+            reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
+        )
+    return sums
+
+
+def reduce_targets(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array,
+) -> tuple[Array, float]:  # fmt: skip
+    """Move every target and add up what the targets say about the stations.
+
+    Parameters
+    ----------
+    reading, weight : ndarray (n, m)
+        Displacements, m, and 1 / standard deviation, 1/m; 0 for what does not count, be it a number or not.
+    station, dead_path : ndarray (n, 3), (n,)
+        m.
+    extra, value : ndarray (k, n, m), (k,)
+        What a unit of each further parameter adds to a reading, and the parameters.
+    place : ndarray (3, m)
+        Targets, m; changed in place.
+
+    Returns
+    -------
+    sums : ndarray (4 n + k + 1, 4 n + k + 1)
+        V V^T; the columns of V are the equations of the targets, derivatives of the readings by (U, L) of every
+        station and by the further parameters, and last the residual.
+    moved : float
+        Longest first step of a target, m.
+    """
+    work = _reduce_shared if place.shape[1] > MANY else _reduce_alone
+    sums, moved = work(reading, weight, station, dead_path, extra, value, place)
+    return sums, moved
+
+
+def settle_targets(
+    reading: Array, weight: Array, station: Array, dead_path: Array, extra: Array, value: Array,
+    place: Array, nominal: Array, centre: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Put every target (3, m) where its distances from the final stations are best fulfilled.
+
+    Returns
+    -------
+    openness : ndarray (m,)
+        Trace of each target's covariance with the stations known, m^2; infinite where readings leave a direction open.
+    moments : ndarray (16,)
+        Of the targets with a place: their number, sums of targets and of nominal ones (m, 3) about ``centre`` (3,), and
+        the sum (3, 3) of nominal times target.
+    """
+    openness = np.empty(place.shape[1])
+    work = _settle_shared if place.shape[1] > MANY else _settle_alone
+    sums = work(reading, weight, station, dead_path, extra, value, place, nominal, centre, openness)
+    return openness, sums.sum(axis=0)
+
+
+@compiled()
+def _screen_alone(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:  # pragma: no cover - compiled
+    largest = np.zeros(1)
+    count = screen_four(reading, weight, station, dead_path, place, 0, place.shape[1], factor, weak, largest)
+    return count, largest[0]
+
+
+@compiled(parallel=True)
+def _screen_shared(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:  # pragma: no cover - compiled
+    parts, m = chunks(place.shape[1]), place.shape[1]
+    largest, count = np.zeros((parts, 1)), np.zeros(parts, dtype=np.int64)
+    for part in numba.prange(parts):
+        count[part] = screen_four(
+            reading, weight, station, dead_path, place, part * CHUNK, min(m, (part + 1) * CHUNK), factor, weak,
+            largest[part],
+        )  # fmt: skip
+    return count.sum(), largest.max()
+
+
+def screen_targets(
+    reading: Array, weight: Array, station: Array, dead_path: Array, place: Array, factor: Array, weak: float
+) -> tuple[int, float]:
+    """Return how many readings of targets (3, m) seen by four stations are checked, and the worst residual.
+
+    Residuals are over what they should be, the stations' factor (16, p) taken into account; readings with a redundancy
+    below ``weak`` are not checked.
+    """
+    work = _screen_shared if place.shape[1] > MANY else _screen_alone
+    count, square = work(reading, weight, station, dead_path, place, factor, weak)
+    return int(count), math.sqrt(square)

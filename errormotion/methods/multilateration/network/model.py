@@ -1,0 +1,90 @@
+"""Model of multilateration: readings from targets and stations, their derivatives, and which way to count parameters.
+
+    d_ij = |u_i - U_j| - L_j + sum_k p_k c_kij
+
+u_i target i, U_j station j, L_j its dead path, p_k further parameters with known coefficients. The parameters of the
+stations are counted (U_1, L_1, U_2, L_2, ..., p).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Places (n, 3) and dead paths (n,) of the stations, m, and further parameters (k,)."""
+
+    place: Array
+    dead_path: Array
+    value: Array
+
+    def stepped(self, step: Array) -> Stations:
+        """Return the stations after a step (4 n + k,) of their parameters."""
+        n = len(self.place)
+        block = step[: 4 * n].reshape(n, 4)
+        return Stations(self.place + block[:, :3], self.dead_path + block[:, 3], self.value + step[4 * n :])
+
+    @property
+    def vector(self) -> Array:
+        """Parameters (4 n + k,)."""
+        return np.concatenate([np.column_stack([self.place, self.dead_path]).ravel(), self.value])
+
+    def motions(self, centre: Array) -> Array:
+        """Return what a rigid motion (t, r about ``centre``) of the whole does to the parameters, (4 n + k, 6)."""
+        n = len(self.place)
+        T = np.zeros((4 * n + len(self.value), 6))
+        T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.place, centre)
+        return T
+
+
+def motions(places: Array, centre: Array) -> Array:
+    """Return G (n, 3, 6): how places (n, 3) move with a rigid motion t + r x (place - ``centre``)."""
+    x, y, z = (places - centre).T
+    G = np.zeros((len(places), 3, 6))
+    G[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    G[:, 0, 4], G[:, 0, 5], G[:, 1, 5] = z, -y, x
+    G[:, 1, 3], G[:, 2, 3], G[:, 2, 4] = -z, y, -x
+    return G
+
+
+def readings(target: Array, stations: Stations, extra: Array | None = None) -> Array:
+    """Return the displacements (n, m), m, of targets (m, 3) from stations."""
+    distance = np.linalg.norm(target - stations.place[:, None], axis=-1)
+    found: Array = distance - stations.dead_path[:, None]
+    return found if extra is None else found + np.tensordot(stations.value, extra, 1)
+
+
+def directions(target: Array, stations: Stations) -> Array:
+    """Return the unit vectors (n, m, 3) from the stations to the targets."""
+    v = target - stations.place[:, None]
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True), dtype=float)
+
+
+def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.csr_array:
+    """Return the derivatives of the known readings by (u_1, ..., u_m, U_1, L_1, ..., U_n, L_n), sparse.
+
+    Parameters
+    ----------
+    target : ndarray (m, 3)
+        m.
+    stations : Stations
+        Without further parameters.
+    known : ndarray (n, m)
+        Rows of the result: target after target, station after station.
+    """
+    n, m = known.shape
+    e = directions(target, stations).transpose(1, 0, 2)
+    values = np.concatenate([e, -e, np.full((m, n, 1), -1.0)], axis=-1)
+    i, j = np.arange(m)[:, None, None], np.arange(n)[None, :, None]
+    columns = np.concatenate(np.broadcast_arrays(3 * i + np.arange(3), 3 * m + 4 * j + np.arange(3)), axis=-1)
+    columns = np.concatenate([columns, np.broadcast_to(3 * m + 4 * j + 3, (m, n, 1))], axis=-1)
+    some = known.T
+    rows = 7 * np.arange(np.count_nonzero(some) + 1)
+    return sp.csr_array((values[some].ravel(), columns[some].ravel(), rows), shape=(len(rows) - 1, 3 * m + 4 * n))

@@ -1,0 +1,271 @@
+"""What a multilateration answers: places, dead paths, and what they are worth.
+
+The datum is a free network: of all rigid motions of the whole, the one that fits the targets to their nominal places
+best. With a_i the part of target i that its own readings decide, covariance D_i, and ds that of the stations,
+
+    u_i = a_i + F_i ds - G_i H (sum_k G_k^T (a_k + F_k ds)),   H = (sum_k G_k^T G_k)^-1,
+
+G_i = [1, -(c_i x)] the motions of target i with the whole. Covariances of one target with another, i and k, are then
+
+    D_i delta_ik + F'_i F'_k^T - D_i G_i H G_k^T - G_i H G_k^T D_k + G_i K G_k^T,   K = H (sum G^T D G) H,
+
+F' the factor of the stations after the datum has taken its part. A target that its readings hardly fix does not carry
+the datum: the sums leave it out, and so do the terms in its own D G. What follows from a solution (datum, covariances,
+residuals and notes) is reckoned when it is asked for, and then kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network import determinacy, outliers
+from errormotion.methods.multilateration.network.kernels.examination import datum_sums, examine, residuals
+from errormotion.methods.multilateration.network.model import Stations, directions, motions
+
+
+@dataclass(frozen=True)
+class Datum:
+    """Free network on the targets: what is needed to carry covariances into it.
+
+    Attributes
+    ----------
+    centre : ndarray (3,)
+        Mean of the targets, m.
+    factor : ndarray (4 n + k, p)
+        W, W W^T the covariance of the stations' parameters in some datum.
+    shift : ndarray (6, p)
+        H sum(G^T F) W.
+    H, K : ndarray (6, 6)
+        As above.
+    """
+
+    centre: Array
+    factor: Array
+    shift: Array
+    H: Array
+    K: Array
+
+
+class _OnDemand:
+    """The datum of a network: as given, or else reckoned when it is first asked for."""
+
+    def __set__(self, network: Network, value: Any) -> None:
+        network.__dict__["_datum"] = None if value is self else value
+
+    def __get__(self, network: Network | None, owner: type) -> Any:
+        if network is None:
+            return self
+        if network.__dict__["_datum"] is None:
+            network.__dict__["_datum"] = network._reckoned_datum()
+        return network.__dict__["_datum"]
+
+
+@dataclass(frozen=True)
+class Network:
+    """Targets and stations from displacements.
+
+    Attributes
+    ----------
+    target : ndarray (m, 3)
+        Estimated places, m, in the frame of the nominal ones; NaN where readings do not determine a target.
+    stations : Stations
+        Places, dead paths and further parameters in the same frame.
+    reading : ndarray (n, m)
+        Displacements, m; NaN where there is none.
+    weight : ndarray (n, m)
+        1 / standard deviation, 1/m; 0 for readings that are missing or left out.
+    left_out : tuple of (int, int)
+        Readings (station, target) found wrong, from 0.
+    undecided : tuple of int
+        Targets with a wrong reading that cannot be told from the right ones; they are NaN.
+    sigma0 : float
+        Root mean square of the residuals over their expected size: 1 where the noise is what was stated.
+    freedom : int
+        Readings in use minus parameters.
+    iterations : int
+        Passes over the targets.
+    converged : bool
+        Whether a further step would be below the tolerance.
+    condition : float
+        Of the stations' information, its diagonal scaled to 1: largest over smallest eigenvalue of what distances can
+        determine.
+    extra : ndarray (k, n, m)
+        Derivatives of the readings by further parameters.
+    carries : ndarray of bool (m,)
+        Targets that carry the datum: those that their readings fix about as well as the others.
+    centre : ndarray (3,)
+        Mean of these, m.
+    factor : ndarray (4 n + k, p)
+        W, W W^T the covariance of the stations' parameters in some datum.
+    rough : ndarray (n, 3) or None
+        Rough places of the stations as given, m.
+    datum : Datum
+        What is needed to carry covariances into the datum.
+    """
+
+    target: Array
+    stations: Stations
+    reading: Array = field(repr=False)
+    weight: Array = field(repr=False)
+    left_out: tuple[tuple[int, int], ...]
+    undecided: tuple[int, ...]
+    sigma0: float
+    freedom: int
+    iterations: int
+    converged: bool
+    condition: float
+    extra: Array = field(repr=False)
+    carries: NDArray[np.bool_] = field(repr=False)
+    centre: Array = field(repr=False)
+    factor: Array = field(repr=False)
+    rough: Array | None = field(repr=False)
+    datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
+
+    def _reckoned_datum(self) -> Datum:
+        GG, GDG, GF = datum_sums(self.weight, self.station, self.extra, self.target, self.carries, self.centre)
+        H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
+        return Datum(self.centre, self.factor, H @ GF @ self.factor, H, H @ GDG @ H)
+
+    @cached_property
+    def joint_covariance(self) -> Array:
+        """Covariance (4 n + k, 4 n + k) of (U_1, L_1, U_2, ..., p) in the datum, m^2."""
+        T = self.stations.motions(self.datum.centre)
+        F = self.datum.factor - T @ self.datum.shift
+        return np.asarray(F @ F.T + T @ self.datum.K @ T.T)
+
+    @property
+    def target_covariance(self) -> Array:
+        """Covariances (m, 3, 3), m^2, in the datum, in which the six motions of the whole have none."""
+        return self._examined[0]
+
+    @property
+    def redundancy(self) -> Array:
+        """Share (n, m) of a reading's error that shows in its residual, 0 to 1; NaN where none is in use."""
+        return self._examined[1]
+
+    @cached_property
+    def residual(self) -> Array:
+        """Reading minus model (n, m), m: of every reading that exists and whose target has a place, left out or not.
+
+        NaN for all others. A reading that was left out has had no say in its target's place, so that its residual
+        shows its whole error.
+        """
+        s = self.stations
+        return residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know."""
+        return (
+            *outliers.told(self.left_out, self.undecided),
+            *determinacy.without_place(self.weight, self.undecided),
+            *determinacy.without_say(self.carries, self.target),
+            *determinacy.weak_layout(self.target_covariance, self.weight, self.station, self.target),
+            *determinacy.weak_targets(self.target, self.target_covariance, self.station),
+            *determinacy.swapped_stations(self.station, self.rough),
+        )
+
+    @cached_property
+    def _examined(self) -> tuple[Array, Array]:
+        datum = self.datum
+        return examine(
+            self.weight, self.station, self.extra, self.target, self.carries,
+            datum.centre, datum.factor, datum.shift, datum.H, datum.K,
+        )  # fmt: skip
+
+    @property
+    def station(self) -> Array:
+        """Places of the stations, (n, 3), m."""
+        return self.stations.place
+
+    @property
+    def dead_path(self) -> Array:
+        """Dead paths (n,), m."""
+        return self.stations.dead_path
+
+    @property
+    def station_covariance(self) -> Array:
+        """Covariances of the stations' places, (n, 3, 3), m^2."""
+        n = len(self.station)
+        blocks = self.joint_covariance[: 4 * n, : 4 * n].reshape(n, 4, n, 4)
+        return np.ascontiguousarray(blocks[np.arange(n), :3, np.arange(n), :3])
+
+    def blocks(self, targets: NDArray[np.intp] | slice = slice(None)) -> tuple[Array, Array, Array]:
+        """Return what joint covariances of some targets (t of them) are made of.
+
+        Returns
+        -------
+        own : ndarray (t, 3, 3)
+            D, m^2: covariance from a target's own readings, the stations known.
+        factor : ndarray (t, 3, p)
+            F', m: what one standard deviation of each independent part of the stations does, in the datum.
+        G : ndarray (t, 3, 6)
+            Motions with the whole about the datum's centre.
+        """
+        u, w = self.target[targets], self.weight[:, targets]
+        e = directions(u, self.stations)
+        A = np.einsum("jt,jta,jtb->tab", w**2, e, e)
+        own = np.full_like(A, np.nan)
+        fine = np.isfinite(self.target_covariance[targets]).all(axis=(1, 2))
+        own[fine] = np.linalg.inv(A[fine])
+        n = len(self.station)
+        W = self.datum.factor[: 4 * n].reshape(n, 4, -1)
+        q = -np.einsum("jta,jap->jtp", e, W[:, :3]) - W[:, None, 3]
+        if len(self.extra):
+            q = q + np.einsum("kjt,kp->jtp", self.extra[:, :, targets], self.datum.factor[4 * n :])
+        G = motions(u, self.datum.centre)
+        factor = -own @ np.einsum("jt,jta,jtp->tap", w**2, e, q) - G @ self.datum.shift
+        return own, factor, G
+
+    def influence(self) -> Array:
+        """Return what the stations' uncertainty does to all targets at once, (p, m, 3), m.
+
+        One row for each independent part of the stations' covariance: the sources of ``influence`` of an error
+        dataset. What is left of ``target_covariance`` is independent from target to target but for the datum's
+        small terms, of the order 6 / (3 m) of it.
+        """
+        return np.ascontiguousarray(self.blocks()[1].transpose(2, 0, 1))
+
+    def covariance(self, targets: NDArray[np.intp] | slice = slice(None)) -> Array:
+        """Return the joint covariance (3 t, 3 t), m^2, of some targets (t of them)."""
+        own, F, G = self.blocks(targets)
+        t, DG = len(own), np.where(self.carries[targets][:, None, None], own @ G, 0.0)
+        F, DG, G = F.reshape(3 * t, -1), DG.reshape(3 * t, 6), G.reshape(3 * t, 6)
+        side = DG @ self.datum.H @ G.T
+        C: Array = F @ F.T - side - side.T + G @ self.datum.K @ G.T
+        C.reshape(t, 3, t, 3)[np.arange(t), :, np.arange(t), :] += own
+        return C
+
+    def response(self, change: Array) -> tuple[Array, Array]:
+        """Return how targets (m, 3) and stations' parameters (4 n + k,) move when readings change by (n, m), m.
+
+        For systematic effects: refraction, a drift between set-ups, a wrong wavelength. First order. Changes of
+        readings that are not in use have none.
+        """
+        w = self.weight
+        used = np.isfinite(self.target_covariance).all(axis=(1, 2))
+        own, factor, G = self.blocks()
+        e = directions(self.target, self.stations)
+        d = np.where((w > 0) & used, change, 0.0)
+        alone = np.einsum("tab,jt,jta->tb", own, w**2 * d, e)
+        alone[~used] = 0.0
+        # Gradient of the stations: derivatives of the readings by them, times what the targets have not taken.
+        rest = w**2 * (d - np.einsum("jta,ta->jt", np.nan_to_num(e), alone))
+        g = np.concatenate([-np.einsum("jt,jta->ja", rest, np.nan_to_num(e)), -rest.sum(axis=1)[:, None]], axis=1)
+        gradient = np.concatenate([g.ravel(), np.einsum("kjt,jt->k", self.extra, rest)])
+        parts = self.datum.factor.T @ gradient
+        shift = self.datum.H @ np.einsum("tab,ta->b", G[self.carries], alone[self.carries])
+        moved = alone + factor @ parts - G @ shift
+        T = self.stations.motions(self.datum.centre)
+        return moved, self.datum.factor @ parts - T @ (self.datum.shift @ parts + shift)
+
+    @property
+    def uncertainty(self) -> Array:
+        """Standard uncertainty of each target: root of the trace of its covariance, (m,), m."""
+        return np.asarray(np.sqrt(np.trace(self.target_covariance, axis1=1, axis2=2)), dtype=float)

@@ -1,0 +1,1 @@
+"""Planning: multilateration, the uncertainty to expect before a measurement."""

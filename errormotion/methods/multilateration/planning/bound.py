@@ -1,0 +1,95 @@
+"""What a layout will be worth, before anything is measured: the Cramer-Rao bound of targets and stations.
+
+The covariance of a network depends on places and noise alone. Estimates of `solver` reach it as long as the stations'
+uncertainty is small against their distances. The formulation of the paper, L_j = |u_1 - U_j|, takes the first target's
+readings for exact: it puts their noise into everything else, and its own covariance does not know.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.network import determinacy
+from errormotion.methods.multilateration.network.descent import State
+from errormotion.methods.multilateration.network.model import Stations, readings
+from errormotion.methods.multilateration.network.network import Network
+from errormotion.methods.multilateration.network.problem import state_problem
+from errormotion.methods.multilateration.network.solver import conclude
+
+_EXACT = 1e-3
+"""Noise of the first target's readings, in units of their own, that counts as none."""
+
+
+def bound(
+    target: ArrayLike,
+    station: ArrayLike,
+    *,
+    noise: ArrayLike = 1e-6,
+    seen: ArrayLike | None = None,
+    dead_path_uncertainty: ArrayLike | None = None,
+) -> Network:
+    """Return the network of error-free readings, with the covariances that readings with noise will have.
+
+    Parameters
+    ----------
+    target : array_like (m, 3)
+        m.
+    station : array_like (n, 3)
+        m.
+    noise : array_like (), (n,) or (n, m)
+        Standard deviation of a reading, m.
+    seen : array_like of bool (n, m), optional
+        Which readings there will be; all without it.
+    dead_path_uncertainty : array_like (n,), optional
+        What is known of the dead paths, m; nothing without it.
+
+    Raises
+    ------
+    MethodError
+        Places that leave a freedom loose.
+    """
+    u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
+    if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:
+        raise MethodError(f"expected places (target, 3) and (station, 3), found {u.shape} and {U.shape}")
+    if not (np.isfinite(u).all() and np.isfinite(U).all()):
+        raise MethodError(
+            "expected places of targets and stations as numbers, found NaN or infinite ones; leave them out"
+        )
+    stations = Stations(U, np.zeros(len(U)), np.zeros(0))
+    d = readings(u, stations)
+    if seen is not None:
+        d = np.where(np.asarray(seen, dtype=bool), d, np.nan)
+    known = None if dead_path_uncertainty is None else (np.zeros(len(U)), dead_path_uncertainty)
+    problem = state_problem(d, u, noise, known)
+    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
+    place = np.ascontiguousarray(u.T)
+    return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
+
+
+def relative_bound(
+    target: ArrayLike, station: ArrayLike, *, noise: float = 1e-6, first: int = 0
+) -> tuple[Array, Array, Network]:
+    """Return what the formulation relative to one target is worth.
+
+    Returns
+    -------
+    target_covariance, joint_covariance : ndarray (m, 3, 3), (4 n, 4 n)
+        True covariances of its estimates, in the datum of the free network.
+    stated : Network
+        What it would state itself, the readings of that target taken for exact.
+    """
+    n, m = len(np.asarray(station)), len(np.asarray(target))
+    sigma = np.full((n, m), float(noise))
+    sigma[:, first] *= _EXACT
+    stated = bound(target, station, noise=sigma)
+    covariance, joint = stated.target_covariance.copy(), stated.joint_covariance.copy()
+    for j in range(n):
+        change = np.zeros((n, m))
+        change[j, first] = float(noise) * np.sqrt(1.0 - _EXACT**2)
+        moved, parameters = stated.response(change)
+        covariance += moved[:, :, None] * moved[:, None, :]
+        joint += np.outer(parameters, parameters)
+    return covariance, joint, stated

@@ -1,0 +1,229 @@
+"""Where to place the tracker: the layout from which the targets become least uncertain.
+
+What a layout is worth follows from places alone (see `bound`). Places are searched for within boxes, from many starts,
+first with a smooth stand-in for the largest uncertainty of all targets, then with that itself.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from errormotion.methods.multilateration.planning.sight import Sight
+    from errormotion.methods.multilateration.settings import Layout
+
+
+LEAST = 4
+"""Stations, and readings of each."""
+_PENALTY = 1e3
+_UNSEEN = 10.0
+"""Places of the volume that are not seen: one in a hundred counts like uncertainties larger by a tenth."""
+_TRIED, _GLOBAL, _LOCAL = 30, 80, 60
+"""Evaluations for each coordinate that is searched: places at random, all over, from each start."""
+_STARTS = 3
+_ROUNDS = 2
+_POWER = 16.0
+"""The mean of the uncertainties to such a power is nearly the largest, and smooth."""
+_TOLERANCE = 1e-6
+
+
+def grid(layout: Layout) -> tuple[Array, Array]:
+    """Return axis positions of the targets and places of the reflector there, both (m, 3), m."""
+    if layout.targets:
+        listed = np.array(layout.targets, np.float64)
+        return listed, listed + np.array(layout.reflector)
+    axes = [np.linspace(a, b, k) if k > 1 else np.array([(a + b) / 2])
+            for a, b, k in zip(layout.low, layout.high, layout.count, strict=True)]  # fmt: skip
+    position = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return position, position + np.array(layout.reflector)
+
+
+def serpentine(count: tuple[int, int, int]) -> list[int]:
+    """Return the targets of a grid in an order in which each is a neighbour of the one before."""
+    nx, ny, nz = count
+    order: list[int] = []
+    for i in range(nx):
+        rows = range(ny) if i % 2 == 0 else range(ny - 1, -1, -1)
+        for j in rows:
+            line = [(i * ny + j) * nz + k for k in range(nz)]
+            order += line if len(order) // nz % 2 == 0 else line[::-1]
+    return order
+
+
+def route(layout: Layout) -> list[int]:
+    """Return the targets in the order of a tour: of a grid row by row, else always to the nearest that is left."""
+    if not layout.targets:
+        return serpentine(layout.count)
+    position = grid(layout)[0]
+    left = list(range(len(position)))
+    order = [left.pop(int(np.argmin(position.sum(axis=1))))]
+    while left:
+        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at once
+        order.append(left.pop(int(np.argmin(away))))
+    return order
+
+
+def target_names(count: int) -> list[str]:
+    """Return the names of targets: T001, T002 and so on."""
+    digits = max(3, len(str(count)))
+    return [f"T{i + 1:0{digits}}" for i in range(count)]
+
+
+def station_names(count: int) -> list[str]:
+    """Return the names of stations: S1, S2 and so on."""
+    return [f"S{j + 1}" for j in range(count)]
+
+
+def uncertainty(covariance: Array) -> Array:
+    """Return standard uncertainties (m,) of all three coordinates together, m, from covariances (m, 3, 3)."""
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2)))
+
+
+def optimise(
+    target: ArrayLike,
+    boxes: ArrayLike,
+    sight: Sight,
+    *,
+    noise: float,
+    start: ArrayLike | None = None,
+    minimise: Literal["largest", "mean"] = "largest",
+    seed: int = 1,
+    worth: Callable[[Array], Array] | None = None,
+    thorough: bool = True,
+) -> Array:
+    """Find the places of the tracker that leave the targets least uncertain.
+
+    Parameters
+    ----------
+    target : array_like (m, 3)
+        Places of the reflector, m.
+    boxes : array_like (n, 2, 3)
+        Lower and upper corner of the box of each station, m.
+    sight : Sight
+        What is seen from where. Every target has to be seen by three stations at least, and enough of them by four.
+    noise : float
+        Standard deviation of a reading, m.
+    start : array_like (n, 3), optional
+        Places to begin with, m. The answer is never worse than they are, moved into their boxes.
+    minimise : {"largest", "mean"}
+        Which uncertainty.
+    seed : int
+        Of the search; same seed, same answer.
+    worth : callable, optional
+        Uncertainties that count, m, from places (n, 3); without it those of the targets.
+    thorough : bool
+        Look all over the boxes; without it near the start only.
+
+    Returns
+    -------
+    ndarray (n, 3)
+        m.
+
+    Raises
+    ------
+    MethodError
+        No places within the boxes determine all targets.
+    """
+    import nlopt
+
+    from errormotion.methods.multilateration.planning.bound import bound
+
+    u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
+    if len(corners) < LEAST:
+        raise MethodError(f"expected boxes for at least {LEAST} stations; found {len(corners)}; add some")
+    low, high = corners[:, 0].ravel(), corners[:, 1].ravel()
+    free = np.flatnonzero(high > low)
+    places = low.copy()
+
+    def at(x: Array) -> Array:
+        full = places.copy()
+        full[free] = x
+        return full.reshape(-1, 3)
+
+    def cost(x: Array, power: float | None = None) -> float:
+        U = at(x)
+        seen = sight.sees(U, u)
+        if lacking := _lacking(seen):
+            return _PENALTY * (1.0 + lacking)
+        try:
+            if worth is not None:
+                return weighed(worth(U), power)
+            with np.errstate(all="ignore"):  # in what is said about a loose freedom, which nobody reads here
+                network = bound(u, U, noise=noise, seen=seen)
+        except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
+            return _PENALTY
+        sigma = uncertainty(network.target_covariance)
+        return weighed(sigma, power) if np.isfinite(sigma).all() else _PENALTY
+
+    def weighed(sigma: Array, power: float | None) -> float:
+        known = np.isfinite(sigma)
+        unseen, sigma = _UNSEEN * float(np.mean(~known)), sigma[known]
+        if not len(sigma):
+            return _PENALTY
+        if minimise == "mean":
+            return float(np.log(sigma.mean())) + unseen
+        largest = sigma.max()
+        smooth = 0.0 if power is None else float(np.log(np.mean((sigma / largest) ** power)) / power)
+        return float(np.log(largest)) + smooth + unseen
+
+    nlopt.srand(seed)
+    rng = np.random.default_rng(seed)
+
+    def search(algorithm: int, x: Array, evaluations: int, power: float | None = None) -> Array:
+        x = np.clip(x, low[free], high[free])
+        lowest, best = cost(x, power), x
+
+        def follow(y: Array, gradient: Array) -> float:  # noqa: ARG001 - the signature of nlopt
+            nonlocal lowest, best
+            if (value := cost(y, power)) < lowest:
+                lowest, best = value, y.copy()
+            return value
+
+        problem = nlopt.opt(algorithm, x.size)
+        problem.set_lower_bounds(low[free])
+        problem.set_upper_bounds(high[free])
+        problem.set_min_objective(follow)
+        problem.set_ftol_abs(_TOLERANCE)
+        problem.set_maxeval(evaluations * x.size)
+        with suppress(nlopt.RoundoffLimited):  # it has come as far as it can
+            problem.optimize(x)
+        return np.asarray(np.clip(best, low[free], high[free]), np.float64)
+
+    given = places if start is None else np.clip(np.asarray(start, np.float64).ravel(), low, high)
+    best = given[free]
+    if free.size:
+        # Good places are on the sides and at the corners of the boxes more often than inside.
+        share = rng.uniform(size=(_TRIED * free.size if thorough else 0, free.size))
+        share = np.where(rng.uniform(size=share.shape) < 0.5, np.round(share), share)
+        tried = sorted((low[free] + share * (high - low)[free]).tolist(), key=lambda x: cost(np.array(x)))
+        everywhere = [search(nlopt.GN_CRS2_LM, best, _GLOBAL, _POWER)] if thorough else []
+        starts = [best, *everywhere, *(np.array(x) for x in tried[:_STARTS])]
+        starts = [search(nlopt.LN_SBPLX, x, _LOCAL, _POWER) for x in starts]
+        best = min([best, *starts], key=cost)
+        # The largest of many uncertainties has edges along which a search creeps: begun anew it goes on.
+        for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * (_ROUNDS if thorough else 1):
+            best = search(algorithm, best, _LOCAL)
+    if cost(best) >= _PENALTY:
+        raise MethodError(
+            f"expected places within the boxes from which {LEAST} stations see the targets; found none in the search: "
+            f"{_lacking(sight.sees(at(best), u))} readings are lacking at the best. Enlarge the boxes, choose a "
+            "reflector with a wider acceptance, move the obstacles, or add stations"
+        )
+    return at(best)
+
+
+def _lacking(sees: NDArray[np.bool_]) -> int:
+    """Return how many readings are lacking: three for a target, as many for a station, and all unknowns."""
+    n, _ = sees.shape
+    by_target, by_station = sees.sum(axis=0), sees.sum(axis=1)
+    lacking = np.maximum(3 - by_target, 0).sum() + np.maximum(LEAST - by_station, 0).sum()
+    return int(lacking + max(4 * n - 6 - np.maximum(by_target - 3, 0).sum(), 0))

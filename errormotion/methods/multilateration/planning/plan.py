@@ -1,0 +1,311 @@
+"""What to expect of the set-up in the settings before anybody carries a tracker, and of the best one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.units import format_quantity
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.identification.refraction import index_uncertainty, sensitivities
+from errormotion.methods.multilateration.identification.uncertainty import Scatter
+from errormotion.methods.multilateration.network.model import motions
+from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.sight import Sight
+from errormotion.methods.multilateration.planning.target_plan import Choice, choose
+from errormotion.methods.multilateration.planning.text import layout_text, map_text
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from errormotion.methods.multilateration.network.network import Network
+    from errormotion.methods.multilateration.planning.sight import Planning
+    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.plugins import MethodInfo
+
+    Array = Array
+
+SETUPS = ("as set", "best")
+_COARSE = 4
+"""Targets along each axis with which places are searched: the worst are at the sides."""
+_AIR = (20.0, 101325.0, 0.5)
+"""Temperature (degC), pressure (Pa), humidity (1) of the air that a plan reckons with."""
+
+
+def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None) -> xr.Dataset:
+    """Return an error dataset of zeros with the covariance to expect of the layout that the settings name.
+
+    What it holds beside, all standard uncertainties of three coordinates together by the readings alone, m:
+    ``target_uncertainty`` (target) of the layout as set; ``map_uncertainty`` (setup, place) at ``map_position``
+    (place, direction), as set and with the best layout; ``largest_uncertainty`` and ``mean_uncertainty`` (setup) of
+    that map; ``gain``, the factor by which the best layout is better in what was minimised; ``station_place`` and
+    ``best_place`` (station, direction), m; ``sees`` (station, target) and ``best_sees`` (station, place). Where targets
+    are chosen, the map is over the candidates, and ``chosen`` (place) is 1 for those to measure. The attribute
+    ``best_layout`` has the best layout as settings of a campaign; ``notes`` say it in words.
+
+    Parameters
+    ----------
+    info : MethodInfo
+        Of the method.
+    settings : Settings
+    planning : Planning, optional
+        Boxes, obstacles, reflector, and what is minimised; default: those of the settings.
+
+    Raises
+    ------
+    MethodError
+        The layout leaves a freedom loose, or there is no better one within the boxes.
+    """
+    p = settings.layout
+    planning = planning or settings.planning
+    position, target = layout.grid(p)
+    sight = Sight.of(planning)
+    own = np.array(p.stations, np.float64)
+    noise = reading_noise(settings)
+    sees = sight.sees(own, target)
+    expected = bound(target, own, noise=noise, seen=sees)
+    sigma = layout.uncertainty(expected.target_covariance)
+    if planning.targets is None:
+        found = _best(settings, planning, sight, own, expected)
+    else:
+        found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own), noise)
+    gain = _measure(planning, found.own) / _measure(planning, found.best) if found.better else 1.0
+    text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
+    if planning.write is not None:
+        _write(planning.write, text)
+    names, groups, shared = _shared(settings, position, target)
+    names, groups, moves = _sources(settings, expected, names, groups, shared)
+    influence = np.concatenate([moves, np.zeros_like(moves)], axis=-1)
+    covariance = np.full((len(target), 6, 6), np.nan)
+    covariance[:, :3, :3] = expected.target_covariance + np.einsum("sia,sib->iab", shared, shared)
+    if settings.together and settings.repeatability:  # one visit, which all stations see
+        covariance[:, :3, :3] += settings.repeatability**2 * np.eye(3)
+    errors = np.zeros((len(target), 6))
+    errors[:, 3:] = np.nan
+    errors[~np.isfinite(sigma)] = np.nan
+    m = {"units": "m"}
+    coords = {name: ("target", position[:, i], m) for i, name in enumerate("xyz")}
+    ds = build_errors(
+        errors,
+        covariance,
+        dims=("target",),
+        coords={
+            **coords,
+            "target": layout.target_names(len(target)),
+            "station": layout.station_names(len(own)),
+            "direction": list("xyz"),
+            "setup": list(SETUPS),
+        },
+        component="tool",
+        machine="plan",
+        frame="machine",
+        functional_point=np.array(p.reflector),
+        reference="planned, not measured",
+        method=info.id,
+        method_version=info.version,
+        provenance=provenance.make(settings, None, None, steps=["plan"]),
+        influence=influence,
+        sources=names,
+        source_groups=groups,
+        extras={
+            "target_uncertainty": xr.DataArray(sigma, dims="target", attrs=m),
+            "map_position": xr.DataArray(found.position, dims=("place", "direction"), attrs=m),
+            "map_uncertainty": xr.DataArray(np.stack([found.own, found.best]), dims=("setup", "place"), attrs=m),
+            **_chosen(planning, found),
+            "station_place": xr.DataArray(own, dims=("station", "direction"), attrs=m),
+            "best_place": xr.DataArray(found.station, dims=("station", "direction"), attrs=m),
+            "sees": xr.DataArray(sees.astype(np.int8), dims=("station", "target")),
+            "best_sees": xr.DataArray(found.sees.astype(np.int8), dims=("station", "place")),
+            "largest_uncertainty": xr.DataArray([np.nanmax(s) for s in (found.own, found.best)], dims="setup", attrs=m),
+            "mean_uncertainty": xr.DataArray([np.nanmean(s) for s in (found.own, found.best)], dims="setup", attrs=m),
+            "gain": xr.DataArray(gain, attrs={"units": "1"}),
+        },
+    )
+    return ds.assign_attrs(notes=_notes(sigma, found, sees, gain, planning, position), best_layout=text)
+
+
+def reading_noise(settings: Settings) -> float:
+    """Return the standard deviation of a reading, m: the tracker's, and with set-ups in turn the machine's."""
+    repeated = 0.0 if settings.together else settings.repeatability or 0.0
+    return float(np.hypot(settings.layout.displacement_noise, repeated))
+
+
+def boxes_of(planning: Planning, stations: Array) -> Array:
+    """Return the box of each station, (n, 2, 3), m: as stated, or the one around all stations of the layout.
+
+    Raises
+    ------
+    MethodError
+        Boxes for another number of stations.
+    """
+    if planning.boxes:
+        boxes = np.array([(box.low, box.high) for box in planning.boxes], np.float64)
+        if len(boxes) not in (1, len(stations)):
+            raise MethodError(
+                f"expected one box for all stations or one for each of {len(stations)}; found {len(boxes)}"
+            )
+        return np.tile(boxes, (len(stations), 1, 1)) if len(boxes) == 1 else boxes
+    around = np.stack([stations.min(axis=0), stations.max(axis=0)])
+    return np.tile(around, (len(stations), 1, 1))
+
+
+def _measure(planning: Planning, sigma: Array) -> float:
+    """Return what is minimised, m, of uncertainties of the targets, NaN for those that are not determined."""
+    return float(np.nanmax(sigma) if planning.minimise == "largest" else np.nanmean(sigma))
+
+
+def _best(settings: Settings, planning: Planning, sight: Sight, own: Array, expected: Network) -> Choice:
+    """Return the best places and what they are worth at the targets; the own ones where no others are better."""
+    p, noise = settings.layout, reading_noise(settings)
+    position, target = layout.grid(p)
+    coarse = p.model_copy(update={"count": tuple(min(k, _COARSE) for k in p.count)})
+    place = layout.optimise(
+        layout.grid(coarse)[1],
+        boxes_of(planning, own),
+        sight,
+        noise=noise,
+        start=own,
+        minimise=planning.minimise,
+    )
+    seen = sight.sees(place, target)
+    best = bound(target, place, noise=noise, seen=seen)
+    there, here = (layout.uncertainty(network.target_covariance) for network in (best, expected))
+    found = Choice(position, np.arange(len(target)), place, here, there, here, seen)
+    unseen = np.isnan(here).sum() - np.isnan(there).sum()
+    if unseen > 0 or _measure(planning, there) < _measure(planning, here):
+        return found
+    return replace(found, station=own, best=here, sees=sight.sees(own, target))
+
+
+def _chosen(planning: Planning, found: Choice) -> dict[str, xr.DataArray]:
+    """Return which candidates to measure, where they were chosen."""
+    if planning.targets is None:
+        return {}
+    chosen = np.zeros(len(found.position), np.int8)
+    chosen[found.chosen] = 1
+    about = {"long_name": "1: to be measured", "of": planning.targets.uncertainty}
+    return {"chosen": xr.DataArray(chosen, dims="place", attrs=about)}
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise MethodError(
+            f"planning.write: {path}: expected a file that can be made anew; {error.strerror or error}. Name another."
+        ) from error
+
+
+def _sources(
+    settings: Settings, expected: Network, names: list[str], groups: list[str], shared: Array
+) -> tuple[list[str], list[str], Array]:
+    """Return the sources of the stations, by cause, before the given ones."""
+    machine = 0.0 if settings.together else settings.repeatability or 0.0
+    shares, rows = Scatter(settings.layout.displacement_noise, machine).shares, expected.influence()
+    moves = [np.sqrt(share) * rows for share in shares.values()]
+    of = [
+        f"stations.{k}" if len(shares) == 1 else f"stations.{k} {group}" for group in shares for k in range(len(rows))
+    ]
+    return [*of, *names], [*(group for group in shares for _ in rows), *groups], np.concatenate([*moves, shared])
+
+
+def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[str], list[str], Array]:
+    """Return sources that all readings share, their groups, and what they do to the targets (source, m, 3), m.
+
+    A scale error of the lengths makes the whole larger, stations and dead paths with it. An expansion of the scales
+    that is not known makes the grid look smaller.
+    """
+    centred = target - target.mean(axis=0)
+    air = settings.air
+    u = {
+        "temperature": air.temperature_uncertainty,
+        "pressure": air.pressure_uncertainty,
+        "humidity": air.humidity_uncertainty / 100,
+    }
+    index = index_uncertainty(sensitivities(*_AIR, air.co2, air.wavelength), u)
+    scales = {f"air {name}": ("air", float(abs(value))) for name, value in index.items()}
+    scales["wavelength"] = ("air", air.wavelength_uncertainty)
+    scales["scale of the tracker"] = ("tracker", settings.scale_uncertainty)
+    names = [name for name, (_, value) in scales.items() if value > 0]
+    groups = [scales[name][0] for name in names]
+    effects = [scales[name][1] * centred for name in names]
+    if (e := settings.expansion) is not None:
+        warmer = 0.0 if e.temperature is None else e.temperature - e.reference
+        strains = {"expansion coefficient": np.full(3, e.coefficient_uncertainty * warmer)}
+        strains |= {
+            f"temperature of {axis} scale": e.coefficient * e.temperature_uncertainty * np.eye(3)[k]
+            for k, axis in enumerate("XYZ")
+        }
+        strains = {name: strain for name, strain in strains.items() if strain.any()}
+        names += list(strains)
+        groups += ["expansion"] * len(strains)
+        effects += [_without_motion(-strain * position, target) for strain in strains.values()]
+    return names, groups, np.array(effects).reshape(-1, *target.shape)
+
+
+def _without_motion(change: Array, target: Array) -> Array:
+    """Return a change (m, 3) of the targets less the rigid motion that fits it best."""
+    G = motions(target, target.mean(axis=0)).reshape(-1, 6)
+    left = change.ravel() - G @ np.linalg.lstsq(G, change.ravel())[0]
+    return np.asarray(left.reshape(change.shape))
+
+
+def _notes(
+    sigma: Array, found: Choice, sees: NDArray[np.bool_], gain: float, planning: Planning, position: Array
+) -> list[str]:
+    worst = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(position[np.nanargmax(sigma)] * 1e3))
+    own = _largest_and_mean(sigma)
+    notes = [
+        f"As set, a target has a standard uncertainty (three coordinates together) of {own[0]} at the worst, with the "
+        f"axes at {worst}, and {own[1]} in the mean, by the readings alone.",
+    ]
+    if missing := int(np.count_nonzero(~sees)):
+        notes.append(
+            f"As set, {missing} of {sees.size} lines of sight are blocked or beyond the reflector's acceptance."
+        )
+    if unseen := int(np.count_nonzero(np.isnan(sigma))):
+        what = "target is" if unseen == 1 else "targets are"
+        notes.append(f"As set, {unseen} {what} seen by fewer than three stations and will not be determined.")
+    if planning.targets is not None:
+        notes += _notes_of_choice(found, len(position), planning.targets.uncertainty)
+    where = "; ".join("{:.0f}, {:.0f}, {:.0f}".format(*(U * 1e3)) for U in found.station)
+    if gain != 1:
+        best = _largest_and_mean(found.best)
+        notes.append(
+            f"The best layout within the boxes: {best[0]} at the worst, {best[1]} in the mean. Its {planning.minimise} "
+            f"uncertainty is {_times(gain)}. Stations at (mm): {where}."
+        )
+    else:
+        notes.append("No better layout was found within the boxes.")
+    if text := map_text(found.position, found.own, found.best):
+        notes.append(text)
+    if planning.write is not None:
+        notes.append(f"The best layout is in {planning.write}: put it in the campaign in place of its layout.")
+    return notes
+
+
+def _notes_of_choice(found: Choice, own: int, of: str) -> list[str]:
+    what = "the error that follows from the errors of the axes" if of == "axes" else "a target measured there"
+    as_set, chosen = _largest_and_mean(found.own), _largest_and_mean(found.before)
+    return [
+        f"Of {len(found.position)} candidates {len(found.chosen)} targets are chosen. Anywhere in the box, {what} has "
+        f"a standard uncertainty of {as_set[0]} at the worst and {as_set[1]} in the mean with the {own} targets as "
+        f"set; of {chosen[0]} and {chosen[1]} with as many chosen ones as are allowed, from the same stations.",
+    ]
+
+
+def _largest_and_mean(sigma: Array) -> list[str]:
+    return [format_quantity(float(x), "um", 3) for x in (np.nanmax(sigma), np.nanmean(sigma))]
+
+
+def _times(gain: float) -> str:
+    return f"{gain:.3g} times smaller" if gain > 1 else f"{1 / gain:.3g} times larger"

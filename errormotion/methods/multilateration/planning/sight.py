@@ -1,0 +1,122 @@
+"""Which targets a tracker sees from where: nothing in between, and the reflector turned towards it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from errormotion.arrays import Array
+from errormotion.datasets.units import Angle, Length
+from errormotion.methods.multilateration.planning.box import Box
+from errormotion.methods.multilateration.planning.choosing import Choosing
+from errormotion.plugins import PluginSettings
+
+_MARGIN = 1e-9
+
+
+class Planning(PluginSettings):
+    """What places there are for the tracker, what stands in its way, and what is to become small."""
+
+    boxes: tuple[Box, ...] = Field(
+        default=(),
+        description="where the tracker may stand: one box for each station, or one for all; without: anywhere "
+        "between the stations of the layout",
+    )
+    obstacles: tuple[Box, ...] = Field(default=(), description="what no beam passes")
+    reflector_axis: tuple[float, float, float] | None = Field(
+        default=None,
+        description="where the reflector looks, in machine coordinates; without: turned towards each station, and "
+        "left so for all targets",
+    )
+    acceptance: Angle = Field(
+        default=float(np.radians(60.0)),
+        gt=0,
+        le=float(np.pi),
+        description="largest angle between that direction and the beam",
+    )
+    nearest: Length = Field(default=0.1, ge=0, description="least distance from tracker to reflector")
+    minimise: Literal["largest", "mean"] = Field(
+        default="largest", description="which of the targets' uncertainties: the largest one, or their mean"
+    )
+    targets: Choosing | None = Field(
+        default=None, description="choose the targets as well; without: those of the layout"
+    )
+    write: Path | None = Field(
+        default=None, description="file for the best layout, as settings of a campaign (TOML); none is replaced"
+    )
+
+    @model_validator(mode="after")
+    def _looks_somewhere(self) -> Self:
+        if self.reflector_axis is not None and not any(self.reflector_axis):
+            raise ValueError(
+                "reflector_axis: expected a direction; found (0, 0, 0); leave it out or say where it looks"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Lines of sight.
+
+    Attributes
+    ----------
+    obstacles : ndarray (k, 2, 3)
+        Lower and upper corners of boxes, m.
+    axis : ndarray (3,) or None
+        Where the reflector looks, a unit vector; None: from the middle of the targets to each station.
+    acceptance : float
+        Largest angle between that and the beam, rad.
+    nearest : float
+        Least distance, m.
+    middle : ndarray (3,) or None
+        Where reflectors turned towards a station look from; None: the mean of the targets.
+    """
+
+    obstacles: Array
+    axis: Array | None
+    acceptance: float
+    nearest: float
+    middle: Array | None = None
+
+    @classmethod
+    def of(cls, planning: Planning) -> Sight:
+        """Return the lines of sight that settings describe."""
+        boxes = np.array([(box.low, box.high) for box in planning.obstacles], np.float64).reshape(-1, 2, 3)
+        axis = None
+        if planning.reflector_axis is not None:
+            axis = np.array(planning.reflector_axis, np.float64)
+            axis /= np.linalg.norm(axis)
+        return cls(boxes, axis, planning.acceptance, planning.nearest)
+
+    def sees(self, station: ArrayLike, target: ArrayLike) -> NDArray[np.bool_]:
+        """Return which targets (m, 3), m, are seen from which stations (n, 3), m, as (n, m)."""
+        U, u = np.asarray(station, np.float64), np.asarray(target, np.float64)
+        back = U[:, None] - u
+        distance = np.linalg.norm(back, axis=-1)
+        axis = self.axis
+        if axis is None:
+            axis = (U - (u.mean(axis=0) if self.middle is None else self.middle))[:, None]
+            axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _MARGIN)
+        along = np.sum(back * axis, axis=-1)
+        accepted = along >= np.cos(self.acceptance) * distance - _MARGIN
+        free = accepted & (distance >= self.nearest - _MARGIN)
+        for low, high in self.obstacles:
+            free &= ~blocked(u, back, low, high)
+        return np.asarray(free)
+
+
+def blocked(start: Array, way: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Return whether the lines from ``start`` (m, 3) over ``way`` (n, m, 3) pass the inside of a box, (n, m)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (low - start) / way, (high - start) / way
+    # Along a side: within its extent for the whole way, or for none of it.
+    still = way == 0
+    inside = np.broadcast_to((start > low) & (start < high), way.shape)
+    enters = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(first, second))
+    leaves = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(first, second))
+    return np.asarray(np.maximum(enters.max(axis=-1), 0.0) < np.minimum(leaves.min(axis=-1), 1.0) - _MARGIN)

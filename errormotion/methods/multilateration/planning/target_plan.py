@@ -1,0 +1,168 @@
+"""Targets and stations chosen by turns: the targets for the stations, the stations for the targets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.choosing import positions, refuse_count
+from errormotion.methods.multilateration.planning.target_sets import POWERS, Expected, Volume
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from errormotion.methods.multilateration.planning.choosing import Choosing
+    from errormotion.methods.multilateration.planning.sight import Planning, Sight
+    from errormotion.methods.multilateration.settings import Settings
+
+    Array = Array
+
+_ROUNDS = 3
+_ENOUGH = 0.01
+"""A further round is made while the last one gained more than this share."""
+_COARSE = 4
+"""Candidates along each axis by which places of the stations are judged."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen, and what it is worth all over the volume.
+
+    Attributes
+    ----------
+    position : ndarray (k, 3)
+        Axis positions of the candidates, m.
+    chosen : ndarray of int
+        Which of them are to be measured.
+    station : ndarray (n, 3)
+        Where from, m.
+    own, best : ndarray (k,)
+        Uncertainty at the candidates with the layout as set, and with what was chosen, m; NaN where not seen.
+    before : ndarray (k,)
+        With the chosen targets, from the stations as set.
+    sees : ndarray of bool (n, k)
+        From the best stations.
+    """
+
+    position: Array
+    chosen: NDArray[np.intp]
+    station: Array
+    own: Array
+    best: Array
+    before: Array
+    sees: NDArray[np.bool_]
+
+    @property
+    def better(self) -> bool:
+        """Whether the choice can be compared with the layout as set, and is another one."""
+        return self.best is not self.own
+
+
+def choose(
+    settings: Settings, planning: Planning, choosing: Choosing, sight: Sight, boxes: Array, noise: float
+) -> Choice:
+    """Return the targets and stations that leave the volume least uncertain.
+
+    Raises
+    ------
+    MethodError
+        A box beyond the travel, more targets than candidates, too few to determine the stations, no chain.
+    """
+    p = settings.layout
+    position = positions(choosing, p.low, p.high)
+    k, own_stations = len(position), np.array(p.stations, np.float64)
+    everywhere = np.concatenate([position, layout.grid(p)[0]])
+    place = everywhere + np.array(p.reflector)
+    sight = replace(sight, middle=place[:k].mean(axis=0))
+    expected = _expected(settings, choosing, everywhere)
+
+    def volume(station: Array) -> Volume:
+        return Volume.of(station, place, sight.sees(station, place), noise, expected, k)
+
+    now = volume(own_stations)
+    refuse_count(choosing.wanted, int(now.fine.sum()), len(own_stations))
+    own = now.worth()
+    if not now.further.any():
+        raise MethodError("The layout as set is not seen by three stations at any target: see to lines of sight.")
+    chosen = np.array(now.choose(choosing.wanted, planning.minimise))
+    station, before = own_stations, now.worth(chosen)
+    best, cost = before, power_mean(before, planning)
+    some = _coarse(choosing)
+    for turn in range(_ROUNDS):
+        trial = layout.optimise(
+            place[chosen], boxes, sight, noise=noise, start=station, minimise=planning.minimise, thorough=turn == 0,
+            worth=_judged(place, chosen, some, sight, noise, expected),
+        )  # fmt: skip
+        there = volume(trial)
+        again = np.array(there.choose(choosing.wanted, planning.minimise))
+        sets = [chosen, again] if there.fine[chosen].all() else [again]
+        worth = [there.worth(each) for each in sets]
+        costs = [power_mean(each, planning) for each in worth]
+        which = int(np.argmin(costs))
+        if not costs[which] < cost:
+            break
+        gained, cost = 1 - costs[which] / cost, costs[which]
+        station, chosen, best = trial, sets[which], worth[which]
+        if gained < _ENOUGH:
+            break
+    sees = sight.sees(station, place[:k])
+    try:
+        bound(place[chosen], station, noise=noise, seen=sees[:, chosen])
+    except MethodError as error:
+        raise MethodError(
+            f"The {len(chosen)} targets that would be best do not determine places and dead paths of the stations: "
+            f"{error} Choose more targets, or add a station."
+        ) from error
+    return Choice(position, chosen, station, own, best, before, sees)
+
+
+def power_mean(sigma: Array, planning: Planning) -> float:
+    """Return what is minimised, m; places that nobody sees make it larger."""
+    known = sigma[np.isfinite(sigma)]
+    top, power = float(known.max()), POWERS[planning.minimise]
+    unseen = 1 - len(known) / len(sigma)
+    return top * float(np.mean((known / top) ** power) ** (1 / power) * np.exp(10 * unseen))
+
+
+def _expected(settings: Settings, choosing: Choosing, position: Array) -> Expected | None:
+    if choosing.uncertainty == "target":
+        return None
+    if settings.chain is None:
+        raise MethodError(
+            "To choose targets for the errors of the axes, the chain of the machine is needed (setting 'chain', such "
+            "as workpiece-X-Y-bed-Z-spindle-tool); or choose them for places (planning.targets.uncertainty = 'target')."
+        )
+    reflector = np.array(settings.layout.reflector, np.float64)
+    return Expected.of(
+        settings.chain, position, reflector, choosing.max_order, choosing.expected_displacement,
+        choosing.expected_rotation,
+    )  # fmt: skip
+
+
+def _coarse(choosing: Choosing) -> NDArray[np.intp]:
+    """Return some of the candidates, spread evenly, sides included."""
+    number = np.arange(int(np.prod(choosing.candidates))).reshape(choosing.candidates)
+    kept = [np.unique(np.linspace(0, c - 1, min(c, _COARSE)).round().astype(int)) for c in choosing.candidates]
+    return np.asarray(number[np.ix_(*kept)].ravel(), dtype=np.intp)
+
+
+class _judged:  # noqa: N801 - called like a function
+    """The uncertainty at some candidates when the chosen ones are measured, by the places of the stations."""
+
+    def __init__(
+        self, place: Array, chosen: NDArray[np.intp], some: NDArray[np.intp], sight: Sight, noise: float,
+        expected: Expected | None,
+    ) -> None:  # fmt: skip
+        which = np.concatenate([some, chosen])
+        self.place, self.count, self.sight, self.noise = place[which], len(some), sight, noise
+        self.expected = None if expected is None else Expected(expected.columns[which], expected.size)
+
+    def __call__(self, station: Array) -> Array:
+        sees = self.sight.sees(station, self.place)
+        return Volume.of(station, self.place, sees, self.noise, self.expected, self.count).worth()

@@ -1,0 +1,225 @@
+"""The chapter of a multilateration: the volume's errors, the network behind them, the axes, and what is not seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+
+from errormotion.methods.crossbeam_scan.report.view import remarks
+from errormotion.methods.multilateration.report import axes as multilateration_axes
+from errormotion.methods.multilateration.report import drawings as multilateration_figures
+from errormotion.methods.multilateration.report import plan as multilateration_plan
+from errormotion.methods.multilateration.report import quality as multilateration_quality
+from errormotion.methods.multilateration.report.view import Network, is_multilateration, network, scalar
+from errormotion.report import budget, provenance
+from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
+from errormotion.report.text import DASH, finite, fixed, integer, significant
+
+__all__ = ["is_multilateration", "part"]
+
+_OWN = "noise of the target's own readings"
+_TRACKER = "stations"
+_WORDS = {_TRACKER: "stations, by the tracker's noise", "repeatability": "repeatability of the machine"}
+_UNKNOWN = "not determined at any target"
+_NOT_SEEN = (
+    "Distances say how targets lie to one another and not where the whole of them is. Six rigid freedoms are therefore "
+    "not seen: three shifts and three rotations of all targets together. They are set so that the targets fit their "
+    "commanded places best; an error that moves or turns the whole volume does not appear here, and is not in the "
+    "uncertainty."
+)
+_ROTATIONS = (
+    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown and not zero. What rotations of "
+    "the axes do shows only as displacements of the reflector."
+)
+
+
+def part(source: Source, key: str) -> Part:
+    """Return the chapter of one result; ``key`` keeps its figures' identifiers apart."""
+    errors = source.errors
+    net = network(errors, source.raw)
+    planned = "target_uncertainty" in errors
+    volume: list[Block] = [] if planned else [_table(net)]
+    if not planned:
+        volume += [
+            multilateration_figures.vectors(net, f"{key}-vectors"),
+            multilateration_figures.slices(net, f"{key}-slices"),
+            multilateration_figures.histograms(net, f"{key}-histograms"),
+        ]
+    stations: list[Block] = [
+        multilateration_figures.layout(net, f"{key}-layout"),
+        multilateration_quality.planned(errors, net) if planned else multilateration_quality.stations(net),
+    ]
+    predicted = multilateration_plan.blocks(errors, f"{key}-map")
+    sections = [
+        *([Section("volume", "Errors of the volume", volume)] if volume else []),
+        *([Section("map", "Predicted uncertainty", predicted)] if predicted else []),
+        Section("unseen", "What is not seen", [Text(_NOT_SEEN, "warning"), Text(_ROTATIONS)]),
+        Section("stations", "Stations", stations),
+        Section("uncertainty", "Uncertainty", _uncertainty(errors, net, key)),
+    ]
+    if not planned:
+        sections += [
+            Section("axes", "Errors of the axes", multilateration_axes.blocks(errors, f"{key}-axes")),
+            Section("quality", "Readings", _readings(errors, net, key)),
+        ]
+    else:
+        sections.append(Section("quality", "Remarks", _remarks(errors)))
+    sections.append(Section("provenance", "Provenance", provenance.blocks(source)))
+    title = "Expected uncertainty of a multilateration" if planned else "Volumetric errors by multilateration"
+    return Part(title, _key_figures(net, planned), _summary(errors, net, planned), sections)
+
+
+def _key_figures(net: Network, planned: bool) -> list[KeyFigure]:
+    found = []
+    if not planned and net.worst is not None:
+        value = estimate(1e6 * net.length[net.worst], 2e6 * _along(net, net.worst), signed=False)
+        found.append(KeyFigure("longest error vector", value, "µm", f"at {net.targets[net.worst]}"))
+        rms = 1e6 * float(np.sqrt(finite(np.mean, net.length**2)))
+        found.append(KeyFigure("root mean square", Cell(fixed(rms, 2)), "µm", "of the error vectors"))
+    sigma = net.worst_direction
+    if np.isfinite(sigma).any():
+        middle = Cell(significant(2e6 * finite(np.median, sigma)))
+        found.append(KeyFigure("targets known to", middle, "µm", "U, k = 2, worst direction, median"))
+        found.append(KeyFigure("worst target", Cell(significant(2e6 * finite(np.max, sigma))), "µm", "U, k = 2"))
+    out = int((net.left_out > 0).sum())
+    if np.isfinite(net.residual).any():
+        used = int((np.isfinite(net.residual) & (net.left_out == 0)).sum())
+        found.append(KeyFigure("readings", Cell(integer(used)), "", f"used; {integer(out)} left out"))
+    return found
+
+
+def _along(net: Network, target: int) -> float:
+    """Return the standard uncertainty of a target along its error vector, m."""
+    size = net.length[target]
+    if not size > 0:
+        return math.nan
+    way = net.error[target] / size
+    variance = float(way @ net.covariance[target] @ way)
+    return math.sqrt(variance) if variance >= 0 else math.nan
+
+
+def _summary(errors: xr.Dataset, net: Network, planned: bool) -> list[str]:
+    known = int(np.isfinite(net.length).sum())
+    m, n = len(net.targets), len(net.stations)
+    words = [f"{integer(m)} targets" + (f" from {integer(n)} places of the tracker." if n else ".")]
+    if planned:
+        words = [f"Planned, not measured: {words[0]}"]
+    elif known < m:
+        words.append(f"The errors of {integer(m - known)} targets are unknown.")
+    if not planned and net.worst is not None:
+        cells = [fixed(1e6 * v, 1, signed=True) for v in net.error[net.worst]]
+        words.append(f"The longest error vector is ({', '.join(cells)}) µm.")
+    sigma0, freedom = scalar(errors, "sigma0"), scalar(errors, "freedom")
+    if math.isfinite(sigma0) and freedom > 0:
+        words.append(
+            f"The readings scatter {fixed(sigma0, 2)} times as much as stated; there are {integer(freedom)} readings "
+            "more than unknowns."
+        )
+    elif freedom == 0:
+        words.append("There are as many readings as unknowns: nothing checks them.")
+    words.append("Shifts and rotations of the whole are not seen.")
+    return words
+
+
+def _table(net: Network) -> Table:
+    rows: list[list[Cell | str]] = []
+    columns = [*zip(("EX", "EY", "EZ"), net.error.T, net.sigma.T, strict=True), ("length", net.length, None)]
+    for name, values, sigma in columns:
+        spans = [finite(np.min, values), finite(np.max, values), float(np.sqrt(finite(np.mean, values**2)))]
+        expanded = [math.nan, math.nan] if sigma is None else [2 * finite(f, sigma) for f in (np.median, np.max)]
+        reason = "of a vector's length see the ellipsoids" if sigma is None else _UNKNOWN
+        rows.append(
+            [
+                name,
+                *(
+                    or_dash(fixed(1e6 * v, 2, signed=k < 2 and sigma is not None), _UNKNOWN)
+                    for k, v in enumerate(spans)
+                ),
+                *(or_dash(significant(1e6 * v), reason) for v in expanded),
+            ]
+        )
+    return Table(
+        "Errors of the targets in µm: actual minus commanded, after the best rigid fit of the whole.",
+        ["error", "lowest", "highest", "root mean square", "U (k = 2), median", "U, largest"],
+        rows,
+    )
+
+
+def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
+    found: list[Block] = [multilateration_figures.ellipsoids(net, f"{key}-ellipsoids")]
+    sigma = net.worst_direction
+    if "influence" not in errors or not np.isfinite(sigma).any():
+        return [*found, Text("The result does not say where its uncertainty comes from.", "note")]
+    worst = int(np.nanargmax(sigma))
+    table = budget.table(_parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the least certain target")
+    own = budget.readable("independent")
+    rows = [[_WORDS.get(str(row[0]), _OWN if row[0] == own else row[0]), *row[1:]] for row in table.rows]
+    found.append(replace(table, rows=rows))
+    shared = _shared(errors)
+    if shared:
+        found.append(Text(f"Of the variance of that target, {shared} is shared with other targets.", "plain"))
+    return found
+
+
+def _parted(place: xr.Dataset) -> xr.Dataset:
+    """Return a result at one target with its own readings' covariance divided by cause, as ``scatter_share`` says.
+
+    What is independent from target to target is the tracker's noise and the machine's repeatability in one; at one
+    target the second is a group like others.
+    """
+    shares = place.get("scatter_share")
+    if shares is None or shares.dims != ("cause",) or shares.size < 2:
+        return place
+    C = np.asarray(place["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
+    F = np.asarray(place["influence"].transpose("source", "dof").values, float)
+    values, vectors = np.linalg.eigh(C - F[:, :3].T @ F[:, :3])
+    rows, groups = [], []
+    for cause, share in zip(shares["cause"].values, shares.values, strict=True):
+        if str(cause) == _TRACKER:
+            continue
+        for value, vector in zip(values, vectors.T, strict=True):
+            rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
+            groups.append(str(cause))
+    names = [*place["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
+    told = [*place["source_group"].values.tolist(), *groups]
+    without = place.drop_dims("source")
+    parted = without.assign_coords(source=names, source_group=("source", told))
+    return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
+
+
+def _shared(errors: xr.Dataset) -> str:
+    variance = np.asarray(errors["covariance"].transpose("target", "dof", "dof_").values, float)[:, :3, :3]
+    trace = np.trace(variance, axis1=1, axis2=2)
+    if not np.isfinite(trace).any():
+        return ""
+    worst = int(np.nanargmax(trace))
+    influence = np.asarray(errors["influence"].isel(target=worst).transpose("source", "dof").values, float)[:, :3]
+    share = float(np.nansum(influence**2) / trace[worst])
+    return f"{fixed(100 * min(share, 1.0), 0)} %" if math.isfinite(share) else ""
+
+
+def _remarks(errors: xr.Dataset) -> list[Block]:
+    return [Text(note, "warning") for note in remarks(errors) if "\n" not in note]  # a map in letters: drawn above
+
+
+def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
+    facts = [
+        ("noise of a reading, as used / µm", fixed(1e6 * net.noise, 2)),
+        ("scatter over what was stated", fixed(scalar(errors, "sigma0"), 3)),
+        ("readings less unknowns", integer(scalar(errors, "freedom"))),
+        ("iterations", integer(scalar(errors, "iterations"))),
+        ("condition of what can be determined", significant(scalar(errors, "condition"), 3)),
+        ("turns of the alternating scheme, beside ours", integer(scalar(errors, "alternating_iterations"))),
+        ("what it had left to go / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
+        ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
+        ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
+    ]
+    rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]
+    found = [*_remarks(errors), *multilateration_quality.left_out(net)]
+    found.append(multilateration_quality.residuals(net, f"{key}-residuals"))
+    if rows:
+        found.append(Table("The solution.", ["quantity", "value"], rows))
+    return found

@@ -1,0 +1,36 @@
+"""Where a ball is touched: directions around it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+
+if TYPE_CHECKING:
+    from errormotion.methods.normal_vector.settings import Settings
+
+    Array = Array
+
+
+def touch_normals(touches: int, elevation: float = 0.0) -> Array:
+    """Return where a ball is touched as unit vectors from its centre, (touches, 3); the probe moves against them.
+
+    All but the last lie around the ball, evenly spaced from +X on, ``elevation`` (rad) above its equator; the last one
+    is its top.
+    """
+    around = 2 * np.pi * np.arange(touches - 1) / (touches - 1)
+    ring = np.stack([np.cos(around), np.sin(around), np.full_like(around, np.tan(elevation))], axis=1)
+    ring *= np.cos(elevation)
+    return np.concatenate([np.round(ring, 15), [[0.0, 0.0, 1.0]]])
+
+
+def normals(settings: Settings) -> Array:
+    """Return the directions in which each ball of the settings is touched, (ball, touch, 3)."""
+    return np.tile(touch_normals(settings.touches, settings.elevation), (len(settings.balls), 1, 1))
+
+
+def names(settings: Settings) -> list[str]:
+    """Return the names of the balls."""
+    return [ball.name or str(i + 1) for i, ball in enumerate(settings.balls)]

@@ -1,0 +1,1 @@
+"""Identification: probed balls, from raw data to errors with covariance."""

@@ -1,0 +1,358 @@
+"""From touches to the errors of every cycle."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.normal_vector.identification import normals, rigid
+from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
+from errormotion.methods.normal_vector.identification.moved import Cleaned, clean
+from errormotion.methods.normal_vector.identification.reading import Readings, check_balls, check_jumps, read
+from errormotion.methods.normal_vector.identification.spheres import Centres, centres
+
+if TYPE_CHECKING:
+    from errormotion.methods.normal_vector.settings import Settings
+
+    Array = Array
+
+log = logging.getLogger(__name__)
+
+FALSE_ALARM = 1e-3
+"""Chance at which sound touches are called noisier than stated."""
+COVERED = 0.975
+SMALL = 1e-4
+"""Parts of what the cycles share are told one by one down to this share of the greatest variance."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Twists (k, 6), their covariance (k, 6, 6) and what the cycles share (k, 6, q); NaN where not known."""
+
+    twist: Array
+    covariance: Array
+    shared: Array
+
+
+def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return an error dataset of component ``tool`` over ``time``.
+
+    Raises
+    ------
+    MethodError
+        The data do not determine the motion, or contradict what is stated of the balls.
+    """
+    notes: list[str] = []
+    data = read(raw, settings, notes)
+    stated = bool(np.isfinite(data.noise))
+    if stated:
+        data = replace(data, seen=replace(data.seen, weight=data.seen.weight / data.noise**2))
+    motion = _motion(data, settings)
+    cleaned = clean(
+        data.seen,
+        motion,
+        interpolate=settings.interpolate and data.timed,
+        stated=stated,
+        robust=settings.robust,
+        smallest_move=settings.smallest_move,
+    )
+    factor = _noise_factor(cleaned.fit, stated, settings, notes)
+    _tell(cleaned, data, notes)
+    best = _rigid_estimate(cleaned, motion, factor, len(data.seen.cycle_time))
+    time = _times(cleaned, data, settings)
+    seen = data.seen.without(cleaned.wrong)
+    measured = centres(seen, cleaned.fit.anchor, cleaned.fit.reach)
+    other = _normals_estimate(data, cleaned, seen, motion, settings, factor, notes)
+    if settings.procedure == "normals" and other is None:
+        raise MethodError("procedure = normals: " + notes[-1])
+    chosen = other if settings.procedure == "normals" and other is not None else best
+    influence = _told_apart(chosen)
+    for note in notes:
+        log.warning(note)
+    ds = build_errors(
+        chosen.twist,
+        chosen.covariance,
+        dims=("time",),
+        coords=_coordinates(raw, data, time),
+        component="tool",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=motion.point,
+        reference=f"mean state of the {'cold' if settings.reference == 'cold' else 'first'} probing cycle",
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, raw, None, steps=_steps(cleaned, settings)),
+        influence=influence,
+        sources=[f"cold reference {i + 1}" for i in range(len(influence))],
+        source_groups=["cold reference"] * len(influence),
+        extras=_extras(data, cleaned, measured, factor, best, other),
+    )
+    return ds.assign_attrs(notes=notes or [""], tool_axes=data.tool_axes)
+
+
+def _motion(data: Readings, settings: Settings) -> Motion:
+    """Check the balls and return what can move."""
+    seen, names = data.seen, data.names
+    ever = np.any(seen.valid, axis=(0, 2))
+    if not ever.all():
+        lost = ", ".join(name for name, there in zip(names, ever, strict=True) if not there)
+        raise MethodError(f"Ball {lost} was never touched: leave it out of the data, or touch it.")
+    check_jumps(seen, names, settings.ball_tolerance)
+    if seen.touched:
+        touched = seen.valid.any(axis=0).sum(axis=1)
+        if (touched < 4).any():
+            i = int(np.argmin(touched))
+            raise MethodError(
+                f"Ball {names[i]} was touched at {touched[i]} places; a sphere needs four or more, better five: around "
+                "it and on top."
+            )
+        centre, radius = rigid.spheres(seen)
+    else:
+        count = np.maximum(seen.valid[..., 0].sum(axis=0), 1)[:, None]
+        centre = np.where(seen.valid[..., :1], seen.place[:, :, 0], 0.0).sum(axis=0) / count
+        radius = np.full(len(names), np.nan)
+    check_balls(centre, radius, data, settings.ball_tolerance)
+    check_layout(centre, names, data.tool_axes)
+    point = settings.functional_point
+    return Motion(data.tool_axes, np.round(centre.mean(axis=0), 4) if point is None else np.array(point, float))
+
+
+def _noise_factor(found: rigid.Rigid, stated: bool, settings: Settings, notes: list[str]) -> float:
+    """Return the variance of a number of weight 1."""
+    if found.freedom < 1 and not stated:
+        raise MethodError(
+            "The noise of a touch is not stated (touch_noise), and no touch is left over to tell it from. State it."
+        )
+    if not stated:
+        variance = found.chi2 / found.freedom
+        notes.append(
+            f"The noise of a touch is not stated; {np.sqrt(variance) * 1e6:.3g} um by the residuals, with "
+            f"{found.freedom} degrees of freedom."
+        )
+        return float(variance * (stats.t.ppf(COVERED, found.freedom) / stats.norm.ppf(COVERED)) ** 2)
+    if found.freedom > 0 and found.chi2 > stats.chi2.ppf(1 - FALSE_ALARM, found.freedom):
+        ratio = found.chi2 / found.freedom
+        raised = settings.noise == "auto"
+        what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
+        notes.append(
+            f"The touches scatter {np.sqrt(ratio):.3g} times as much as stated; {what}. Do the balls move as one rigid "
+            "body, and do the right axes carry the tool (tool_axes)?"
+        )
+        return float(ratio) if raised else 1.0
+    return 1.0
+
+
+def _rigid_estimate(cleaned: Cleaned, motion: Motion, factor: float, cycles: int) -> Estimate:
+    found = cleaned.fit
+    twist = np.full((cycles, 6), np.nan)
+    covariance = np.full((cycles, 6, 6), np.nan)
+    shared = np.full((cycles, 6, found.shared.shape[2]), np.nan)
+    twist[cleaned.used], shared[cleaned.used] = found.twist, np.sqrt(factor) * found.shared
+    covariance[cleaned.used] = factor * found.covariance
+    unseen = [k for k in range(6) if k not in motion.seen]
+    twist[:, unseen] = np.nan
+    return Estimate(twist, covariance, shared)
+
+
+def _normals_estimate(
+    data: Readings,
+    cleaned: Cleaned,
+    seen: rigid.Observations,
+    motion: Motion,
+    settings: Settings,
+    factor: float,
+    notes: list[str],
+) -> Estimate | None:
+    """Return what the published construction makes of four of the balls; None, with a note, where it does not hold."""
+    names = data.names
+    chosen = settings.normals_balls or tuple(names[:4])
+    if motion.tool_axes != "XYZ":
+        notes.append(
+            "The normals of planes through balls say nothing here: where axes carry the workpiece, a turn of their "
+            "frame shears the picture of the balls and does not turn it."
+        )
+        return None
+    if len(names) < 4:
+        notes.append(f"The normals of two planes need four balls; found {len(names)}.")
+        return None
+    if missing := [name for name in chosen if name not in names]:
+        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
+    four = [names.index(name) for name in chosen]
+    at_once = centres(_at_cycle_time(seen, cleaned, motion, settings), cleaned.fit.anchor, cleaned.fit.reach)
+    centre, cofactor = at_once.centre[:, four], factor * at_once.cofactor[:, four]
+    for move in cleaned.moves:
+        if move.ball in four:
+            centre[move.cycle :] = np.nan
+    known = np.all(np.isfinite(centre), axis=(1, 2))
+    if not known[0]:
+        notes.append("The normals are not known: one of their balls is missing in the cold cycle.")
+        return None
+    if not normals.planes_apart(centre[0]):
+        notes.append(normals.ONE_PLANE)
+        return None
+    twist = np.full((len(centre), 6), np.nan)
+    covariance = np.full((len(centre), 6, 6), np.nan)
+    shared = np.full((len(centre), 6, 12), np.nan)
+    twist[known] = normals.twist(centre[0], centre[known], motion.point)
+    covariance[known] = normals.covariance(cofactor[0], cofactor[known], motion.point, centre[0])
+    cold = normals.jacobian(centre[0], motion.point)
+    shared[known] = np.einsum("ubi,bij->ubj", cold, np.linalg.cholesky(cofactor[0])).reshape(6, 12)
+    for array in (covariance, shared):
+        array[0] = 0.0
+    return Estimate(twist, covariance, shared)
+
+
+def _at_cycle_time(
+    seen: rigid.Observations, cleaned: Cleaned, motion: Motion, settings: Settings
+) -> rigid.Observations:
+    """Return the touches as they would have been had all of a cycle been made at once."""
+    if not settings.interpolate or not seen.touched or not np.ptp(seen.time):
+        return seen
+    used, found = cleaned.used, cleaned.fit
+    weights = rigid.knot_weights(found.time, np.where(seen.valid, seen.time, 0.0)[used], interpolate=True)
+    lever = motion.lever(seen.place[used])
+    drift = motion.error(rigid.at_times(weights, found.twist), lever)
+    drift -= motion.error(found.twist[:, None, None], lever)
+    place = seen.place.copy()
+    place[used] += np.where(seen.valid[used][..., None], drift, 0.0)
+    return replace(seen, place=place)
+
+
+def _told_apart(estimate: Estimate) -> Array:
+    """Return what the cycles share as a few independent sources, (source, k, 6)."""
+    u = np.sqrt(np.einsum("kii->ki", estimate.covariance))
+    F = np.where(u[..., None] > 0, estimate.shared / np.where(u > 0, u, 1.0)[..., None], 0.0)
+    F = np.nan_to_num(F).reshape(-1, F.shape[2])
+    values, vectors = np.linalg.eigh(F.T @ F)
+    vectors = vectors[:, values > SMALL * max(values[-1], 1e-300)][:, ::-1]
+    return np.moveaxis(estimate.shared @ vectors, 2, 0)
+
+
+def _times(cleaned: Cleaned, data: Readings, settings: Settings) -> Array:
+    """Return the time of each cycle: the mean of its touches where these are known and count, else its begin."""
+    time = data.seen.cycle_time.copy()
+    if not (settings.interpolate and data.timed):
+        return time
+    mean, some = rigid.mean_time(data.seen), data.seen.valid.any(axis=(1, 2))
+    time[some] = mean[some]
+    time[cleaned.used] = cleaned.fit.time
+    return time
+
+
+def _tell(cleaned: Cleaned, data: Readings, notes: list[str]) -> None:
+    names = data.names
+    wrong = cleaned.wrong.any(axis=2) if not data.seen.touched else cleaned.wrong
+    if wrong.any():
+        count = int(wrong.sum())
+        k, i = (int(index) for index in np.argwhere(wrong)[0][:2])
+        what = "touches" if data.seen.touched else "centres"
+        notes.append(f"{count} wrong {what} left out, the first of ball {names[i]} in cycle {k}.")
+    for move in cleaned.moves:
+        shift = ", ".join(f"{value * 1e6:.2g}" for value in move.shift)
+        also = f" It may also have been {' or '.join(names[i] for i in move.others)}." if move.others else ""
+        notes.append(
+            f"Ball {names[move.ball]} moved before cycle {move.cycle} "
+            f"({data.seen.cycle_time[move.cycle]:g} s), as the machine sees it by about ({shift}) um; left out from "
+            f"there on.{also}"
+        )
+    if len(cleaned.moves) > 1:
+        notes.append(
+            "More than one ball seems to have moved. Do they stand firm, and do the right axes carry the tool "
+            "(tool_axes)? A machine that does not move as one rigid frame looks alike."
+        )
+    lost = sorted(set(range(len(data.seen.cycle_time))) - set(cleaned.used.tolist()))
+    if lost:
+        shown = ", ".join(map(str, lost[:8])) + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
+        notes.append(f"{len(lost)} cycles do not determine the motion and are unknown: {shown}.")
+
+
+def _coordinates(raw: xr.Dataset, data: Readings, time: Array) -> dict[str, Any]:
+    coords: dict[str, Any] = {
+        "time": ("time", time, {"units": "s"}),
+        "cycle_time": ("time", data.seen.cycle_time, {"units": "s", "long_name": "begin of the probing cycle"}),
+        "ball": data.names,
+        "direction": list("xyz"),
+        "direction_": list("xyz"),
+    }
+    for name in ("temperature", "spindle_speed", "feed"):
+        if name in raw:
+            dims = ("time", "sensor") if name == "temperature" else ("time",)
+            coords[name] = (
+                dims,
+                np.array(raw[name].transpose(*dims).values, float),
+                {"units": raw[name].attrs["units"]},
+            )
+    if "sensor" in raw.coords and "temperature" in raw:
+        coords["sensor"] = [str(name) for name in raw["sensor"].values]
+    return coords
+
+
+def _extras(
+    data: Readings, cleaned: Cleaned, measured: Centres, factor: float, best: Estimate, other: Estimate | None
+) -> dict[str, xr.DataArray]:
+    k, b, m = data.seen.valid.shape
+    metre = {"units": "m"}
+    each = ("time", "ball", "touch" if data.seen.touched else "direction")
+    residual = np.full((k, b, m), np.nan)
+    residual[cleaned.used] = cleaned.fit.residual
+    flag = np.where(data.seen.valid, 0, 1)
+    moved = np.zeros((k, b), dtype=np.int8)
+    for move in cleaned.moves:
+        moved[move.cycle :, move.ball] = 1
+    flag[(moved[..., None] > 0) & (flag == 0)] = 3
+    flag[cleaned.wrong] = 2
+    lost = np.setdiff1d(np.arange(k), cleaned.used)
+    flag[lost] = np.where(flag[lost] == 0, 4, flag[lost])
+    dof = ("time", "dof")
+    unknown = Estimate(np.full((k, 6), np.nan), np.full((k, 6, 6), np.nan), np.empty(0))
+    plain = unknown if other is None else other
+    u, u_best = (np.sqrt(np.einsum("kii->ki", part.covariance)) for part in (plain, best))
+    loss = np.where(u_best > 0, u / np.where(u_best > 0, u_best, 1.0), np.nan)
+    extras = {
+        "centre": (("time", "ball", "direction"), measured.centre, {**metre, "long_name": "as the machine sees it"}),
+        "centre_covariance": (
+            ("time", "ball", "direction", "direction_"),
+            factor * measured.cofactor,
+            {"units": "m^2", "long_name": "by what is new in every cycle"},
+        ),
+        "ball_displacement": (
+            ("time", "ball", "direction"),
+            measured.centre - measured.centre[0],
+            {**metre, "long_name": "since the cold cycle, as the machine sees it: against its own error"},
+        ),
+        "residual": (each, residual, {**metre, "long_name": "measured less fitted distance"}),
+        "left_out": (
+            each,
+            flag.astype(np.int8),
+            {"long_name": "0 = used, 1 = missing, 2 = wrong touch, 3 = ball had moved, 4 = cycle not determined"},
+        ),
+        "ball_moved": (("time", "ball"), moved, {"long_name": "1 from the cycle on before which the ball moved"}),
+        "normals_errors": (dof, plain.twist, {"long_name": "by the normals of two planes; m, rad"}),
+        "normals_covariance": ((*dof, "dof_"), plain.covariance, {"long_name": "m^2, m rad, rad^2"}),
+        "normals_loss": (
+            dof,
+            loss,
+            {"units": "1", "long_name": "standard uncertainty by the normals over that by all touches"},
+        ),
+        "noise": ((), np.sqrt(factor) * (data.noise if np.isfinite(data.noise) else 1.0), metre),
+    }
+    return {name: xr.DataArray(array, dims=dims, attrs=attrs) for name, (dims, array, attrs) in extras.items()}
+
+
+def _steps(cleaned: Cleaned, settings: Settings) -> list[str]:
+    steps = [
+        "joint least squares of all touches"
+        if settings.procedure == "rigid"
+        else "normals of two planes through four balls, Cayley"
+    ]
+    if cleaned.wrong.any():
+        steps.append(f"{int(cleaned.wrong.sum())} wrong touches left out")
+    return steps + [f"ball {move.ball + 1} left out from cycle {move.cycle} on" for move in cleaned.moves]

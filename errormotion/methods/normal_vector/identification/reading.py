@@ -1,0 +1,243 @@
+"""What identification takes out of a raw dataset: arrays in a fixed order, with names, and first doubts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.normal_vector.identification.rigid import Observations
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from numpy.typing import NDArray
+
+    from errormotion.methods.normal_vector.settings import Settings
+
+    Array = Array
+
+FLAGS = {1: "no trip", 2: "tripped at the start", 3: "repeat differs", 4: "not made"}
+"""What a touch's flag says; 0 is a good touch."""
+_AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Raw data as arrays.
+
+    Attributes
+    ----------
+    seen : Observations
+        With unit weights (1 / noise^2 where the noise is stated).
+    names : list of str
+        Of the balls.
+    tool_axes : str
+    noise : float
+        Stated standard deviation of a number, m; 1 where the weights are stated covariances; NaN where nothing is.
+    nominal : ndarray (b, 3) or None
+        Rough centres, m.
+    radius : ndarray (b,)
+        Nominal radius of ball and tip, m; NaN where not known.
+    timed : bool
+        Whether the time of each touch is known.
+    """
+
+    seen: Observations
+    names: list[str]
+    tool_axes: str
+    noise: float
+    nominal: Array | None
+    radius: Array
+    timed: bool
+
+
+def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
+    """Return the readings of a raw dataset.
+
+    Raises
+    ------
+    MethodError
+        Nothing measured, no cold cycle, or balls that are not where and what they are said to be.
+    """
+    touched = "touch" in raw.variables  # it bears the name of a dimension, so that xarray calls it a coordinate
+    names = _names(raw)
+    begin = _array(raw, "time", "time")
+    place = _array(raw, "touch", "time", "ball", "touch", "direction") if touched else _coordinates(raw)
+    valid = np.all(np.isfinite(place), axis=-1)
+    if "touch_flag" in raw:
+        flag = _array(raw, "touch_flag", "time", "ball", "touch")
+        _tell_flags(flag, notes)
+        valid = valid & ~(flag > 0)
+    if not valid.any():
+        raise MethodError("Expected touches of balls; found none that is good. Did the probe trip at all?")
+    if settings.reference == "cold":
+        _check_cold(begin, valid)
+    lost = int(valid.size - valid.sum()) // (1 if touched else 3)
+    if lost:
+        what = "touches" if touched else "centres"
+        notes.append(f"{lost} of {valid.size // (1 if touched else 3)} {what} are missing.")
+    timed = touched and "touch_time" in raw
+    time = (
+        _array(raw, "touch_time", "time", "ball", "touch")
+        if timed
+        else np.broadcast_to(begin[:, None, None], valid.shape)
+    )
+    if timed:
+        valid = valid & np.isfinite(time)
+        _check_times(time, valid)
+    elif settings.interpolate and touched:
+        notes.append(
+            "The times of the touches are not in the data (touch_time): drift within a cycle is not corrected."
+        )
+    weight, noise = _weights(raw, settings, valid, touched)
+    place = np.where(valid[..., None], place, 0.0)
+    seen = Observations(place, weight, np.where(valid, time, 0.0), begin, touched)
+    nominal = _array(raw, "ball_nominal", "ball", "direction") if "ball_nominal" in raw else None
+    radius = np.full(len(names), np.nan)
+    if "ball_radius" in raw and touched:
+        radius = _array(raw, "ball_radius", "ball") + float(raw["tip_radius"])
+    axes = str(raw.attrs.get("tool_axes", settings.tool_axes))
+    if axes not in _AXES:
+        raise MethodError(f"tool_axes: expected the linear axes that carry the tool, such as XYZ or Z; found '{axes}'")
+    if "tool_axes" in raw.attrs and axes != settings.tool_axes and "tool_axes" in settings.model_fields_set:
+        notes.append(
+            f"The data say that {axes or 'no axis'} carries the tool; the setting {settings.tool_axes} was not used."
+        )
+    return Readings(seen, names, axes, noise, nominal, radius, timed)
+
+
+def check_balls(centre: Array, radius: Array, data: Readings, tolerance: float) -> None:
+    """Raise MethodError where balls found at ``centre`` (b, 3) with ``radius`` (b,), m, are not as stated."""
+    nominal = data.nominal
+    if nominal is not None and np.isfinite(nominal).all():
+        away = np.linalg.norm(centre[:, None] - nominal, axis=2)
+        off = np.diagonal(away)
+        if (off > tolerance).any():
+            i = int(np.argmax(off))
+            j = int(np.argmin(away[i]))
+            if j != i and away[i, j] < min(tolerance, off[i] / 2):
+                raise MethodError(
+                    f"Ball {data.names[i]} was found where ball {data.names[j]} should be: are they swapped, in the "
+                    "program or in ball_nominal? Expected the same order in both."
+                )
+            raise MethodError(
+                f"Ball {data.names[i]} was found {off[i] * 1e3:.4g} mm from its rough place; expected within "
+                f"{tolerance * 1e3:g} mm (ball_tolerance). Are both in m and in machine coordinates?"
+            )
+    wrong = np.abs(radius - data.radius) > tolerance
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise MethodError(
+            f"The touches of ball {data.names[i]} lie on a sphere of radius {radius[i] * 1e3:.4g} mm; expected "
+            f"{data.radius[i] * 1e3:.4g} mm, ball and tip together. Are ball_radius and tip_radius right, and in m?"
+        )
+
+
+def check_jumps(seen: Observations, names: list[str], tolerance: float) -> None:
+    """Raise MethodError where touches of a cycle lie far from those of the others."""
+    valid = seen.valid
+    place = np.where(valid[..., None], seen.place, np.nan)
+    middle = np.nanmedian(place, axis=0) if valid.any(axis=0).all() else _median(place)
+    off = np.linalg.norm(place - middle, axis=-1)
+    if not np.nanmax(off) > tolerance:
+        return
+    k, i, j = np.unravel_index(int(np.nanargmax(off)), off.shape)
+    other = np.linalg.norm(place[k, i, j] - middle[:, j], axis=-1)
+    other[i] = np.inf
+    where = f"In cycle {k} ball {names[i]}"
+    if np.nanmin(other) < tolerance:
+        raise MethodError(
+            f"{where} was touched where ball {names[int(np.nanargmin(other))]} is in the other cycles: expected the "
+            "same order of the balls in all cycles. Was the program changed, or a touch lost in the record?"
+        )
+    raise MethodError(
+        f"{where} was touched {off[k, i, j] * 1e3:.4g} mm from where it is touched in the other cycles; expected "
+        f"within {tolerance * 1e3:g} mm (ball_tolerance). Was the ball knocked over, or was something else touched?"
+    )
+
+
+def _median(place: Array) -> Array:
+    import warnings
+
+    with warnings.catch_warnings():  # directions that were never touched have no median
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(place, axis=0))
+
+
+def _check_cold(begin: Array, valid: NDArray[np.bool_]) -> None:
+    late = len(begin) > 1 and begin[0] > (begin[1] - begin[0]) / 2
+    if late:
+        raise MethodError(
+            f"The cold cycle is missing: expected the first cycle at 0 s; found it at {begin[0]:g} s. Probe the cold "
+            'machine, or take the first cycle as it is for the reference (reference = "first").'
+        )
+    if not valid[0].any():
+        raise MethodError(
+            "The cold cycle is missing: cycle 0 holds no good touch. Probe the cold machine, or leave the empty cycle "
+            'out and take the first one that there is for the reference (reference = "first").'
+        )
+
+
+def _check_times(time: Array, valid: NDArray[np.bool_]) -> None:
+    first = np.min(np.where(valid, time, np.inf), axis=(1, 2))
+    last = np.max(np.where(valid, time, -np.inf), axis=(1, 2))
+    done = np.flatnonzero(valid.any(axis=(1, 2)))
+    for before, after in pairwise(done):
+        if last[before] > first[after]:
+            raise MethodError(
+                f"touch_time: expected cycle {before} to end before cycle {after} begins; found {last[before]:g} s and "
+                f"{first[after]:g} s. Are the touches' times on the clock of `time`?"
+            )
+
+
+def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touched: bool) -> tuple[Array, float]:
+    k, b, m = valid.shape
+    diagonal = np.zeros((k, b, m, m))
+    diagonal[..., range(m), range(m)] = valid
+    if touched:
+        stated = float(raw["touch_noise"]) if "touch_noise" in raw else settings.touch_noise
+        if stated is None:
+            return diagonal, float("nan")
+        if not stated > 0:
+            raise MethodError(f"expected touch_noise above 0, found {stated:g} m; leave it out where it is not known")
+        return diagonal, stated
+    if "centre_covariance" not in raw:
+        return diagonal, float("nan")
+    C = _array(raw, "centre_covariance", "time", "ball", "direction", "direction_")
+    there = np.all(valid, axis=-1)
+    known = np.all(np.isfinite(C), axis=(2, 3)) & there
+    if (there & ~known).any():
+        raise MethodError(
+            "centre_covariance: expected a covariance for every centre; found NaN. Leave it out if unknown."
+        )
+    C = np.where(known[..., None, None], C, np.eye(3))
+    if not (np.linalg.eigvalsh(C) > 0).all():
+        raise MethodError("centre_covariance: expected positive definite matrices; found one that is not.")
+    return np.linalg.inv(C) * known[..., None, None], 1.0
+
+
+def _tell_flags(flag: Array, notes: list[str]) -> None:
+    for value in np.unique(flag[np.isfinite(flag)]):
+        if value > 0:
+            count = int(np.count_nonzero(flag == value))
+            notes.append(f"{count} touches are flagged: {FLAGS.get(int(value), f'flag {value:g}')}.")
+
+
+def _coordinates(raw: xr.Dataset) -> Array:
+    """Return the centres as three numbers each that are measured at one place, (k, b, 3, 3)."""
+    centre = _array(raw, "centre", "time", "ball", "direction")
+    return np.array(np.broadcast_to(centre[:, :, None], (*centre.shape, 3)))
+
+
+def _array(raw: xr.Dataset, name: str, *dims: str) -> Array:
+    return np.array(raw[name].transpose(*dims).values, dtype=np.float64)
+
+
+def _names(raw: xr.Dataset) -> list[str]:
+    if "ball" in raw.coords:
+        return [str(name) for name in raw["ball"].values]
+    return [str(i + 1) for i in range(raw.sizes["ball"])]

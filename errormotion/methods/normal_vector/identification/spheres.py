@@ -1,0 +1,71 @@
+"""The centre of every ball in every cycle, from its own touches alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+
+if TYPE_CHECKING:
+    from errormotion.methods.normal_vector.identification.rigid import Observations
+
+    Array = Array
+
+STEPS = 12
+FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Centres:
+    """Centres of balls as the machine sees them.
+
+    Attributes
+    ----------
+    centre : ndarray (k, b, 3)
+        m; NaN where the touches leave it open.
+    cofactor : ndarray (k, b, 3, 3)
+        Covariance for unit weights of the touches: by their scatter, which is new in every cycle.
+    """
+
+    centre: Array
+    cofactor: Array
+
+
+def centres(seen: Observations, anchor: Array, reach: Array) -> Centres:
+    """Return the places from which every touch of a ball is as far away as its reach says.
+
+    The reaches (b, m), m, hold what all cycles share, so that the radius is not free in each of them anew: what is
+    left is the intersection of spheres around the tip's places, found by Gauss-Newton from ``anchor`` (b, 3), m.
+    """
+    valid = seen.valid & np.isfinite(reach)
+    weight = seen.weight * valid[..., None] * valid[..., None, :]
+    if not seen.touched:
+        known = np.all(valid, axis=-1)
+        centre = np.where(known[..., None], seen.place[:, :, 0], np.nan)
+        return Centres(centre, _inverse(weight))
+    centre = np.broadcast_to(anchor, (len(seen.place), *anchor.shape)).copy()
+    cofactor = np.full((*centre.shape, 3), np.nan)
+    for _ in range(STEPS):
+        away = seen.place - centre[:, :, None]
+        length = np.linalg.norm(away, axis=-1)
+        normal = away / np.where(length > 0, length, 1.0)[..., None]
+        misfit = np.where(valid, length - reach, 0.0)
+        WN = weight @ normal
+        cofactor = _inverse(np.swapaxes(normal, 2, 3) @ WN)
+        step = (cofactor @ (np.swapaxes(WN, 2, 3) @ misfit[..., None]))[..., 0]
+        step = np.nan_to_num(step)
+        centre += step
+        if np.abs(step).max(initial=0.0) < 1e-13:
+            break
+    return Centres(np.where(np.isfinite(cofactor[..., 0]), centre, np.nan), cofactor)
+
+
+def _inverse(N: Array) -> Array:
+    """Return the inverse of matrices (..., 3, 3); NaN for those that have none."""
+    size = np.linalg.eigvalsh(N)
+    sound = size[..., 0] > FLAT * size[..., -1]
+    safe = np.where(sound[..., None, None], N, np.eye(3))
+    return np.asarray(np.where(sound[..., None, None], np.linalg.inv(safe), np.nan))

@@ -1,0 +1,321 @@
+"""The chapter of a warm-up seen by probing balls: errors and temperatures, balls, residuals, normals, sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+
+from errormotion.methods.crossbeam_scan.report.view import remarks
+from errormotion.methods.normal_vector.report import drawings as normal_vector_figures
+from errormotion.methods.normal_vector.report.view import (
+    FLAGS,
+    MISSING,
+    MOVED,
+    UNDETERMINED,
+    WRONG,
+    Probing,
+    is_normal_vector,
+    probing,
+)
+from errormotion.report import budget, provenance, quality, sensors, timeline
+from errormotion.report.budget import FREEDOMS
+from errormotion.report.document import (
+    Block,
+    Cell,
+    Figure,
+    KeyFigure,
+    Part,
+    Section,
+    Source,
+    Table,
+    Text,
+    estimate,
+    or_dash,
+)
+from errormotion.report.generic import unit_at
+from errormotion.report.series import events
+from errormotion.report.text import finite, fixed, integer, listed, significant
+
+__all__ = ["is_normal_vector", "part"]
+
+_BEHIND = (
+    "The tip always sits at the same place of the spindle. A tilt of the spindle behind the last axis therefore only "
+    "displaces all balls alike: it is in the displacements, and in no rotation. The rotations are those of the "
+    "frame of axes against the table."
+)
+_TOUCHES = "touches of the cycle itself"
+_KINDS = (
+    (MISSING, "missing"),
+    (WRONG, "wrong"),
+    (MOVED, "of a ball that had moved"),
+    (UNDETERMINED, "of a cycle that is not determined"),
+)
+
+
+def part(source: Source, key: str) -> Part:
+    """Return the chapter of one result; ``key`` keeps its figures' identifiers apart."""
+    errors = source.errors
+    seen = probing(errors, source.raw)
+    found = sensors.of_dataset(errors, source)
+    beside = (seen.balls, seen.centre[0]) if len(seen.centre) else None
+    return Part(
+        "Errors of a warm-up by probing balls",
+        _key_figures(seen),
+        _summary(errors, seen, found),
+        [
+            Section("errors", "Errors and temperatures", errors_over_time(source, f"{key}-errors", seen)),
+            Section("balls", "Balls", [normal_vector_figures.balls(seen, f"{key}-balls"), _balls(seen)]),
+            Section("residuals", "Touches and residuals", _residuals(seen, f"{key}-residuals")),
+            Section("normals", "The published normals beside the fit", _normals(seen, f"{key}-normals")),
+            Section("sensors", "Temperature sensors", sensors.blocks(found, f"{key}-sensors", beside)),
+            Section("uncertainty", "Uncertainty", _uncertainty(errors, seen)),
+            Section("quality", "Data quality", _quality(source)),
+            Section("provenance", "Provenance", provenance.blocks(source)),
+        ],
+    )
+
+
+def _strongest(seen: Probing, first: int) -> tuple[int, float] | None:
+    """Return cycle and length, SI, of the largest displacement (0) or rotation (3)."""
+    some = seen.values[:, first : first + 3]
+    length = np.where(np.isfinite(some).any(axis=1), np.sqrt(np.nansum(some**2, axis=1)), np.nan)
+    if not np.isfinite(length).any() or not np.nanmax(length) > 0:
+        return None
+    k = int(np.nanargmax(length))
+    return k, float(length[k])
+
+
+def _when(seen: Probing, cycle: int) -> str:
+    return f"after {fixed(seen.time[cycle] / 60, 1)} min"
+
+
+def _key_figures(seen: Probing) -> list[KeyFigure]:
+    figures = []
+    if seen.last is not None:
+        for i in (0, 1, 2, 3, 4, 5):
+            unit, size = unit_at(i)
+            value, sigma = seen.values[seen.last, i] / size, seen.sigma[seen.last, i] / size
+            if math.isfinite(value):
+                figures.append(KeyFigure(FREEDOMS[i], estimate(value, 2 * sigma), unit, _when(seen, seen.last)))
+    rms = _rms(seen.residual[seen.used])
+    if math.isfinite(rms):
+        note = f"rms; noise of a touch: {fixed(1e6 * seen.noise, 2)} µm" if seen.by_touch else "rms"
+        figures.append(KeyFigure("residual", Cell(fixed(1e6 * rms, 2)), "µm", note))
+    cost = finite(np.median, seen.loss)
+    if math.isfinite(cost):
+        figures.append(KeyFigure("cost of the normals", Cell(fixed(cost, 2)), "×", "in uncertainty, median"))
+    return figures
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(finite(np.mean, values**2)))
+
+
+def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> list[str]:
+    cycles, known = len(seen.time), int(np.isfinite(seen.values).any(axis=1).sum())
+    words = [
+        f"{integer(cycles)} cycles over {integer(len(seen.balls))} balls in "
+        f"{fixed(float(np.ptp(seen.time)) / 60 if cycles else math.nan, 1)} min; "
+        + ("the errors of all are known." if known == cycles else f"the errors of {integer(cycles - known)} are not.")
+    ]
+    for first, what, (unit, size) in ((0, "displacement", unit_at(0)), (3, "rotation", unit_at(3))):
+        strongest = _strongest(seen, first)
+        if strongest is not None:
+            k, length = strongest
+            words.append(f"The largest {what} is {fixed(length / size, 2)} {unit}, {_when(seen, k)}.")
+    speed = errors["spindle_speed"].values if "spindle_speed" in errors else np.array([])
+    if np.isfinite(speed).any():
+        words.append(
+            f"Between cycles the spindle turned at up to {integer(finite(np.max, np.abs(speed)))} /min on the mean."
+        )
+    if found:
+        words.append(sensors.warmest(found))
+    out = {name: int((seen.left_out == kind).sum()) for kind, name in _KINDS}
+    if any(out.values()):
+        told = listed([f"{integer(count)} {name}" for name, count in out.items() if count])
+        words.append(f"Of {integer(seen.left_out.size)} {seen.what} these do not count: {told}.")
+    gone = [seen.balls[i] for i in seen.moved_balls]
+    if gone:
+        words.append(f"Moved on the table: {listed(gone)}.")
+    unseen = [name for i, name in enumerate(FREEDOMS) if not np.isfinite(seen.values[:, i]).any()]
+    if unseen:
+        words.append(f"Not observed: {listed(unseen)}. Reported as unknown, not as zero.")
+    return words
+
+
+def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
+    """Return errors, temperatures and what was done to the machine on one time axis, and the table of the errors."""
+    errors = source.errors
+    names = timeline.sensor_names(errors)
+    values = errors["temperature"].transpose("time", "sensor").values if names else np.empty((len(seen.time), 0))
+    panels = [
+        *timeline.errors(errors),
+        *timeline.temperatures(names, np.asarray(values, float)),
+        *timeline.working(errors, held=True),
+    ]
+    if not panels:
+        return [Text("No error is known at any time.", "warning"), _table(errors, seen)]
+    done = events(source)
+    point = ", ".join(fixed(1e3 * float(value), 1) for value in np.atleast_1d(errors.attrs["functional_point"]))
+    caption = (
+        f"Errors of the tool's side against the workpiece's at ({point}) mm since the cold cycle, and on the same time "
+        "axis the temperatures and what the spindle did. Bands: expanded uncertainty, k = 2 (about 95 %). Speed and "
+        f"feed are means since the cycle before.{timeline.events_in_words(done)}"
+    )
+    words = ". ".join(panel.in_words() for panel in panels)
+    figure = Figure(timeline.draw(seen.time, panels, key, done), caption, f"Over time: {words}.")
+    return [figure, _table(errors, seen)]
+
+
+def _table(errors: xr.Dataset, seen: Probing) -> Table:
+    reasons = {name: seen.reason(i) for i, name in enumerate(FREEDOMS)}
+    return timeline.table(errors, "The six errors. The cold cycle is zero by definition.", reasons)
+
+
+def _balls(seen: Probing) -> Block:
+    if not seen.balls:
+        return Text("The result names no balls.", "note")
+    rows: list[list[Cell | str]] = []
+    size = np.where(seen.sound, np.linalg.norm(seen.displacement, axis=2), np.nan)
+    for i, name in enumerate(seen.balls):
+        known = np.flatnonzero(seen.sound[:, i])
+        lost = Cell("—", reason="never determined")
+        if not known.size:
+            rows.append([name, *[lost] * 7, "no cycle"])
+            continue
+        k, largest = int(known[-1]), finite(np.max, size[:, i])
+        rows.append(
+            [
+                name,
+                *(fixed(1e3 * v, 3) for v in seen.centre[known[0], i]),
+                # Both the cold and the last centre are uncertain, each by its own touches.
+                *(
+                    estimate(1e6 * v, 2e6 * math.hypot(a, b), reason="not determined")
+                    for v, a, b in zip(
+                        seen.displacement[k, i], seen.centre_u[k, i], seen.centre_u[known[0], i], strict=True
+                    )
+                ),
+                fixed(1e6 * largest, 1),
+                f"from cycle {integer(int(np.argmax(seen.moved[:, i])))} on" if seen.moved[:, i].any() else "no",
+            ]
+        )
+    return Table(
+        "Centres of the balls as the machine sees them: cold, and their displacement at the last cycle in "
+        "which they were determined. After ±: expanded uncertainty, k = 2.",
+        ["ball", "x / mm", "y / mm", "z / mm", "x / µm", "y / µm", "z / µm", "largest / µm", "moved by itself"],
+        rows,
+        [("", 1), ("cold", 3), ("displacement", 4), ("", 1)],
+    )
+
+
+def _residuals(seen: Probing, key: str) -> list[Block]:
+    found: list[Block] = [normal_vector_figures.residuals(seen, key)]
+    if not seen.balls or not seen.left_out.size:
+        return found
+    rows: list[list[Cell | str]] = []
+    every = list(range(len(seen.balls)))
+    for name, own in [*((seen.balls[i], [i]) for i in every), ("all", every)]:
+        kind, residual = seen.left_out[:, own], seen.residual[:, own]
+        kept = residual[kind == 0]
+        rows.append(
+            [
+                name,
+                integer(int((kind == 0).sum())),
+                *(integer(int((kind == code).sum())) for code, _ in _KINDS),
+                or_dash(fixed(1e6 * _rms(kept), 3), "none was used"),
+                or_dash(fixed(1e6 * finite(np.max, np.abs(kept)), 3), "none was used"),
+            ]
+        )
+    found.append(
+        Table(
+            f"The {seen.what} by ball: those used and their residuals, and those left out because they are missing or "
+            "wrong, the ball had moved, or the cycle is not determined.",
+            ["ball", "used", "missing", "wrong", "ball moved", "cycle lost", "rms / µm", "largest / µm"],
+            rows,
+            [("", 1), (seen.what, 5), ("residual", 2)],
+        )
+    )
+    noise = fixed(1e6 * seen.noise, 3)
+    found.append(Text(f"A touch was taken to scatter by {noise} µm (one standard deviation)."))
+    found += _flagged(seen)
+    return found
+
+
+def _flagged(seen: Probing) -> list[Block]:
+    """Say what the probe itself remarked while measuring."""
+    if seen.flag is None:
+        return []
+    if not seen.flag.any():
+        return [Text("The probe flagged no touch.")]
+    words = []
+    for code in np.unique(seen.flag[seen.flag > 0]):
+        name = FLAGS[code] if code < len(FLAGS) else f"flag {code}"
+        where = np.argwhere(seen.flag == code)
+        first = f"the first of {seen.balls[where[0, 1]]} in cycle {where[0, 0]}"
+        words.append(f"{name}: {integer(len(where))} ({first})")
+    return [Text(f"Flagged by the probe: {'; '.join(words)}.", "warning")]
+
+
+def _normals(seen: Probing, key: str) -> list[Block]:
+    found: list[Block] = []
+    if seen.by_normals:
+        found.append(
+            Text("The result of this page is by the published normals, and not by the fit of all touches.", "note")
+        )
+    figure = normal_vector_figures.normals(seen, key)
+    found.append(figure)
+    if isinstance(figure, Text):
+        return found
+    rows: list[list[Cell | str]] = []
+    for i, name in enumerate(FREEDOMS):
+        unit, size = unit_at(i)
+        reason = seen.reason(i)
+        apart = _rms((seen.normals[:, i] - seen.values[:, i]) / size) if not seen.by_normals else math.nan
+        own = "the result is the normals' own" if seen.by_normals else reason
+        last = np.flatnonzero(np.isfinite(seen.normals[:, i]))
+        value = (
+            estimate(seen.normals[last[-1], i] / size, 2 * seen.normals_u[last[-1], i] / size, reason=reason)
+            if last.size
+            else Cell("—", reason=reason)
+        )
+        rows.append(
+            [
+                name,
+                unit,
+                value,
+                or_dash(significant(apart), own),
+                *(or_dash(fixed(finite(f, seen.loss[:, i]), 2), reason) for f in (np.median, np.max)),
+            ]
+        )
+    found.append(
+        Table(
+            "The published normals. Cost: standard uncertainty by the normals over that of the fit of all "
+            "touches. After ±: expanded uncertainty, k = 2.",
+            ["error", "unit", "last known", "rms, less the fit", "cost, median", "cost, largest"],
+            rows,
+        )
+    )
+    return found
+
+
+def _uncertainty(errors: xr.Dataset, seen: Probing) -> list[Block]:
+    if seen.last is None:
+        return [Text("No cycle determines the errors, and there is no uncertainty to part.", "warning")]
+    made = budget.table(errors.isel(time=seen.last), f"in the last known cycle, {_when(seen, seen.last)}")
+    own = budget.readable("independent")
+    rows = [[_TOUCHES if row[0] == own else row[0], *row[1:]] for row in made.rows]
+    return [
+        replace(made, rows=rows),
+        Text(
+            "The cold cycle is the reference of all others: its own touches are uncertain too, and all cycles share it."
+        ),
+        Text(_BEHIND, "note"),
+    ]
+
+
+def _quality(source: Source) -> list[Block]:
+    found: list[Block] = [Text(note, "warning") for note in remarks(source.errors)]
+    return [*found, *quality.sentences(source.errors, source.raw)] or [Text("The method had nothing to remark.")]

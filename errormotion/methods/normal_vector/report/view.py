@@ -1,0 +1,171 @@
+"""What a result of probing balls holds, as plain arrays over cycles, balls and touches, whatever of it is missing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.report.budget import FREEDOMS
+from errormotion.report.provenance import read
+
+USED, MISSING, WRONG, MOVED, UNDETERMINED = range(5)
+"""What ``left_out`` says of a touch."""
+
+FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
+"""What the raw dataset's ``touch_flag`` says of a touch, by its number."""
+
+
+def is_normal_vector(errors: xr.Dataset) -> bool:
+    """Return whether a dataset is a result of probing balls over time."""
+    return errors.attrs.get("method") == "normal_vector" and errors["EX"].dims == ("time",)
+
+
+_POOR = 5.0
+"""Times the median uncertainty of the centres, beyond which one is no longer drawn."""
+
+
+@dataclass(frozen=True)
+class Probing:
+    """A warm-up seen by probing, SI; NaN where something is not known.
+
+    Attributes
+    ----------
+    time : (t,)
+        s since the cold cycle.
+    balls : list of str
+    values, sigma : (t, 6)
+        Errors and standard uncertainties.
+    centre, centre_u : (t, ball, 3)
+        Of the balls, as the machine sees them.
+    displacement : (t, ball, 3)
+        Of the centres since the cold cycle.
+    moved : (t, ball) of bool
+        Where a ball had moved on its own.
+    residual, left_out : (t, ball, touch)
+        Of touches, or of coordinates where only centres were given.
+    flag : (t, ball, touch) of int, or None
+        What the probe said of each touch; None where it is not known.
+    normals, normals_u, loss : (t, 6)
+        By the published construction, and its standard uncertainty over that of the fit.
+    noise : float
+        Of a touch, as used.
+    by_touch : bool
+        Whether residuals are of touches.
+    by_normals : bool
+        Whether the result itself is by the published construction.
+    tool_axes : str
+    """
+
+    time: Array
+    balls: list[str]
+    values: Array
+    sigma: Array
+    centre: Array
+    centre_u: Array
+    displacement: Array
+    moved: NDArray[np.bool_]
+    residual: Array
+    left_out: NDArray[np.int64]
+    flag: NDArray[np.int64] | None
+    normals: Array
+    normals_u: Array
+    loss: Array
+    noise: float
+    by_touch: bool
+    by_normals: bool
+    tool_axes: str
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Touches that count, (t, ball, touch)."""
+        return np.asarray(self.left_out == USED)
+
+    @property
+    def sound(self) -> NDArray[np.bool_]:
+        """Centres that are known about as well as others, (t, ball): a lost touch can leave one nearly free."""
+        worst = np.max(self.centre_u, axis=2) if self.centre_u.size else np.empty(self.displacement.shape[:2])
+        known = worst[np.isfinite(worst)]
+        limit = _POOR * float(np.median(known)) if known.size else np.inf
+        there = np.isfinite(self.displacement).all(axis=2)
+        return np.asarray(there & ~(worst > limit))
+
+    @property
+    def moved_balls(self) -> list[int]:
+        """Balls that moved on their own at any time."""
+        return [i for i in range(len(self.balls)) if bool(self.moved[:, i].any())]
+
+    @property
+    def last(self) -> int | None:
+        """Last cycle with a known error; None where there is none."""
+        known = np.flatnonzero(np.isfinite(self.values).any(axis=1))
+        return int(known[-1]) if known.size else None
+
+    @property
+    def what(self) -> str:
+        """Word for what the residuals are of."""
+        return "touches" if self.by_touch else "coordinates"
+
+    def reason(self, index: int) -> str:
+        """Return why a freedom is unknown throughout."""
+        if self.tool_axes and self.tool_axes != "XYZ" and index >= 3:
+            return (
+                f"not seen: of the axes only {' and '.join(self.tool_axes)} move the tool, and the balls do not "
+                "show this rotation of the frame of axes"
+            )
+        return "not observed by this method"
+
+
+def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
+    """Return the view of a dataset; ``raw`` tells what the probe said of each touch."""
+    each = "touch" if "residual" not in errors or "touch" in errors["residual"].dims else "direction"
+    t, b = errors.sizes["time"], errors.sizes.get("ball", 0)
+    m = errors.sizes.get(each, 0) if "residual" in errors else 0
+    sizes = {"time": t, "ball": b, each: m, "direction": 3, "dof": 6, "dof_": 6, "direction_": 3}
+
+    def get(name: str, *dims: str) -> Array:
+        shape = tuple(sizes[dim] for dim in dims)
+        if name not in errors or set(errors[name].dims) != set(dims) or errors[name].dtype.kind not in "iufb":
+            return np.full(shape, np.nan)
+        values = np.asarray(errors[name].transpose(*dims).values, float)
+        return values if values.shape == shape else np.full(shape, np.nan)
+
+    def deviation(variance: Array) -> Array:
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+    spread = get("centre_covariance", "time", "ball", "direction", "direction_")
+    plain = get("normals_covariance", "time", "dof", "dof_")
+    procedure = read(errors).get("settings", {})
+    procedure = procedure.get("procedure") if isinstance(procedure, dict) else None
+    return Probing(
+        np.asarray(errors["time"].values, float),
+        [str(name) for name in errors["ball"].values] if "ball" in errors.coords else [f"B{i + 1}" for i in range(b)],
+        np.stack([np.asarray(errors[name].values, float) for name in FREEDOMS], axis=-1),
+        deviation(np.diagonal(errors["covariance"].transpose("time", "dof", "dof_").values, axis1=1, axis2=2)),
+        get("centre", "time", "ball", "direction"),
+        deviation(np.diagonal(spread, axis1=2, axis2=3)),
+        get("ball_displacement", "time", "ball", "direction"),
+        np.nan_to_num(get("ball_moved", "time", "ball")) > 0,
+        get("residual", "time", "ball", each),
+        np.nan_to_num(get("left_out", "time", "ball", each), nan=MISSING).astype(np.int64),
+        _flags(raw, (t, b, m)),
+        get("normals_errors", "time", "dof"),
+        deviation(np.diagonal(plain, axis1=1, axis2=2)),
+        get("normals_loss", "time", "dof"),
+        float(errors["noise"]) if "noise" in errors and errors["noise"].ndim == 0 else math.nan,
+        each == "touch",
+        procedure == "normals",
+        str(errors.attrs.get("tool_axes", "")),
+    )
+
+
+def _flags(raw: xr.Dataset | None, shape: tuple[int, ...]) -> NDArray[np.int64] | None:
+    """Return the probe's flags where the raw dataset holds them for the same touches."""
+    if raw is None or "touch_flag" not in raw or set(raw["touch_flag"].dims) != {"time", "ball", "touch"}:
+        return None
+    flag = np.asarray(raw["touch_flag"].transpose("time", "ball", "touch").values)
+    return flag.astype(np.int64) if flag.shape == shape else None

@@ -1,0 +1,146 @@
+"""Measuring where the beams are: the record of a sphere that the machine steps through each of them.
+
+Every sample is kept, before its steps are looked for.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.errors import InstrumentError, MethodError
+from errormotion.kinematics.beams import across
+from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS, SCHEMA
+from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.plugins import Bench
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from errormotion.methods.spindle_drift.settings import Settings
+
+    Array = Array
+
+
+def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+    """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
+
+    The machine needs no synchronous reading: it steps by its own clock, and the steps are found in the record. A scan
+    that an interruption cut off is made anew, as another attempt.
+    """
+    frame = bench.of_kind("spindle_frame")
+    if not bench.has_kind("controller"):
+        raise MethodError(
+            "A beam detection steps a sphere through the beams and needs an instrument of kind 'controller' to move "
+            "it; the bench has none. Give the beams of an earlier detection, or measure with the nominal ones."
+        )
+    controller = bench.of_kind("controller")
+    static = _scan_plan(bench, frame, settings)
+    length = round(scan_seconds(settings.steps, settings.dwell) * frame.rate)
+    attempts = {} if done is None else last_attempts(done)
+    controller.mount("sphere")
+    profiles = static.sizes["profile"]
+    for scan in range(len(CHANNELS) * profiles):
+        attempt, recorded = attempts.get(scan, (-1, 0))
+        if recorded >= length:
+            continue
+        channel, profile = divmod(scan, profiles)
+        controller.run_steps(
+            start=[float(x) for x in static["sphere_centre"].values[channel, profile, 0]],
+            direction=[float(x) for x in static["scan_direction"].values[channel, profile]],
+            step=settings.scan_length / (settings.steps - 1),
+            count=settings.steps,
+            dwell=settings.dwell,
+        )
+        yield from _record_scan(frame, static, channel, scan, attempt + 1, length)
+
+
+def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
+    """Return, for each scan, the number of its last attempt and how many samples that one has."""
+    scan, attempt = raw["scan"].values.astype(np.int64), raw["attempt"].values.astype(np.int64)
+    last: dict[int, tuple[int, int]] = {}
+    for number in np.unique(scan):
+        tries = attempt[scan == number]
+        last[int(number)] = int(tries.max()), int((tries == tries.max()).sum())
+    return last
+
+
+def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
+    """Return everything of a beam detection but its samples."""
+    g = frame.geometry
+    offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
+    scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in g.nominal_direction])
+    ahead = np.repeat(settings.depths, 2) + settings.sphere_radius
+    middle = g.nominal_origin[:, None] + ahead[:, None] * g.nominal_direction[:, None]
+    m = {"units": "m"}
+    return xr.Dataset(
+        {
+            "sphere_centre": (
+                ("channel", "profile", "step", "direction"),
+                middle[:, :, None] + offsets[:, None] * scans[:, :, None],
+                m,
+            ),
+            "scan_direction": (("channel", "profile", "direction"), scans, {"units": "1"}),
+            "nominal_origin": (("channel", "direction"), g.nominal_origin, m),
+            "nominal_direction": (("channel", "direction"), g.nominal_direction, {"units": "1"}),
+            "sphere_radius": ((), settings.sphere_radius, m),
+        },
+        coords={"channel": list(CHANNELS), "direction": list("xyz")},
+        attrs={
+            "schema": SCHEMA,
+            "machine": bench.machine,
+            "start": datetime.now(UTC).isoformat(timespec="seconds"),
+            "sensors_warm": int(bool(frame.warm)),
+            "sample_rate": float(frame.rate),
+            "dwell": settings.dwell,
+        },
+    )
+
+
+def machine_axes(direction: Array) -> Array:
+    """Return the two machine axes across a beam; for a beam far from all axes, two vectors across it."""
+    axis = int(np.argmax(np.abs(direction)))
+    if abs(direction[axis]) < 0.9:
+        return across(direction)
+    return np.delete(np.eye(3), axis, axis=0)
+
+
+def _record_scan(
+    frame: Any, static: xr.Dataset, channel: int, scan: int, attempt: int, length: int
+) -> Iterator[xr.Dataset]:
+    """Yield ``length`` samples of one channel."""
+    name = CHANNELS[channel]
+    taken, since = 0, time.monotonic()
+    waiting: list[Array] = []
+
+    def chunk() -> xr.Dataset:
+        record = np.concatenate(waiting)
+        found = static.assign(
+            record=("sample", record, {"units": "m"}),
+            scan=("sample", np.full(record.size, scan, np.int16)),
+            attempt=("sample", np.full(record.size, attempt, np.int16)),
+        )
+        found["record"].encoding = dict(frame.encoding)
+        waiting.clear()
+        return found
+
+    try:
+        for samples in frame.stream([name]):
+            waiting.append(samples.values[0, : length - taken])
+            taken += waiting[-1].size
+            if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
+                yield chunk()
+                since = time.monotonic()
+            if taken == length:
+                return
+    except InstrumentError:
+        if waiting:  # what came before it went wrong is not lost
+            yield chunk()
+        raise
+    raise MethodError(f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.")

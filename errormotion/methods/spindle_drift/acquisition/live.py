@@ -1,0 +1,69 @@
+"""The drift while it is being measured: the last mean against the reference state, chunk by chunk."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
+from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
+from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
+from errormotion.methods.spindle_drift.schema import CHANNELS
+
+if TYPE_CHECKING:
+    from errormotion.methods.spindle_drift.settings import Settings
+
+    Array = Array
+
+_ARCSEC = np.degrees(1.0) * 3600.0
+
+
+class LiveDrift:
+    """Follow a drift record; holds one unfinished mean and the reference state, however long the record is.
+
+    A view for the person at the machine: without uncertainty and without the frame's expansion. What counts is
+    identified from the whole record afterwards.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
+        self._begin: float | None = None
+        self._reference: State | None = None
+        self.errors = np.full(6, np.nan)
+
+    def update(self, chunk: xr.Dataset) -> str:
+        """Take in a chunk of the raw dataset; return the errors of its last known mean as a line of text."""
+        for time, part in slices(chunk):
+            if self._begin is None:
+                self._begin = float(time[0])
+            found = self._averager.update(time, part["distance"].transpose("channel", "time").values)
+            known = np.isfinite(found.mean).all(axis=0)
+            wanted = self._settings.reference_time
+            known &= found.time >= self._begin + (self._settings.spin_up if wanted is None else wanted)
+            if known.any():
+                self._take(found.mean[:, known], chunk)
+        return self.text()
+
+    def _take(self, mean: Array, chunk: xr.Dataset) -> None:
+        origin, direction = chunk["beam_origin"].values, chunk["beam_direction"].values
+        levels, radius = chunk["level"].values, float(chunk["bar_radius"])
+
+        def state(columns: Array) -> State:
+            q = fit_axis(columns, origin, direction, radius, levels)
+            return State(columns, q, *end_point(q, columns[4], origin[4], direction[4], levels))
+
+        if self._reference is None:
+            self._reference = state(mean[:, :1])
+        self.errors = twist(state(mean[:, -1:]), self._reference, self._reference.E[0])[0]
+
+    def text(self) -> str:
+        """Return the last errors in the units of the field; empty before there are any."""
+        if not np.isfinite(self.errors[:5]).all():
+            return ""
+        x, y, z = self.errors[:3] * 1e6
+        a, b = self.errors[3:5] * _ARCSEC
+        return f"EX {x:+.2f} EY {y:+.2f} EZ {z:+.2f} um, EA {a:+.1f} EB {b:+.1f} arcsec"

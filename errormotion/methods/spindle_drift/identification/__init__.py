@@ -1,0 +1,1 @@
+"""Identification: spindle drift, from raw data to errors with covariance."""

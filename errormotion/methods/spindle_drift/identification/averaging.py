@@ -1,0 +1,260 @@
+"""Averages of fixed length over records of any length, at the speed of memory.
+
+A drift record is billions of samples that become one mean every half second. The kernels here add up in double
+precision and turn back to a window only where its sum shows that a NaN is in it; the loops around them hand out slices,
+so that a record larger than memory passes through in constant space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+# Reassociation lets the compiler add in vectors; NaN keeps its meaning, since the kernels test for it.
+_FAST = {"reassoc", "contract", "nsz", "arcp"}
+_SLICE_BYTES = 32 << 20
+# A last window that is shorter is left out: run-out does not average away in a part of it.
+_LEAST_WINDOW = 0.5
+
+
+@numba.njit(cache=True, nogil=True, fastmath=_FAST)
+def _valid_sum(x: NDArray[Any], start: int, end: int, step: int) -> tuple[float, int]:  # pragma: no cover - compiled
+    """Sum and count what is not NaN."""
+    total, valid = 0.0, 0
+    for i in range(start, end, step):
+        if not np.isnan(x[i]):
+            total += np.float64(x[i])
+            valid += 1
+    return total, valid
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def _sum_rows(
+    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
+) -> None:  # pragma: no cover - compiled
+    """Sum ``x`` (channel, sample) between consecutive ``edges``."""
+    channels, windows = sums.shape
+    for job in numba.prange(channels * windows):
+        channel, window = job // windows, job % windows
+        row = x[channel, edges[window] : edges[window + 1]]
+        total, valid = 0.0, row.size
+        for i in range(row.size):
+            total += np.float64(row[i])
+        if np.isnan(total):
+            total, valid = _valid_sum(row, 0, row.size, 1)
+        sums[channel, window] = total
+        counts[channel, window] = valid
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
+def _sum_columns(
+    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
+) -> None:  # pragma: no cover - compiled
+    """Sum ``x`` (sample, channel) between consecutive ``edges``.
+
+    The samples are taken as one long row in pieces of 16 samples, so that every lane of a vector keeps its channel.
+    """
+    channels, windows = sums.shape
+    piece = 16 * channels
+    flat = x.reshape(x.size)
+    for window in numba.prange(windows):
+        total = np.zeros(piece)
+        begin, end = edges[window] * channels, edges[window + 1] * channels
+        whole = begin + (end - begin) // piece * piece
+        pieces = flat[begin:whole].reshape(-1, piece)
+        for k in range(pieces.shape[0]):
+            for i in range(piece):
+                total[i] += np.float64(pieces[k, i])
+        for i in range(end - whole):
+            total[i] += np.float64(flat[whole + i])
+        for channel in range(channels):
+            sums[channel, window] = total[channel::channels].sum()
+            counts[channel, window] = edges[window + 1] - edges[window]
+            if np.isnan(sums[channel, window]):
+                kept, valid = _valid_sum(flat, begin + channel, end, channels)
+                sums[channel, window] = kept
+                counts[channel, window] = valid
+
+
+def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Return sums and numbers of the values that are not NaN, between consecutive edges.
+
+    Parameters
+    ----------
+    values : ndarray, float32 or float64, (channel, sample)
+        In either memory order: the transposed view of a (sample, channel) array is read as it lies.
+    edges : ndarray, int64, (window + 1,)
+        Sample indices, not decreasing.
+
+    Returns
+    -------
+    sums, counts : ndarray (channel, window)
+    """
+    sums = np.empty((values.shape[0], edges.size - 1))
+    counts = np.empty(sums.shape, np.int64)
+    if values.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
+        values = values.astype(np.float64)
+    if values.T.flags.c_contiguous and not values.flags.c_contiguous:
+        _sum_columns(values.T, edges, sums, counts)
+    else:
+        _sum_rows(np.ascontiguousarray(values), edges, sums, counts)
+    return sums, counts
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Window means of a drift record.
+
+    Attributes
+    ----------
+    time : ndarray, (window,)
+        Mean time of the samples of each window, s, on the record's own clock.
+    mean : ndarray, (channel, window)
+        Mean of the valid samples, m; NaN where fewer than ``minimum`` of a full window's are valid.
+    count : ndarray, int64, (channel, window)
+        Number of valid samples.
+    expected : ndarray, int64, (window,)
+        Number of samples, valid or not.
+    """
+
+    time: Array
+    mean: Array
+    count: NDArray[np.int64]
+    expected: NDArray[np.int64]
+
+
+class Averager:
+    """Average a stream of blocks into windows of fixed length; holds one unfinished window at most.
+
+    Window k covers the times from ``start + k * length`` to ``start + (k + 1) * length``. Where the samples lie
+    further apart than half a window, every sample is a window of its own.
+    """
+
+    def __init__(self, channels: int, length: float, minimum: float = 0.5) -> None:
+        self._length, self._minimum = length, minimum
+        self._start = np.nan
+        self._own: bool | None = None
+        self._lone: tuple[Array, NDArray[np.floating[Any]]] | None = None
+        self._slack = self._full = 0.0
+        self._index = -1
+        self._sum = np.zeros(channels)
+        self._count = np.zeros(channels, np.int64)
+        self._time = 0.0
+        self._samples = 0
+
+    def update(self, time: Array, values: NDArray[np.floating[Any]]) -> Averages:
+        """Take in ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
+        if time.size == 0:
+            return self._averages([], [], [], [])
+        if self._lone is not None:
+            time, values = np.append(self._lone[0], time), np.concatenate([self._lone[1], values], axis=1)
+            self._lone = None
+        if self._own is None:
+            if time.size == 1:  # one sample does not tell how far apart they lie
+                self._lone = time.copy(), values.copy()
+                return self._averages([], [], [], [])
+            self._start = float(time[0])
+            interval = float(np.median(np.diff(time[:1000])))
+            self._own = interval > 0.5 * self._length
+            self._slack = 0.5 * interval / self._length
+            self._full = self._length / interval
+        if self._own:
+            return _each(time, values)
+        # Half a sample of slack forgives the rounding of times that were written as decimals.
+        first = int(np.floor((time[0] - self._start) / self._length + self._slack))
+        last = int(np.floor((time[-1] - self._start) / self._length + self._slack))
+        bounds = self._start + (np.arange(first + 1, last + 1) - self._slack) * self._length
+        edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
+        sums, counts = window_sums(values, edges)
+        samples = np.diff(edges)
+        # Times are summed relative to the slice's first one: a day in seconds would cost digits.
+        moments = np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0)
+        times = moments + samples * time[0]
+        done_sum, done_count, done_time, done_samples = [], [], [], []
+        for k in range(samples.size):
+            if first + k != self._index:
+                if self._samples:
+                    done_sum.append(self._sum)
+                    done_count.append(self._count)
+                    done_time.append(self._time)
+                    done_samples.append(self._samples)
+                self._index = first + k
+                self._sum, self._count = sums[:, k].copy(), counts[:, k].copy()
+                self._time, self._samples = float(times[k]), int(samples[k])
+            else:
+                self._sum += sums[:, k]
+                self._count += counts[:, k]
+                self._time += float(times[k])
+                self._samples += int(samples[k])
+        return self._averages(done_sum, done_count, done_time, done_samples)
+
+    def finish(self) -> Averages:
+        """Return the last window, if enough of it was there to average the run-out away."""
+        if self._lone is not None:
+            return _each(*self._lone)
+        if not self._samples or self._samples < _LEAST_WINDOW * self._full:
+            return self._averages([], [], [], [])
+        last = self._averages([self._sum], [self._count], [self._time], [self._samples])
+        self._samples = 0
+        return last
+
+    def _averages(self, sums: list[Any], counts: list[Any], times: list[float], samples: list[int]) -> Averages:
+        channels = self._sum.size
+        count = np.array(counts, np.int64).reshape(-1, channels).T
+        total = np.array(sums, np.float64).reshape(-1, channels).T
+        expected = np.array(samples, np.int64)
+        enough = count >= np.maximum(1, self._minimum * np.maximum(expected, 0.99 * self._full))
+        mean = np.where(enough, total / np.maximum(count, 1), np.nan)
+        return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
+
+
+def _each(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
+    """Return every sample as a window of its own."""
+    counts = np.isfinite(values).astype(np.int64)
+    return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
+
+
+def join(parts: list[Averages]) -> Averages:
+    """Join consecutive averages."""
+    return Averages(
+        np.concatenate([part.time for part in parts]),
+        np.concatenate([part.mean for part in parts], axis=1),
+        np.concatenate([part.count for part in parts], axis=1),
+        np.concatenate([part.expected for part in parts]),
+    )
+
+
+def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
+    """Yield (time, slice of the dataset) of a record along ``time``, a few tens of megabytes at a time.
+
+    The time comes from the variable ``time``, or from the attributes ``sample_rate`` (Hz) and ``time_start`` (s).
+    """
+    distance = raw["distance"]
+    samples = distance.sizes["time"]
+    step = max(1, _SLICE_BYTES // (distance.sizes["channel"] * distance.dtype.itemsize))
+    chunk = distance.encoding.get("preferred_chunks", {}).get("time", 1)
+    if chunk > 1:
+        step = max(1, step // chunk) * chunk
+    for begin in range(0, samples, step):
+        part = raw.isel(time=slice(begin, begin + step))
+        if "time" in raw.variables:
+            time = np.asarray(part["time"].values, np.float64)
+        elif "sample_rate" in raw.attrs:
+            index = np.arange(begin, min(begin + step, samples))
+            time = float(raw.attrs.get("time_start", 0.0)) + index / float(raw.attrs["sample_rate"])
+        else:
+            raise MethodError(
+                "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz)."
+            )
+        yield time, part

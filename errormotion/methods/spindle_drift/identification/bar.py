@@ -1,0 +1,239 @@
+"""Where the bar is, from five distances: the axis of a cylinder of known radius, and its end face.
+
+The axis is the line through A = (x1, y1, L1) and B = (x2, y2, L2); q = (x1, y1, x2, y2) are the four unknowns of the
+four side readings. A beam with origin P, direction u and reading d touches the bar at S = P + u d, and
+
+    g_i(q) = |S_i - line(q)| - r = 0,   i = X1, X2, Y1, Y2
+
+is solved by Newton's method for every instant on its own. With n the unit vector from the axis to S and tau the place
+of its foot on AB, the derivative is exact and short:
+
+    dg = n . (dP + u dd + d du) - dr - n . ((1 - tau) dA + tau dB)
+
+The end face is the plane through S_Z at right angles to the axis; E, where the axis meets it, carries the Z motion.
+Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives our own.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+from errormotion.arrays import Array
+
+if TYPE_CHECKING:
+    Array = Array
+
+SIDE = 4
+"""Number of side channels: X1, X2, Y1, Y2 come first, Z last."""
+PARAMETERS = 36
+"""Columns of a state Jacobian: five distances, then (origin, direction) of five beams, then the bar radius."""
+MAX_STEPS = 30
+# Newton's method squares the error: what is left after a step s is about s * s / radius, here below 1e-17 m.
+_LAST_STEP = 1e-10
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _solve4(m: Array, b: Array) -> bool:  # pragma: no cover - compiled
+    """Solve m x = b in place (x replaces b) by elimination with row exchange; False where m is singular."""
+    for k in range(4):
+        pivot = k
+        for i in range(k + 1, 4):
+            if abs(m[i, k]) > abs(m[pivot, k]):
+                pivot = i
+        if not abs(m[pivot, k]) > 1e-12:
+            return False
+        if pivot != k:
+            for j in range(k, 4):
+                m[k, j], m[pivot, j] = m[pivot, j], m[k, j]
+            b[k], b[pivot] = b[pivot], b[k]
+        inverse = 1.0 / m[k, k]
+        for i in range(k + 1, 4):
+            f = m[i, k] * inverse
+            for j in range(k + 1, 4):
+                m[i, j] -= f * m[k, j]
+            b[i] -= f * b[k]
+    for k in range(3, -1, -1):
+        for j in range(k + 1, 4):
+            b[k] -= m[k, j] * b[j]
+        b[k] /= m[k, k]
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def _fit(
+    distance: Array, origin: Array, direction: Array, radius: float, z1: float, z2: float, start: Array, q: Array
+) -> None:  # pragma: no cover - compiled
+    instants = distance.shape[1]
+    height = z2 - z1
+    chunk = 256
+    for part in numba.prange((instants + chunk - 1) // chunk):
+        m = np.empty((4, 4))
+        g = np.empty(4)
+        x1, y1, x2, y2 = start[0], start[1], start[2], start[3]
+        for t in range(part * chunk, min(instants, (part + 1) * chunk)):
+            done = False
+            for _ in range(MAX_STEPS):
+                ax, ay = (x2 - x1) / height, (y2 - y1) / height
+                norm2 = 1.0 + ax * ax + ay * ay
+                for i in range(4):
+                    d = distance[i, t]
+                    wx = origin[i, 0] + direction[i, 0] * d - x1
+                    wy = origin[i, 1] + direction[i, 1] * d - y1
+                    wz = origin[i, 2] + direction[i, 2] * d - z1
+                    s = (wx * ax + wy * ay + wz) / norm2
+                    nx, ny, nz = wx - s * ax, wy - s * ay, wz - s
+                    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+                    tau = s / height
+                    nx, ny = nx / length, ny / length
+                    m[i, 0], m[i, 1] = (1.0 - tau) * nx, (1.0 - tau) * ny
+                    m[i, 2], m[i, 3] = tau * nx, tau * ny
+                    g[i] = length - radius
+                if not _solve4(m, g):
+                    break
+                x1, y1, x2, y2 = x1 + g[0], y1 + g[1], x2 + g[2], y2 + g[3]
+                step = max(max(abs(g[0]), abs(g[1])), max(abs(g[2]), abs(g[3])))
+                if not step > _LAST_STEP:
+                    done = step == step
+                    break
+            if done:
+                q[t, 0], q[t, 1], q[t, 2], q[t, 3] = x1, y1, x2, y2
+            else:
+                q[t] = np.nan
+                x1, y1, x2, y2 = start[0], start[1], start[2], start[3]
+
+
+def start_axis(origin: Array, direction: Array, distance: Array, radius: float, levels: Array) -> Array:
+    """Return a starting axis (4,) from one set of readings: every side beam goes on to the bar's middle.
+
+    Each side beam i gives one equation for the axis at its own height: along its horizontal direction the axis lies a
+    radius behind the surface point. Four such equations are linear in q. Singular (parallel) beams give NaN.
+    """
+    point = origin[:SIDE] + direction[:SIDE] * distance[:SIDE, None]
+    flat = direction[:SIDE].copy()
+    flat[:, 2] = 0.0
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    tau = (point[:, 2] - levels[0]) / (levels[1] - levels[0])
+    rows = np.column_stack([(1 - tau) * flat[:, 0], (1 - tau) * flat[:, 1], tau * flat[:, 0], tau * flat[:, 1]])
+    if not np.linalg.cond(rows) < 1e8:
+        return np.full(4, np.nan)
+    return np.linalg.solve(rows, np.sum(flat * point, axis=1) + radius)
+
+
+def fit_axis(
+    distance: Array, origin: Array, direction: Array, radius: float, levels: Array, start: Array | None = None
+) -> Array:
+    """Fit the axis of a cylinder of known radius to the four side readings of every instant.
+
+    Parameters
+    ----------
+    distance : ndarray (>= 4, instant)
+        Readings of X1, X2, Y1, Y2 in this order, m; further rows are not looked at.
+    origin, direction : ndarray (>= 4, 3)
+        Beams: zero point, m, and unit vector.
+    radius : float
+        Bar radius, m.
+    levels : ndarray (2,)
+        Heights L1, L2 at which the axis is given, m.
+    start : ndarray (4,), optional
+        Where Newton's method starts; default from the first instant without NaN.
+
+    Returns
+    -------
+    ndarray (instant, 4)
+        x and y of the axis at L1, then at L2, m; NaN where a reading is NaN or no cylinder fits.
+    """
+    q = np.full((distance.shape[1], 4), np.nan)
+    if start is None:
+        known = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
+        if known.size == 0:
+            return q
+        start = start_axis(origin, direction, distance[:, known[0]], radius, levels)
+    if np.isfinite(start).all():
+        _fit(
+            np.ascontiguousarray(distance),
+            np.ascontiguousarray(origin),
+            np.ascontiguousarray(direction),
+            float(radius),
+            float(levels[0]),
+            float(levels[1]),
+            start,
+            q,
+        )
+    return q
+
+
+def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
+    """Return axis directions (instant, 3) and the points E where the axis meets the end face (instant, 3), m.
+
+    ``origin`` and ``direction`` (3,) are those of the Z beam, ``distance_z`` (instant,) its readings.
+    """
+    A = np.column_stack([q[:, 0], q[:, 1], np.full(len(q), levels[0])])
+    B = np.column_stack([q[:, 2], q[:, 3], np.full(len(q), levels[1])])
+    a = (B - A) * np.sign(levels[1] - levels[0])
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    S = origin + direction * distance_z[:, None]
+    along = np.einsum("ti,ti->t", a, S - A)
+    return a, A + a * along[:, None]
+
+
+def state_jacobian(q: Array, distance: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
+    """Return the derivatives of axis direction a and end point E with respect to all that was read and assumed.
+
+    Parameters
+    ----------
+    q : ndarray (instant, 4)
+        Fitted axes.
+    distance : ndarray (5, instant)
+        Readings, m.
+    origin, direction : ndarray (5, 3)
+        Beams.
+    levels : ndarray (2,)
+        Heights L1, L2, m.
+
+    Returns
+    -------
+    da, dE : ndarray (instant, 3, 36)
+        Columns: five distances, then origin and direction of each beam (5 x 6), then the bar radius.
+    """
+    instants = len(q)
+    height = levels[1] - levels[0]
+    A = np.column_stack([q[:, 0], q[:, 1], np.full(instants, levels[0])])
+    slope = np.column_stack([(q[:, 2] - q[:, 0]) / height, (q[:, 3] - q[:, 1]) / height, np.ones(instants)])
+    norm = np.linalg.norm(slope, axis=1)
+    S = origin + direction * distance.T[:, :, None]
+    # The four side equations: M dq = n . dS - dr.
+    w = S[:, :SIDE] - A[:, None]
+    s = np.einsum("tci,ti->tc", w, slope) / (norm**2)[:, None]
+    n = w - s[..., None] * slope[:, None]
+    n /= np.linalg.norm(n, axis=2, keepdims=True)
+    tau = (s / height)[..., None]
+    M = np.concatenate([(1 - tau) * n[..., :2], tau * n[..., :2]], axis=2)
+    rhs = np.zeros((instants, SIDE, PARAMETERS))
+    for i in range(SIDE):
+        rhs[:, i, i] = n[:, i] @ direction[i]
+        rhs[:, i, 5 + 6 * i : 8 + 6 * i] = n[:, i]
+        rhs[:, i, 8 + 6 * i : 11 + 6 * i] = n[:, i] * distance[i][:, None]
+    rhs[:, :, -1] = -1.0
+    known = np.isfinite(M).all(axis=(1, 2))
+    dq = np.full((instants, 4, PARAMETERS), np.nan)
+    dq[known] = np.linalg.solve(M[known], rhs[known])
+    dA = np.zeros((instants, 3, PARAMETERS))
+    dA[:, :2] = dq[:, :2]
+    dslope = np.zeros_like(dA)
+    dslope[:, :2] = (dq[:, 2:] - dq[:, :2]) / height
+    a = slope / norm[:, None]
+    da = (dslope - a[:, :, None] * np.einsum("ti,tip->tp", a, dslope)[:, None]) / norm[:, None, None]
+    # E = A + a (a . (S_Z - A))
+    dS = np.zeros_like(dA)
+    dS[:, :, 4] = direction[4]
+    for k in range(3):
+        dS[:, k, 29 + k] = 1.0
+        dS[:, k, 32 + k] = distance[4]
+    v = S[:, 4] - A
+    along = np.einsum("ti,ti->t", a, v)
+    dalong = np.einsum("tip,ti->tp", da, v) + np.einsum("ti,tip->tp", a, dS - dA)
+    dE = dA + da * along[:, None, None] + a[:, :, None] * dalong[:, None]
+    return da, dE

@@ -1,0 +1,147 @@
+"""From the readings of a stepped sphere to an error dataset of the five beams."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.kinematics.beams import beam_errors
+from errormotion.methods.spindle_drift.identification.beams import Beam, circles_and_line, likelihood_fit
+from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds, segment_steps
+
+if TYPE_CHECKING:
+    from errormotion.methods.spindle_drift.settings import Settings
+
+    Array = Array
+
+log = logging.getLogger(__name__)
+
+
+def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return an error dataset of component ``beam``: what each beam is, minus what it was meant to be.
+
+    Each beam's errors are stated about its own zero point; see `beam_errors` for their meaning.
+
+    Raises
+    ------
+    MethodError
+        Readings that do not determine a beam; the beam is named.
+    """
+    notes: list[str] = []
+    measured = raw
+    if "scan" in raw.variables:
+        raw = segmented(raw, settings, notes)
+    names = [str(name) for name in raw["channel"].values]
+    radius = float(raw["sphere_radius"])
+    distance = raw["distance"].transpose("channel", "profile", "step").values.astype(np.float64)
+    centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction").values
+    scan = raw["scan_direction"].transpose("channel", "profile", "direction").values
+    origin0 = np.asarray(raw["nominal_origin"].transpose("channel", "direction").values, np.float64)
+    direction0 = np.asarray(raw["nominal_direction"].transpose("channel", "direction").values, np.float64)
+    direction0 = direction0 / np.linalg.norm(direction0, axis=1, keepdims=True)
+    found: list[Beam] = []
+    paper_origin, paper_direction = np.full_like(origin0, np.nan), np.full_like(origin0, np.nan)
+    for i, name in enumerate(names):
+        beam = likelihood_fit(distance[i], centre[i], radius, origin0[i], direction0[i], name)
+        found.append(beam)
+        clean = distance[i].copy()
+        clean[tuple(beam.left_out.T)] = np.nan
+        paper_origin[i], paper_direction[i] = circles_and_line(clean, centre[i], scan[i], radius, direction0[i])
+        missing = int(np.isnan(distance[i]).sum())
+        if missing:
+            notes.append(f"{name}: {missing} of {distance[i].size} readings are unknown (NaN).")
+        if len(beam.left_out):
+            places = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
+            notes.append(f"{name}: {len(beam.left_out)} readings left out as outliers: {places}.")
+    errors, covariance = beam_errors(
+        origin0,
+        direction0,
+        np.array([b.origin for b in found]),
+        np.array([b.direction for b in found]),
+        np.array([b.covariance for b in found]),
+    )
+    for note in notes:
+        log.warning(note)
+    beam_axis, axis = ("beam", names), ("direction", list("xyz"))
+    parameters = ["px", "py", "pz", "ux", "uy", "uz"]
+
+    def vectors(values: Array, unit: str) -> xr.DataArray:
+        return xr.DataArray(
+            values, coords={"beam": beam_axis, "direction": axis}, dims=("beam", "direction"), attrs={"units": unit}
+        )
+
+    extras = {
+        "beam_origin": vectors(np.array([b.origin for b in found]), "m"),
+        "beam_direction": vectors(np.array([b.direction for b in found]), "1"),
+        "nominal_origin": vectors(origin0, "m"),
+        "nominal_direction": vectors(direction0, "1"),
+        "paper_origin": vectors(paper_origin, "m"),
+        "paper_direction": vectors(paper_direction, "1"),
+        "beam_covariance": xr.DataArray(
+            np.array([b.covariance for b in found]),
+            coords={"beam": beam_axis, "p": ("p", parameters), "p_": ("p_", parameters)},
+            dims=("beam", "p", "p_"),
+            attrs={"units": "SI: m for p, 1 for u"},
+        ),
+        "residual": xr.DataArray(
+            np.array([b.residual for b in found]),
+            coords={"beam": beam_axis},
+            dims=("beam", "profile", "step"),
+            attrs={"units": "m"},
+        ),
+        "noise": xr.DataArray(
+            np.array([b.noise for b in found]), coords={"beam": beam_axis}, dims="beam", attrs={"units": "m"}
+        ),
+        "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), coords={"beam": beam_axis}, dims="beam"),
+    }
+    ds = build_errors(
+        errors,
+        covariance,
+        dims=("beam",),
+        coords={"beam": names},
+        component="beam",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=origin0.mean(axis=0),
+        reference="nominal beams; each beam's errors are stated at its own nominal zero point (nominal_origin)",
+        method=method,
+        method_version=version,
+        provenance=provenance.make(settings, measured, None, steps=["ray-sphere likelihood fit", "circles and line"]),
+        extras=extras,
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Dataset:
+    """Return a beam detection with the mean reading of every step, from one as recorded.
+
+    Of a scan that was cut off and made anew the last attempt counts; one whose steps are not found is NaN, and
+    ``notes`` say why.
+    """
+    centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction")
+    channels, profiles, steps = centre.shape[:3]
+    rate, dwell = float(raw.attrs["sample_rate"]), float(raw.attrs.get("dwell", settings.dwell))
+    length = round(scan_seconds(steps, dwell) * rate)
+    scan = raw["scan"].values
+    attempt = raw["attempt"].values if "attempt" in raw else np.zeros(scan.size, np.int16)
+    means = np.full((channels, profiles, steps), np.nan)
+    for number in range(channels * profiles):
+        channel, profile = divmod(number, profiles)
+        place = f"{raw['channel'].values[channel]}, profile {profile}"
+        samples = np.flatnonzero(scan == number)
+        if samples.size == 0:
+            notes.append(f"{place}: not recorded.")
+            continue
+        samples = samples[attempt[samples] == attempt[samples].max()][:length]
+        record = raw["record"].isel(sample=slice(int(samples[0]), int(samples[-1]) + 1)).values.astype(np.float64)
+        try:
+            means[channel, profile] = segment_steps(record, rate, steps, dwell, settings.step_average).mean
+        except MethodError as error:
+            notes.append(f"{place}: {error}")
+    return raw.drop_dims("sample").assign(distance=(("channel", "profile", "step"), means, {"units": "m"}))

@@ -1,0 +1,168 @@
+"""What is known of the drift's errors: independent noise, and sources that are one draw for the whole record.
+
+The errors of an instant are a function of its own readings, of the readings of the reference state, and of what both
+share: the beams and the bar's radius. With a the bar's direction, E the middle of its end face, 0 the reference state
+and p the functional point,
+
+    w = a0 x a                               rotation; the part about the axis is not seen
+    T = E - E0 + w x (p - E0)                displacement of p
+
+    dw = a0 x da - a x da0
+    dT = dE - dE0 + dw x (p - E0) - w x dE0
+
+The derivatives of a and E come from ``bar.state_jacobian``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.methods.spindle_drift.identification.bar import PARAMETERS, state_jacobian
+from errormotion.methods.spindle_drift.schema import CHANNELS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Array = Array
+
+_BLOCK = 1024
+
+
+@dataclass(frozen=True)
+class Source:
+    """One standard uncertainty of something that all instants share, as a change of the 36 parameters.
+
+    ``now`` acts on the state of each instant, ``then`` on the reference state; (36,) in SI.
+    """
+
+    name: str
+    group: str
+    now: Array
+    then: Array
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The geometry that all instants share."""
+
+    origin: Array
+    direction: Array
+    levels: Array
+    point: Array
+
+
+@dataclass(frozen=True)
+class State:
+    """Fitted states: readings (5, instant), axes q (instant, 4), directions a and end points E (instant, 3)."""
+
+    distance: Array
+    q: Array
+    a: Array
+    E: Array
+
+
+def twist(now: State, then: State, point: Array) -> Array:
+    """Return the error twists (instant, 6) at ``point`` relative to the one state ``then``; EC is NaN."""
+    rotation = np.cross(then.a[0], now.a)
+    shift = now.E - then.E[0] + np.cross(rotation, point - then.E[0])
+    errors = np.concatenate([shift, rotation], axis=1)
+    errors[:, 5] = np.nan
+    return errors
+
+
+def _cross(v: Array, m: Array) -> Array:
+    """Return v x m column by column; v (..., 3), m (..., 3, k)."""
+    return np.asarray(np.cross(v[..., None], m, axis=-2))
+
+
+def propagate(
+    now: State,
+    then: State,
+    frame: Frame,
+    sigma: Array,
+    sources: Sequence[Source],
+    scaled: Sequence[Array],
+) -> tuple[Array, Array]:
+    """Return what the readings' own noise and the shared sources do to the errors.
+
+    Parameters
+    ----------
+    now, then : State
+        All instants, and the one reference state.
+    frame : Frame
+        Beams, levels and functional point.
+    sigma : ndarray (5, instant)
+        Standard uncertainty of the mean readings, m.
+    sources : sequence of Source
+        Shared by all instants.
+    scaled : sequence of ndarray (5, instant)
+        Effects of further shared sources as changes of the readings, m, in each instant.
+
+    Returns
+    -------
+    independent : ndarray (instant, 6, 6)
+        Covariance from the readings' own noise.
+    influence : ndarray (source, instant, 6)
+        Of ``sources``, then of ``scaled``.
+    """
+    instants = len(now.q)
+    independent = np.full((instants, 6, 6), np.nan)
+    influence = np.full((len(sources) + len(scaled), instants, 6), np.nan)
+    da0, dE0 = (m[0] for m in state_jacobian(then.q, then.distance, frame.origin, frame.direction, frame.levels))
+    changes_now = np.array([s.now for s in sources]).reshape(-1, PARAMETERS).T
+    changes_then = np.array([s.then for s in sources]).reshape(-1, PARAMETERS).T
+    da0, dE0 = da0 @ changes_then, dE0 @ changes_then
+    a0, arm = then.a[0], frame.point - then.E[0]
+    for begin in range(0, instants, _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        a = now.a[part]
+        w = np.cross(a0, a)
+        da, dE = state_jacobian(now.q[part], now.distance[:, part], frame.origin, frame.direction, frame.levels)
+        # The readings' own noise acts on the instant alone.
+        dw = _cross(a0, da[:, :, :5])
+        J = np.concatenate([dE[:, :, :5] + _cross(-arm, dw), dw], axis=1)
+        independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J)
+        for k, change in enumerate(scaled):
+            influence[len(sources) + k, part] = np.einsum("tip,pt->ti", J, change[:, part])
+        # What is shared acts on the instant and on the reference state.
+        da, dE = da @ changes_now, dE @ changes_now
+        dw = _cross(a0, da) - _cross(a, da0[None])
+        dT = dE - dE0 + _cross(-arm, dw) - _cross(w, dE0[None])
+        influence[: len(sources), part] = np.moveaxis(np.concatenate([dT, dw], axis=1), 2, 0)
+    return independent, influence
+
+
+def reading_sources(sigma: Array) -> list[Source]:
+    """Return the reference state's readings (5,), m, as sources."""
+    found = []
+    for i, name in enumerate(CHANNELS):
+        change = np.zeros(PARAMETERS)
+        change[i] = sigma[i]
+        found.append(Source(f"reference {name}", "reference state", np.zeros(PARAMETERS), change))
+    return found
+
+
+def beam_sources(covariance: Array, group: str) -> list[Source]:
+    """Return the beams' uncertainty, covariance (5, 6, 6) over (origin, direction), as columns of its factors."""
+    found = []
+    for i, name in enumerate(CHANNELS):
+        # Scaled, so that metres and radians weigh alike where rank is decided.
+        size = np.sqrt(np.diag(covariance[i]))
+        unit = np.where(size > 0, size, 1.0)
+        values, vectors = np.linalg.eigh(covariance[i] / np.outer(unit, unit))
+        for k in np.flatnonzero(values > 1e-12):
+            change = np.zeros(PARAMETERS)
+            change[5 + 6 * i : 11 + 6 * i] = unit * vectors[:, k] * np.sqrt(values[k])
+            found.append(Source(f"beam {name}.{k}", group, change, change))
+    return found
+
+
+def radius_source(sigma: float) -> Source:
+    """Return the bar's radius as a source."""
+    change = np.zeros(PARAMETERS)
+    change[-1] = sigma
+    return Source("bar radius", "bar radius", change, change)

@@ -1,0 +1,177 @@
+"""Logs that a lab already has: columns of text become a raw dataset of ``spindle_drift``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets.storage import save
+from errormotion.datasets.text.log_format import TIMESTAMP
+from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
+from errormotion.datasets.tomlfile import load_model
+from errormotion.datasets.units import convert
+from errormotion.datasets.validation import validate
+from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.log_import.import_map import (
+    Channel,
+    ImportMap,
+    SpeedColumn,
+    TemperatureColumn,
+    TimeColumn,
+)
+from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
+
+_DRIFT = RAW_SCHEMAS[0]
+_ROWS = {row.name: row for row in _DRIFT.rows}
+_VARIABLE = {
+    "time": "time",
+    "channels": "distance",
+    "temperatures": "temperature",
+    "spindle_speed": "spindle_speed",
+}
+
+
+def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwrite: bool = False) -> xr.Dataset:
+    """Turn a CSV or TSV log into a raw dataset, and write it.
+
+    Parameters
+    ----------
+    log : str or Path
+        Text with one line an instant. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON,
+        key of the map to count).
+    map_file : str or Path
+        TOML; see `errormotion.methods.spindle_drift.log_import.import_map.ImportMap`.
+    out : str or Path
+        ``.nc`` or ``.zarr``.
+    overwrite : bool
+        Replace what is at ``out``.
+
+    Returns
+    -------
+    Dataset
+        Schema ``errormotion.raw.spindle_drift/1``, drift.
+
+    Raises
+    ------
+    DatasetError
+        The map or the log is wrong; all complaints at once, each with its line. Nothing is written then.
+    """
+    settings = load_model(map_file, ImportMap, error=DatasetError)
+    complaints = Complaints(Path(log))
+    dates = settings.time.unit == TIMESTAMP
+    columns = read_columns(_wanted(settings), "time", settings.format, complaints, dates=dates)
+    _check_times(columns, complaints)
+    _check_magnitudes(columns, settings, complaints)
+    complaints.raise_any()
+    raw = _raw_dataset(columns, settings).assign_attrs(log=Path(log).name, map=Path(map_file).name)
+    validate(raw)
+    save(raw, out, overwrite=overwrite)
+    return raw
+
+
+def _wanted(settings: ImportMap) -> dict[str, str | int]:
+    """Return the column of each key of the map."""
+    found: dict[str, str | int] = {"time": settings.time.column}
+    found |= {f"channels.{name}": settings.channels[name].column for name in CHANNELS}
+    found |= {f"temperatures.{name}": entry.column for name, entry in settings.temperatures.items()}
+    if settings.spindle_speed is not None:
+        found["spindle_speed"] = settings.spindle_speed.column
+    return found
+
+
+def _check_times(columns: Columns, complaints: Complaints) -> None:
+    """Complain of times that do not increase."""
+    t, lines = columns.values["time"], columns.lines
+    known = np.flatnonzero(~np.isnan(t))
+    for step in np.flatnonzero(np.diff(t[known]) <= 0):
+        before, after = known[step], known[step + 1]
+        complaints.add(
+            int(lines[after]),
+            f"time: expected more than {t[before]:.9g} of line {int(lines[before])}; found {t[after]:.9g}",
+        )
+
+
+def _check_magnitudes(columns: Columns, settings: ImportMap, complaints: Complaints) -> None:
+    """Complain of the first value of each column that cannot be."""
+    for key, values in columns.values.items():
+        row = _ROWS[_VARIABLE[key.partition(".")[0]]]
+        inside = _inside(key, values, settings)
+        outside = np.flatnonzero((inside < row.low) | (inside > row.high))
+        if outside.size:
+            first, unit = outside[0], _column(key, settings).unit
+            complaints.add(
+                int(columns.lines[first]),
+                f"{key}: {values[first]:.6g} makes a {row.name} of {inside[first]:.6g} {row.unit}; expected "
+                f"{row.low:g}..{row.high:g} {row.unit}. Is the unit '{unit}' right? ({outside.size} such values)",
+            )
+
+
+def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | TemperatureColumn | SpeedColumn:
+    """Return what the map says of a column."""
+    table, _, name = key.partition(".")
+    if table == "channels":
+        return settings.channels[name]
+    if table == "temperatures":
+        return settings.temperatures[name]
+    return settings.spindle_speed if table == "spindle_speed" and settings.spindle_speed else settings.time
+
+
+def _inside(key: str, values: Array, settings: ImportMap) -> Array:
+    """Return a column in inside units."""
+    column = _column(key, settings)
+    if column.unit == TIMESTAMP:
+        return values
+    inside = np.asarray(convert(values, column.unit, _ROWS[_VARIABLE[key.partition(".")[0]]].unit))
+    return inside * column.scale + column.offset if isinstance(column, Channel) else inside
+
+
+def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
+    channels = [settings.channels[name] for name in CHANNELS]
+    direction = np.array([channel.direction for channel in channels])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    inside = {key: _inside(key, values, settings) for key, values in columns.values.items()}
+    metre = {"units": "m"}
+    variables: dict[str, Any] = {
+        "distance": (("channel", "time"), np.stack([inside[f"channels.{name}"] for name in CHANNELS]), metre),
+        "beam_origin": (("channel", "direction"), [channel.origin for channel in channels], metre),
+        "beam_direction": (("channel", "direction"), direction, {"units": "1"}),
+        "bar_radius": ((), settings.bar_radius, metre),
+        "distance_noise": ((), settings.distance_noise, metre),
+        "level": (("height",), list(settings.levels), metre),
+    }
+    coords: dict[str, Any] = {
+        "channel": list(CHANNELS),
+        "direction": ["x", "y", "z"],
+        "height": ["L1", "L2"],
+        "time": (("time",), inside["time"], {"units": "s"}),
+    }
+    if channels[0].origin_uncertainty is not None:
+        variables["beam_covariance"] = (("channel", "p", "p_"), _beam_covariance(settings, direction))
+    if settings.temperatures:
+        temperature = np.stack([inside[f"temperatures.{name}"] for name in settings.temperatures], axis=1)
+        variables["temperature"] = (("time", "sensor"), temperature, {"units": "degC"})
+        coords["sensor"] = list(settings.temperatures)
+    if settings.spindle_speed is not None:
+        variables["spindle_speed"] = (("time",), inside["spindle_speed"], {"units": "1/min"})
+    missing = {key: int(np.isnan(values).sum()) for key, values in columns.values.items()}
+    attrs: dict[str, Any] = {
+        "schema": _DRIFT.id,
+        "missing_values": json.dumps({key: count for key, count in missing.items() if count}),
+    }
+    attrs |= {name: value for name, value in (("machine", settings.machine), ("start", columns.start)) if value}
+    return xr.Dataset(variables, coords, attrs)
+
+
+def _beam_covariance(settings: ImportMap, direction: Array) -> Array:
+    """Return (channel, 6, 6): equal in each coordinate of the origin, and across the beam in the direction."""
+    C = np.zeros((len(CHANNELS), 6, 6))
+    for k, name in enumerate(CHANNELS):
+        channel, u = settings.channels[name], direction[k]
+        C[k, :3, :3] = (channel.origin_uncertainty or 0.0) ** 2 * np.eye(3)
+        C[k, 3:, 3:] = (channel.direction_uncertainty or 0.0) ** 2 * (np.eye(3) - np.outer(u, u))
+    return C

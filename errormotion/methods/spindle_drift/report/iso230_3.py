@@ -1,0 +1,126 @@
+"""The tables of thermal drift values in the manner of ISO 230-3: ranges and differences, first hour and to the end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+
+from errormotion.report.document import Cell, Table, estimate
+from errormotion.report.series import (
+    QUANTITIES,
+    Event,
+    curves,
+    end_of_running,
+    minutes_of,
+    unit_of,
+)
+from errormotion.report.text import fixed
+
+#: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.
+_STEP = "holds the step of a compensation that was switched in this interval"
+_SLOPE_SPAN = 10.0  # min before the end of running, over which an end slope is taken
+_RATES = {"end_slope": (3600.0, "/h"), "per_kelvin": (1.0, "/K")}
+
+
+def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, float]:
+    """Return one ISO 230-3 value and its standard uncertainty in SI; NaN where the dataset does not hold it."""
+    if "iso_value" not in errors:
+        return math.nan, math.nan
+    table = errors["iso_value"]
+    if quantity not in table["quantity"].values or measure not in table["measure"].values:
+        return math.nan, math.nan
+    place = {"quantity": quantity, "measure": measure}
+    value = float(table.sel(place))
+    uncertainty = float(errors["iso_uncertainty"].sel(place)) if "iso_uncertainty" in errors else math.nan
+    return value, uncertainty
+
+
+def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] = ()) -> Cell:
+    """Return one value in field units with its expanded uncertainty, or a dash and why.
+
+    A value over an interval in which the quantity's compensation was switched carries that as its footnote.
+    """
+    value, uncertainty = value_of(errors, quantity, measure)
+    size = 60.0 if measure == "time_constant" else unit_of(quantity)[1] / _RATES.get(measure, (1.0, ""))[0]
+    made = estimate(
+        value / size,
+        2 * uncertainty / size,
+        reason=why_not(errors, quantity, measure),
+        signed=not measure.startswith(("range", "time")),
+    )
+    if math.isfinite(value) and holds_step(errors, quantity, measure, done):
+        return replace(made, reason=_STEP)
+    return made
+
+
+def holds_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
+    """Return whether the quantity's compensation was switched within the interval that a measure is taken over."""
+    time, stop = minutes_of(errors), end_of_running(errors)
+    if not (time.size and done):
+        return False
+    running = time[stop] if stop is not None else time[-1]
+    begin = running - _SLOPE_SPAN if measure == "end_slope" else time[0]
+    end = time[0] + 60 if measure.endswith("60min") else time[-1] if measure.endswith("total") else running
+    return any(begin < event.minute <= end and quantity[0] in event.axes for event in done)
+
+
+def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
+    """Say why a value is not there, from what the record holds."""
+    time = minutes_of(errors)
+    values = curves(errors)[quantity].values
+    if not np.isfinite(values).any():
+        return f"{quantity} could not be determined from this record"
+    if measure.endswith("60min") and (time.size == 0 or time[-1] - time[0] < 60):
+        return f"the record is {fixed(time[-1] - time[0], 1)} min long, shorter than 60 min"
+    if measure.endswith("running") and end_of_running(errors) is None:
+        if "spindle_speed" in errors:
+            return "the spindle did not turn in this record"
+        return "the spindle speed was not recorded"
+    if measure == "per_kelvin":
+        if "temperature" not in errors or not np.isfinite(errors["temperature"].values).any():
+            return "no temperature was recorded"
+        return "the temperatures changed too little for a coefficient"
+    if measure == "time_constant":
+        return "the curve is not described by one exponential within this record"
+    return "too few valid readings in this interval"
+
+
+def tables(errors: xr.Dataset, done: Sequence[Event] = ()) -> list[Table]:
+    """Return the table of drift values and the table of what describes the curves."""
+    if "iso_value" not in errors:
+        return []
+    time, stop = minutes_of(errors), end_of_running(errors)
+    running = f"to the end of running ({fixed(time[stop], 1)} min)" if stop is not None else "to the end of running"
+    whole = f"whole record ({fixed(time[-1], 1)} min)" if time.size else "whole record"
+    groups = [("", 2), (Markup("first 60 min, d(…)<sub>60</sub>"), 2), (running, 2), (whole, 2)]
+    head = ["quantity", "unit"] + ["range", "difference"] * 3
+    intervals = [f"{kind}_{span}" for span in ("60min", "running", "total") for kind in ("range", "difference")]
+    first = Table(
+        "Thermal drift values. Range: highest minus lowest value in the interval. Difference: value at the end of the "
+        "interval minus value at its start. After ±: expanded uncertainty, k = 2.",
+        head,
+        [[f"d({name})", unit_of(name)[0], *(cell(errors, name, m, done) for m in intervals)] for name in QUANTITIES],
+        groups,
+    )
+    second = Table(
+        "Course of the drift. Time constant of the first approach, slope at the end of running, and displacement or "
+        "tilt per kelvin of temperature change. After ±: expanded uncertainty, k = 2.",
+        ["quantity", "time constant / min", "end slope", "unit", "per kelvin", "unit"],
+        [
+            [
+                f"d({name})",
+                cell(errors, name, "time_constant", done),
+                cell(errors, name, "end_slope", done),
+                f"{unit_of(name)[0]}/h",
+                cell(errors, name, "per_kelvin", done),
+                f"{unit_of(name)[0]}/K",
+            ]
+            for name in QUANTITIES
+        ],
+    )
+    return [first, second]

@@ -1,0 +1,303 @@
+"""What a plugin is: an instrument, a method, a kind of dataset; and the data that they exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+
+import numpy as np
+import xarray as xr
+from pydantic import BaseModel, ConfigDict
+
+Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
+
+ERRORS_SCHEMA = "errormotion.errors/1"
+"""Schema of every error dataset, whichever method it comes from."""
+
+
+class PluginSettings(BaseModel):
+    """Base of every plugin's settings: unknown keys are refused, values are fixed once made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(frozen=True)
+class InstrumentInfo:
+    """What an instrument says of itself.
+
+    ``status`` is honest about what it has met: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
+    ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
+    """
+
+    id: str
+    kind: str
+    summary: str
+    status: Status
+    version: str = "1"
+    simulator: str | None = None
+
+
+@dataclass(frozen=True)
+class MethodInfo:
+    """What a method says of itself; ``cannot_see`` lists in words what it is blind to."""
+
+    id: str
+    summary: str
+    status: Status
+    version: str = "1"
+    cannot_see: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """Description of a kind of dataset that is neither raw data of a method nor its errors: a log, a model.
+
+    ``schemas`` are the values of the attribute ``schema`` that its datasets have. ``methods`` are the values of the
+    attribute ``method`` of error datasets that it makes, such as the predictions of a model.
+    """
+
+    id: str
+    summary: str
+    schemas: tuple[str, ...]
+    methods: tuple[str, ...] = ()
+    version: str = "1"
+
+
+@dataclass(frozen=True)
+class FigureOfMerit:
+    """One number of a result that a person looks at first: on the command line, in a summary, in a comparison.
+
+    Attributes
+    ----------
+    name : str
+        In the words of the standard that defines it, with its place or time where it has one.
+    value, expanded_uncertainty : float
+        SI; k = 2. NaN where unknown.
+    unit : str
+        SI unit of both: ``m``, ``rad``, ``1``, ``degC``.
+    limit : float, optional
+        Largest absolute value that is accepted, where one is known.
+    """
+
+    name: str
+    value: float
+    expanded_uncertainty: float
+    unit: str
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a method needs: instrument kinds to acquire, a raw schema to identify."""
+
+    instruments: tuple[str, ...]
+    raw_schema: str
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who answered at an address: goes into the provenance of everything that it measured."""
+
+    manufacturer: str
+    model: str
+    serial_number: str
+    firmware: str = ""
+    simulated: bool = False
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A block of equally spaced samples of one or more channels, as an instrument hands them over.
+
+    Attributes
+    ----------
+    values : ndarray, float64, (channel, n)
+        SI units; NaN where the instrument gave no valid value.
+    first : int
+        Device counter of the first sample (samples since the start of the stream, lost ones included).
+    rate : float
+        Samples per second.
+    host_time : float
+        ``time.monotonic()`` when the block had come off the wire, s.
+    dropped : int
+        Samples that the device counter shows missing inside this block; they are NaN in ``values``.
+    invalid : mapping of str to int
+        Why values are NaN: reason to count.
+    """
+
+    values: np.ndarray
+    first: int
+    rate: float
+    host_time: float
+    dropped: int = 0
+    invalid: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch that a probe is to make: to the start, toward the target until it trips, and back to the start.
+
+    Attributes
+    ----------
+    start, target : (3,) tuple of float
+        Commanded places of the tip, X Y Z, m: before the touch, and where the probe stops if nothing trips it.
+    item : int
+        What is touched (the number of a ball), for messages and for the dataset.
+    """
+
+    start: tuple[float, float, float]
+    target: tuple[float, float, float]
+    item: int = 0
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What came of one touch.
+
+    Attributes
+    ----------
+    position : (3,) tuple of float
+        Where the machine says that the tip was when the probe tripped, m; NaN where the touch gave none.
+    time : float
+        When it tripped, s on the clock of the machine (its ``state()["time"]``).
+    flag : str
+        Empty for a good touch; else why there is none: ``no trip``, ``tripped at the start``, ``repeat differs``.
+    """
+
+    position: tuple[float, float, float]
+    time: float
+    flag: str = ""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of what a machine is to do: for its limits, and for a dry run.
+
+    Attributes
+    ----------
+    what : str
+        ``move``, ``touch`` or ``rest``.
+    place : (3,) tuple of float or None
+        Where it ends, X Y Z, m; None where the machine stays.
+    feed : float
+        m/s; NaN at rest.
+    seconds : float
+        How long it takes.
+    spindle_speed : float
+        1/min.
+    """
+
+    what: str
+    place: tuple[float, float, float] | None
+    feed: float
+    seconds: float
+    spindle_speed: float = 0.0
+
+
+@runtime_checkable
+class Instrument(Protocol):
+    """A driver: one plain class. Nothing touches the wire before ``__enter__`` (or ``open``)."""
+
+    info: ClassVar[InstrumentInfo]
+    Settings: ClassVar[type[PluginSettings]]
+    address: str
+    settings: Any
+
+    def open(self) -> None:
+        """Open the connection; idempotent."""
+
+    def close(self) -> None:
+        """Close the connection and end every thread; idempotent."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def identify(self) -> Identity:
+        """Ask the device who it is."""
+
+    def read(self) -> Any:
+        """Return one reading now."""
+
+
+@runtime_checkable
+class Bench(Protocol):
+    """What a method sees of a bench: opened instruments by kind, and where and what the machine is."""
+
+    machine: str
+
+    def of_kind(self, kind: str) -> Any:
+        """Return the one instrument of this kind; BenchError names what is missing."""
+
+    def all_of_kind(self, kind: str) -> Mapping[str, Any]:
+        """Return every instrument of this kind by its name on the bench; none where there is none."""
+
+    def has_kind(self, kind: str) -> bool:
+        """Whether the bench offers an instrument of this kind."""
+
+    def ask(self, message: str) -> None:
+        """Ask the operator to do something and wait for it; passes at once on a virtual machine."""
+
+
+@runtime_checkable
+class Method(Protocol):
+    """What is measured and how it becomes an error dataset.
+
+    Optional attributes. Where one is heavy to import, `lazy` loads it when it is first used.
+
+    ``raw_schemas`` : tuple of `errormotion.datasets.schemas.RawSchema`
+        The tables that validation, CSV reading, import and the reference pages follow.
+    ``chapters(source)`` : list of `errormotion.report.document.Part`
+        The report of one of its error datasets; without it, the generic chapter.
+    ``figures(errors)`` : list of `FigureOfMerit`
+        The numbers that the command line and summaries show.
+    ``simulate(settings, seed)`` : (raw, truth)
+        Raw data with a known truth: a raw dataset, and an error dataset relative to the same reference.
+    ``conformance()`` : tuple of `MethodSubject`
+        What the conformance kit examines.
+    ``follow(settings)`` : function
+        Takes each acquired dataset and returns a line of text for the operator.
+    ``programs(settings, instruments)`` : mapping of str to str
+        The NC programs of the test, file name to text.
+    ``motions(settings, instruments)`` : list of `Step`
+        Every step of the machine; checked against the limits of the bench before anything moves.
+    ``check(settings)`` : mapping of str to str
+        What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
+
+    ``programs`` and ``motions`` get the settings of the bench's instruments by kind.
+    """
+
+    info: ClassVar[MethodInfo]
+    needs: ClassVar[Needs]
+    Settings: ClassVar[type[PluginSettings]]
+
+    def acquire(
+        self,
+        bench: Bench,
+        settings: Any,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
+    ) -> Iterator[xr.Dataset]:
+        """Measure; yield raw datasets to be joined along ``append_dim(settings)``.
+
+        ``inputs`` are results of earlier tests by the name the campaign gives them. ``done`` is what an interrupted
+        run already holds: go on behind it.
+        """
+
+    def append_dim(self, settings: Any) -> str:
+        """Return the dimension along which the yielded datasets are joined."""
+
+    def progress(self, settings: Any) -> float:
+        """Return the expected total for the progress bar: seconds, where chunks state a ``sample_rate``; else items."""
+
+    def identify(self, raw: xr.Dataset, settings: Any) -> xr.Dataset:
+        """Turn a raw dataset into an error dataset; leaves ``raw`` as it is."""
+
+    def plan(self, settings: Any) -> xr.Dataset:
+        """Return an error dataset of zeros whose covariance is the one to expect."""
