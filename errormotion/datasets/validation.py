@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.datasets.error_dataset import error_violations
+from errormotion.datasets.error_checks import error_violations
 from errormotion.datasets.raw import raw_violations, variant_of
 from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
 from errormotion.datasets.tomlfile import nearest
