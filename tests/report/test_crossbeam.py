@@ -9,8 +9,9 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.methods.crossbeam_scan.report.view import campaign, remarks
+from errormotion.methods.crossbeam_scan.report.view import campaign
 from errormotion.report import write_report
+from errormotion.report.fields import remarks
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import swept
 

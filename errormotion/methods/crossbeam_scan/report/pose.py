@@ -9,9 +9,9 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import field, remarks
 from errormotion.report import provenance, quality
 from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, estimate
+from errormotion.report.fields import field, remarks
 from errormotion.report.text import fixed, integer
 
 #: Parameter of the pose: its name, what it is; mrad for angles and mm for shifts.

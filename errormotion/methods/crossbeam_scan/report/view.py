@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +11,8 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import iso_names
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.text import SECOND_OF_ARC, UM, fixed
+from errormotion.report.fields import field
+from errormotion.report.text import fixed
 
 AXES = ("time", "position")
 NO_REASON = "no value, and the result states no reason"
@@ -119,11 +118,6 @@ class Campaign:
         return f"{at_y(self.position[artefact])}, {after(self.time[cycle])}"
 
 
-def field(errors: xr.Dataset, name: str, *dims: str) -> Array:
-    """Return a variable as floats in the order of these dims."""
-    return np.asarray(errors[name].transpose(*dims).values, dtype=float)
-
-
 def campaign(errors: xr.Dataset) -> Campaign:
     """Return the view of a dataset over time and position."""
     values = np.stack([field(errors, name, *AXES) for name in FREEDOMS], axis=-1)
@@ -158,11 +152,6 @@ def _reasons(errors: xr.Dataset, values: Array) -> NDArray[np.str_]:
     return np.where(holes, np.array(text, dtype=str).reshape(holes.shape), "")
 
 
-def unit_of(freedom: int) -> tuple[str, float]:
-    """Return the field unit of a freedom by its index, and its size in SI."""
-    return UM if freedom < 3 else SECOND_OF_ARC
-
-
 def millimetres(position: float) -> str:
     """Return a position in mm, with decimals where it has any."""
     return trimmed(fixed(1e3 * position, 3))
@@ -181,16 +170,3 @@ def after(seconds: float) -> str:
 def trimmed(number: str) -> str:
     """Return a number without zeros behind its decimal point."""
     return number.rstrip("0").rstrip(".") if "." in number else number
-
-
-def remarks(errors: xr.Dataset) -> list[str]:
-    """Return the method's own sentences; they are kept as a JSON list."""
-    found = errors.attrs.get("notes", [])
-    if isinstance(found, str):
-        try:
-            found = json.loads(found)
-        except ValueError:
-            found = [found]
-    if isinstance(found, str) or not isinstance(found, Sequence | np.ndarray):
-        found = [found]
-    return [str(note) for note in found if str(note).strip() and not isinstance(note, Mapping)]
