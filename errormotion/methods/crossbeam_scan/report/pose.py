@@ -26,11 +26,6 @@ PARAMETERS = {
 CONVENTION = "T · Rx(a) · Ry(b) · Rz(g)"
 
 
-def is_pose(errors: xr.Dataset) -> bool:
-    """Return whether a dataset is the pose of a profiler."""
-    return errors.attrs.get("method") == "crossbeam_scan" and "profiler_pose" in errors and "beam" in errors.dims
-
-
 def part(source: Source, _key: str) -> Part:
     """Return the chapter of one calibration, which has no figures."""
     errors = source.errors

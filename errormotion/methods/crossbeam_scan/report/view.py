@@ -16,12 +16,16 @@ from errormotion.report.text import fixed
 
 AXES = ("time", "position")
 NO_REASON = "no value, and the result states no reason"
-_ABSENT = ("missing", "no scan", "not scanned", "not recorded", "no line")
 
 
 def is_campaign(errors: xr.Dataset) -> bool:
     """Return whether a dataset is the result of a campaign of crossbeam scans, and not of a step before it."""
     return errors.attrs.get("method") == "crossbeam_scan" and set(AXES) <= set(errors["EX"].dims)
+
+
+def is_pose(errors: xr.Dataset) -> bool:
+    """Return whether a dataset is the pose of a profiler."""
+    return errors.attrs.get("method") == "crossbeam_scan" and "profiler_pose" in errors and "beam" in errors.dims
 
 
 @dataclass(frozen=True)
@@ -75,14 +79,10 @@ class Campaign:
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """Where there was no scan to register, (t, p)."""
-        holes: NDArray[np.bool_] = ~self.known
-        if "scan_time" in self.errors:
-            taken = np.isfinite(field(self.errors, "scan_time", *AXES))
-            if taken.any():
-                return np.asarray(holes & ~taken)
-        said = np.array([[any(word in text.lower() for word in _ABSENT) for text in row] for row in self.reason])
-        return np.asarray(holes & said.reshape(holes.shape))
+        """Where there was no scan to register, (t, p); nowhere if the dataset does not state scan times."""
+        if "scan_time" not in self.errors:
+            return np.zeros_like(self.known)
+        return np.asarray(~self.known & ~np.isfinite(field(self.errors, "scan_time", *AXES)))
 
     def get(self, name: str, *dims: str) -> Array:
         """Return a variable over (time, position, and these dims); all NaN where the dataset does not hold it."""
