@@ -12,13 +12,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.kinematics.poses import displacement
 from errormotion.plugins import Group, InstrumentSubject, MethodSubject
 from errormotion.twin import Event, VirtualMachine
-from errormotion.twin.profiler import Profiler
 
 #: 100 minutes at 15000 /min, one instant every 250 s: enough for the thermal drift to build up.
 TIMES = 250.0 * np.arange(24)
@@ -33,8 +30,6 @@ def builtin_subjects(
     """Return the subjects of a built-in plugin; none where the kit needs no help, or knows none."""
     if (group, plugin_id) == ("methods", "spindle_drift"):
         return spindle_drift(cls)
-    if (group, plugin_id) == ("methods", "crossbeam_scan"):
-        return crossbeam_scan(cls)
     if (group, plugin_id) == ("methods", "beam_direction"):
         return (beam_direction(cls),)
     if (group, plugin_id) == ("methods", "multilateration"):
@@ -142,36 +137,6 @@ def spindle_drift(cls: Any) -> tuple[MethodSubject, ...]:
     return drift, beams
 
 
-def crossbeam_scan(cls: Any) -> tuple[MethodSubject, ...]:
-    """Return the two procedures of ``crossbeam_scan``: scans of three artefacts, and the profiler's own pose.
-
-    The axis is Y of every frame, so the frame is turned about Y, and the pocket's not at all.
-    """
-    scans = MethodSubject(
-        cls,
-        crossbeam_scans,
-        name="scan",
-        settings={"positions": SCANNED},
-        raw_vectors={"profiler_pose": "pose", "lever": "direction"},
-        optional=("lever_uncertainty",),
-        measured=("height",),
-        motion=((0.0, 0.3, 0.0), (0.0, 0.0, 0.0)),
-        seeds=40,
-    )
-    pose = MethodSubject(
-        cls,
-        pocket_scans,
-        name="profiler_pose",
-        settings={"procedure": "profiler_pose", "profiler_pose": {"dz": NOMINAL_LIFT}},
-        raw_vectors={},
-        optional=("pocket_radius_uncertainty",),
-        measured=("height",),
-        motion=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        seeds=40,
-    )
-    return scans, pose
-
-
 def beam_direction(cls: Any) -> MethodSubject:
     """Return ``beam_direction`` on four planes of a sine gauge, with the triangulation plane as well known as it is."""
     return MethodSubject(
@@ -199,46 +164,6 @@ def beam_direction(cls: Any) -> MethodSubject:
         measured=("distance",),
         seeds=150,
     )
-
-
-#: Where the artefacts of the simulated scans stand along Y, and where the profiler hangs by its drawing, m.
-SCANNED = (-0.5, 0.0, 0.5)
-NOMINAL_LIFT = -0.17
-
-
-def crossbeam_scans(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return scans of three artefacts, cold, after half an hour and after two; and the true errors of the axis.
-
-    A quarter of the points of a real profiler, twice as far apart, on half the width; with all that is wrong with it.
-    """
-    virtual, times = VirtualMachine("gantry", seed=seed), [0.0, 1800.0, 7200.0]
-    raw = virtual.raw_crossbeam_scan(times, SCANNED, seed=seed, profiler=Profiler(800, 25e-6), profiles=400, feed=70e-6)
-    raw["lever"] = raw["lever"] + np.random.default_rng([seed, 2]).normal(0, 1e-3, 3)
-    raw["lever"].attrs["units"] = "m"
-    raw["lever_uncertainty"] = ("direction", np.full(3, 1e-3), {"units": "m"})
-    return raw, virtual.truth_crossbeam(times, SCANNED)
-
-
-def pocket_scans(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return scans of a pocket, and how the profiler truly hangs off its drawing."""
-    virtual = VirtualMachine("gantry", seed=seed)
-    nominal = RigidTransform.from_translation([0.0, 0.0, NOMINAL_LIFT])
-    true = RigidTransform.from_matrix(virtual.crossbeam.pose)
-    truth = build_errors(
-        displacement(true * nominal.inv(), nominal.translation)[None],
-        np.zeros((1, 6, 6)),
-        dims=("beam",),
-        coords={"beam": ["profiler"]},
-        component="beam",
-        machine=virtual.name,
-        frame="tool",
-        functional_point=nominal.translation,
-        reference="nominal pose of the profiler",
-        method="twin",
-        method_version="1",
-        provenance=provenance.make({}, None, None, seed=seed),
-    )
-    return virtual.raw_pocket_scan(seed=seed), truth
 
 
 def planes_of_gauge(seed: int) -> tuple[xr.Dataset, xr.Dataset]:

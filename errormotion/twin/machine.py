@@ -17,7 +17,6 @@ from errormotion.twin import frame as frames
 from errormotion.twin import rawdata, truth
 from errormotion.twin.beam_rawdata import BeamMeasurements
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
-from errormotion.twin.crossbeam_rawdata import CrossbeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.multilateration_rawdata import TrackerMeasurements
@@ -35,7 +34,7 @@ _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "prob
 _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurements, ProbeMeasurements):
+class VirtualMachine(BeamMeasurements, TrackerMeasurements, ProbeMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same

@@ -9,8 +9,11 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.methods.crossbeam_scan.report.view import campaign, remarks
+from errormotion.methods.crossbeam_scan import simulation
+from errormotion.methods.crossbeam_scan.report.figures import figures
+from errormotion.methods.crossbeam_scan.report.view import campaign
 from errormotion.report import write_report
+from errormotion.report.fields import remarks
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import swept
 
@@ -400,7 +403,7 @@ def test_the_order_of_artefacts_is_that_of_their_places(page):
 
 
 def test_the_truth_of_the_machine_keeps_its_plain_chapter(page):
-    truth = VirtualMachine("gantry", seed=3).truth_crossbeam([0.0, 600.0], PLACES)
+    truth = simulation.truth_axis(VirtualMachine("gantry", seed=3), [0.0, 600.0], PLACES)
     assert "Errors of component Y" in page(truth)
 
 
@@ -449,3 +452,22 @@ def test_zero_is_white_and_both_sides_have_the_same_depth():
     below, above, far = 1 - np.array(scale.to_rgba([-0.9, 0.9, 3.9]))[:, :3].min(axis=1)
     assert below == pytest.approx(above, abs=0.15)
     assert far > 2 * below
+
+
+def test_figures_are_the_largest_errors_with_their_expanded_uncertainty():
+    errors = campaign_dataset(holes=HOLES)
+    found = {one.name.split()[1]: one for one in figures(errors)}
+    assert list(found) == ["EXY", "EYY", "EZY", "EAY", "EBY", "ECY"]
+    k, j = np.unravel_index(np.nanargmax(np.abs(errors["EY"].values)), errors["EY"].shape)
+    assert found["EYY"].value == errors["EY"].values[k, j]
+    assert found["EYY"].expanded_uncertainty == 2 * np.sqrt(errors["covariance"].values[k, j, 1, 1])
+    assert found["EYY"].name == f"largest EYY at y = {1e3 * PLACES[j]:g} mm, {MINUTES[k]} min"
+    assert [one.unit for one in found.values()] == ["m"] * 3 + ["rad"] * 3
+
+
+def test_figures_of_a_pose_are_its_errors_and_a_plan_has_none():
+    errors = pose_dataset()
+    found = figures(errors)
+    assert [one.value for one in found] == [float(errors[name][0]) for name in ("EX", "EY", "EZ", "EA", "EB", "EC")]
+    assert [one.expanded_uncertainty for one in found] == list(2 * np.sqrt(np.diag(errors["covariance"].values[0])))
+    assert figures(errors.assign_attrs(reference="planned measurement")) == []
