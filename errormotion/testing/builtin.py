@@ -32,8 +32,6 @@ def builtin_subjects(
         return spindle_drift(cls)
     if (group, plugin_id) == ("methods", "beam_direction"):
         return (beam_direction(cls),)
-    if (group, plugin_id) == ("methods", "multilateration"):
-        return (multilateration(cls),)
     if (group, plugin_id) == ("methods", "normal_vector"):
         return (normal_vector(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
@@ -172,33 +170,6 @@ def planes_of_gauge(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     planes = [(math.radians(20.0), math.radians(rotation)) for rotation in (0.0, 90.0, 180.0, 270.0)]
     raw = virtual.raw_beam_direction(planes, seed=seed, speckle=True, inclination_error=False)
     return raw, virtual.truth_beam()
-
-
-def multilateration(cls: Any) -> MethodSubject:
-    """Return ``multilateration`` with one tracker at four places in turn, some beams broken, and 48 targets."""
-    return MethodSubject(
-        cls,
-        tracker_readings,
-        settings={"scale_uncertainty": TRACKER_SCALE, "planning": {"minimise": "mean"}},
-        raw_vectors={"target_nominal": "point", "station_nominal": "point", "reflector": "point"},
-        optional=("station_nominal", "reflector", "reading_time"),
-        measured=("displacement",),
-        seeds=100,
-        compiles=True,
-    )
-
-
-#: Relative error of the tracker's lengths, one sigma.
-TRACKER_SCALE = 0.5e-6
-
-
-def tracker_readings(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return distances of a reflector from four places, and the true errors less the motion that they do not see."""
-    virtual = VirtualMachine("cframe", seed=seed)
-    position = virtual.target_grid((4, 4, 3))
-    scale = TRACKER_SCALE * np.random.default_rng([seed, 3]).normal()
-    raw = virtual.raw_multilateration(position, seed=seed, scale=scale, missing=0.02)
-    return raw, virtual.truth_multilateration(position)
 
 
 def normal_vector(cls: Any) -> MethodSubject:

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.methods.multilateration import Multilateration
+from errormotion.methods.multilateration import Multilateration, simulation
 from errormotion.methods.multilateration.report.view import enlargement, network, thinned
 from errormotion.report import write_report
 from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw
@@ -33,7 +33,7 @@ HEADINGS = [
 def measured():
     """A real result with its raw data: some readings missing, one wrong by 0.32 mm."""
     machine = VirtualMachine("cframe", seed=3)
-    raw = machine.raw_multilateration(machine.target_grid((4, 4, 3)), seed=1, missing=0.02)
+    raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, missing=0.02)
     raw["displacement"][1, 20] += WRONG
     return Multilateration().identify(raw), raw
 
@@ -284,7 +284,7 @@ def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
 
 def test_repeatability_of_the_machine_is_a_line_of_the_budget(tmp_path):
     machine = VirtualMachine("cframe", seed=3)
-    raw = machine.raw_multilateration(machine.target_grid((4, 4, 3)), seed=1, repeatability=2 * UM)
+    raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, repeatability=2 * UM)
     errors = Multilateration().identify(raw, Multilateration.Settings(repeatability="2 um", parametric=False))
     html = page(errors, tmp_path)
     table = html[html.index("Uncertainty budget") :]
