@@ -7,14 +7,14 @@ import pytest
 import xarray as xr
 
 from errormotion.cli.summary import notes_of
-from errormotion.methods.beam_direction import BeamDirection, Settings
+from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
 from errormotion.twin import VirtualMachine
 
 
 @pytest.fixture(scope="module")
 def beam() -> xr.Dataset:
     planes = [(np.radians(20.0), np.radians(b)) for b in (0, 90, 180, 270)]
-    raw = VirtualMachine("cframe", seed=3).raw_beam_direction(planes, seed=3, inclination_error=False)
+    raw = simulation.raw(VirtualMachine("cframe", seed=3), planes, seed=3, inclination_error=False)
     return BeamDirection().identify(raw)
 
 
