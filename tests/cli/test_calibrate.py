@@ -36,7 +36,7 @@ def test_readings_become_a_calibration_that_is_found_by_its_name(run, data, tmp_
     assert "note: Holes between the settings" in shown
     known = InclinationCalibration.find("left")
     assert known.supported([0.1, 0.0])
-    assert "good" in run("validate", "calibrations/left.nc").stdout
+    assert "valid" in run("validate", "calibrations/left.nc").stdout
 
 
 def test_a_program_gets_the_figures(answer, data):

@@ -288,7 +288,7 @@ def test_a_cold_sensor_warms_up() -> None:
 def test_a_plane_fitted_through_compensated_readings_is_the_face(machine: VirtualMachine) -> None:
     """All in one: who knows beam and slope finds the face as it stands."""
     sensor, face = machine.point_sensor, machine.sine_gauge.face(20 * DEG, 0.0)
-    places = machine.strokes(20 * DEG, 0.0)
+    places = simulation.strokes(machine, 20 * DEG, 0.0)
     reading = machine.point_readings(np.zeros(len(places)), places, face)
     k = float(sensor.slope(tilt(sensor.true_direction, sensor.triangulation_normal, face.normal)))
     spots = places + sensor.true_origin + (reading / (1 + k))[:, None] * sensor.true_direction

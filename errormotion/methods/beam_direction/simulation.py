@@ -93,7 +93,7 @@ def truth_beam(machine: VirtualMachine, sensor: PointSensor | None = None, beam:
     return ds.assign(extras).assign_coords(direction=list("xyz"))
 
 
-def _strokes(
+def strokes(
     machine: VirtualMachine,
     inclination: float,
     rotation: float,
@@ -159,7 +159,7 @@ def raw(
     """
     sensor = sensor or machine.point_sensor
     if stage is None:
-        each = [_strokes(machine, *plane, sensor=sensor, count=count, half_length=half_length) for plane in planes]
+        each = [strokes(machine, *plane, sensor=sensor, count=count, half_length=half_length) for plane in planes]
         positions = np.array(each)
     else:
         given = np.asarray(stage, dtype=float)

@@ -163,10 +163,10 @@ def test_the_inclination_error_on_a_bar_is_tens_of_micrometres(machine: VirtualM
 
 
 def test_a_stroke_beyond_the_bar_or_a_beam_along_it_is_refused(machine: VirtualMachine) -> None:
-    with pytest.raises(BenchError, match="within its radius of 25 mm; found 26 mm"):
+    with pytest.raises(BenchError, match="shorter than the radius of the bar, 25 mm; found 26 mm"):
         simulation.raw_check_bar(machine, seed=1, half_width=26e-3)
     along = seeded_point_sensor(np.random.default_rng(0), lean=np.pi / 2, azimuth=np.pi / 2)
-    with pytest.raises(BenchError, match="looks along the bar"):
+    with pytest.raises(BenchError, match="parallel to the bar"):
         simulation.raw_check_bar(machine, seed=1, sensor=along)
 
 
