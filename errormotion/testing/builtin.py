@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import math
 import shutil
 import tempfile
 from functools import cache
@@ -13,25 +12,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets import build_errors, provenance
 from errormotion.plugins import Group, InstrumentSubject, MethodSubject
 from errormotion.twin import Event, VirtualMachine
-
-#: 100 minutes at 15000 /min, one instant every 250 s: enough for the thermal drift to build up.
-TIMES = 250.0 * np.arange(24)
-SCHEDULE = (Event(0.0, 15000.0, None),)
-#: Beam calibration in the simulated drift data: 0.5 um and 0.4 mrad, as a beam detection attains them.
-BEAM_SIGMA = np.array([0.5e-6] * 3 + [0.4e-3] * 3)
 
 
 def builtin_subjects(
     group: Group, plugin_id: str, cls: Any
 ) -> tuple[MethodSubject, ...] | tuple[InstrumentSubject, ...]:
     """Return the subjects of a built-in plugin; none where the kit needs no help, or knows none."""
-    if (group, plugin_id) == ("methods", "spindle_drift"):
-        return spindle_drift(cls)
-    if (group, plugin_id) == ("methods", "beam_direction"):
-        return (beam_direction(cls),)
     if (group, plugin_id) == ("methods", "normal_vector"):
         return (normal_vector(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
@@ -93,83 +81,6 @@ def scan_file() -> Path:
     return folder / "scan.nc"
 
 
-def spindle_drift(cls: Any) -> tuple[MethodSubject, ...]:
-    """Return the two procedures of ``spindle_drift``: the drift itself, and the detection of its beams.
-
-    Its levels are heights on z, and a beam along an axis has no rotation about itself: both procedures are tried in
-    frames turned about z, the beams by a quarter turn. The numbers of seeds keep the whole kit under a minute.
-    """
-    drift = MethodSubject(
-        cls,
-        drift_record,
-        name="drift",
-        settings={"functional_point": (0.0, 0.0, 0.0)},
-        setting_vectors={"functional_point": "point"},
-        raw_vectors={
-            "beam_origin": "point",
-            "beam_direction": "direction",
-            "beam_covariance": "covariance",
-            "level": "z",
-        },
-        optional=("beam_covariance", "temperature", "spindle_speed"),
-        measured=("distance",),
-        motion=((0.0, 0.0, 0.5), (0.1, -0.2, 0.05)),
-        seeds=120,
-    )
-    beams = MethodSubject(
-        cls,
-        beam_detection,
-        name="beam_detection",
-        settings={"procedure": "beam_detection"},
-        raw_vectors={
-            "sphere_centre": "point",
-            "scan_direction": "direction",
-            "nominal_origin": "point",
-            "nominal_direction": "direction",
-        },
-        optional=("distance_noise",),
-        measured=("distance",),
-        motion=((0.0, 0.0, math.pi / 2), (0.1, -0.2, 0.05)),
-        seeds=60,
-    )
-    return drift, beams
-
-
-def beam_direction(cls: Any) -> MethodSubject:
-    """Return ``beam_direction`` on four planes of a sine gauge, with the triangulation plane as well known as it is."""
-    return MethodSubject(
-        cls,
-        planes_of_gauge,
-        settings={
-            "layout": {
-                "nominal_direction": (np.sin(np.radians(20)), 0.0, -np.cos(np.radians(20))),
-                "nominal_origin": (0.05, 0.0, -0.08),
-                "pivot": (0.1, 0.05, 0.12),
-            }
-        },
-        raw_vectors={
-            "stage": "direction",
-            "nominal_direction": "direction",
-            "nominal_origin": "point",
-            "nominal_normal": "direction",
-            "triangulation_normal": "direction",
-            "plane_point": "point",
-        },
-        optional=(
-            *("nominal_origin", "nominal_normal", "triangulation_normal", "mid_range", "reading_range"),
-            *("speckle", "plane_point", "plane_point_uncertainty"),
-        ),
-        measured=("distance",),
-        seeds=150,
-    )
-
-
-def planes_of_gauge(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return readings with speckle on four planes of a sine gauge, and how the beam truly lies off its drawing."""
-    virtual = VirtualMachine("cframe", seed=seed)
-    planes = [(math.radians(20.0), math.radians(rotation)) for rotation in (0.0, 90.0, 180.0, 270.0)]
-    raw = virtual.raw_beam_direction(planes, seed=seed, speckle=True, inclination_error=False)
-    return raw, virtual.truth_beam()
 
 
 def normal_vector(cls: Any) -> MethodSubject:
@@ -211,51 +122,3 @@ def touched_balls(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         if truth[name].dims == ("time",):
             truth[name] = (truth[name] - truth[name][0]).assign_attrs(truth[name].attrs)
     return raw, truth
-
-
-@cache
-def machine(seed: int) -> VirtualMachine:
-    """Return a virtual machine that has run through the schedule."""
-    virtual = VirtualMachine("cframe", seed=seed)
-    virtual.start(SCHEDULE)
-    return virtual
-
-
-def drift_record(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return a drift record, its beams known as well as a calibration knows them, and the spindle's true drift."""
-    virtual = machine(seed)
-    rng = np.random.default_rng([seed, 1])
-    origin = virtual.frame.true_origin + BEAM_SIGMA[:3] * rng.normal(size=(5, 3))
-    direction = virtual.frame.true_direction.copy()
-    covariance = np.zeros((5, 6, 6))
-    for i, u in enumerate(virtual.frame.true_direction):
-        across = np.eye(3) - np.outer(u, u)
-        direction[i] += across @ (BEAM_SIGMA[3:] * rng.normal(size=3))
-        covariance[i, :3, :3] = np.diag(BEAM_SIGMA[:3] ** 2)
-        covariance[i, 3:, 3:] = across * BEAM_SIGMA[3] ** 2
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    beams = (origin, direction, covariance)
-    raw = virtual.raw_spindle_drift(TIMES, seed=seed, beams=beams, warm_up=False, radius_error=False)
-    return raw, virtual.truth_spindle(TIMES)
-
-
-def beam_detection(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the readings of a stepped sphere, and the true beams relative to the nominal ones."""
-    virtual = machine(seed)
-    frame = virtual.frame
-    turn = np.cross(frame.nominal_direction, frame.true_direction)  # the sine; the angle to 1e-5 at 5 mrad
-    truth = build_errors(
-        np.concatenate([frame.true_origin - frame.nominal_origin, turn], axis=1),
-        np.zeros((5, 6, 6)),
-        dims=("beam",),
-        coords={"beam": list(frame.channels)},
-        component="beam",
-        machine=virtual.name,
-        frame="machine",
-        functional_point=frame.nominal_origin.mean(axis=0),
-        reference="nominal beams, each at its own nominal zero point",
-        method="twin",
-        method_version="1",
-        provenance=provenance.make({}, None, None, seed=seed),
-    )
-    return virtual.raw_beam_detection(seed=seed), truth

@@ -15,6 +15,7 @@ from errormotion.campaign import batch, runner
 from errormotion.campaign.batch import Outcome, identify_runs
 from errormotion.campaign.files import CampaignPlan
 from errormotion.errors import PluginError, RunError
+from errormotion.methods.spindle_drift import simulation
 from errormotion.plugins import PluginSettings
 from errormotion.twin import Event, VirtualMachine
 
@@ -34,7 +35,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
     t = np.arange(0.25, 60.0, 0.5)
-    good = [datasets.save(machine.raw_spindle_drift(t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
+    good = [datasets.save(simulation.raw_drift(machine, t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
     cut = folder / "cut.nc"
     cut.write_bytes(good[0].read_bytes()[:5000])
     return [*good[:2], cut, *good[2:]]

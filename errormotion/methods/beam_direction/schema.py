@@ -2,6 +2,9 @@
 
 from errormotion.datasets.schemas import DIRECTION, NOISE, POSITION, RADIUS, READING, UNIT_VECTOR, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.beam_direction/1"
+INCLINATION_SCHEMA = "errormotion.raw.inclination/1"
+
 _POINT_SENSOR = (
     Row(
         "triangulation_normal",
@@ -35,7 +38,7 @@ _POINT_SENSOR = (
 
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.beam_direction/1",
+        SCHEMA,
         "planes",
         "stage",
         (
@@ -78,7 +81,7 @@ RAW_SCHEMAS = (
         labels=XYZ,
     ),
     RawSchema(
-        "errormotion.raw.beam_direction/1",
+        SCHEMA,
         "check bar alone",
         "bar_distance",
         (
@@ -95,7 +98,7 @@ RAW_SCHEMAS = (
         labels=XYZ,
     ),
     RawSchema(
-        "errormotion.raw.inclination/1",
+        INCLINATION_SCHEMA,
         "",
         "group",
         (

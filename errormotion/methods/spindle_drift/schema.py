@@ -13,6 +13,9 @@ from errormotion.datasets.schemas import (
     Row,
 )
 
+SCHEMA = "errormotion.raw.spindle_drift/1"
+"""Id of all raw schemas of the method."""
+
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 """Channels of the five-sensor frame."""
 
@@ -38,7 +41,7 @@ _STEPPED_SPHERE = (
 
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "drift",
         "time",
         (
@@ -85,7 +88,7 @@ RAW_SCHEMAS = (
         labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
     ),
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "beam detection as recorded",
         "scan",
         (
@@ -100,7 +103,7 @@ RAW_SCHEMAS = (
         labels={**XYZ, "channel": CHANNELS},
     ),
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "beam detection",
         "step",
         (

@@ -30,7 +30,6 @@ from errormotion.methods.beam_direction.identification.slopes import UNKNOWNS, P
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
-from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
 from errormotion.twin import Event, VirtualMachine
 
 SEEN = slice(0, 5)  # EC is not seen
@@ -27,7 +27,7 @@ def method():
 
 def detected(machine, method, seed):
     """Return beams as a detection finds them: origin, direction, covariance."""
-    beams = method.identify(machine.raw_beam_detection(seed=seed))
+    beams = method.identify(simulation.raw_beam_detection(machine, seed=seed))
     return beams["beam_origin"].values, beams["beam_direction"].values, beams["beam_covariance"].values
 
 
@@ -41,7 +41,7 @@ def truth_of(machine, errors):
 def test_stated_intervals_hold_the_truth_and_the_joint_covariance_is_right(machine, method):
     seeds, inside, joint, slopes = 60, [], [], []
     for seed in range(seeds):
-        raw = machine.raw_spindle_drift(TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
+        raw = simulation.raw_drift(machine, TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
         errors = method.identify(raw, Settings(compensate_frame=False))
         miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
         covariance = errors["covariance"].values[:, SEEN, SEEN]
@@ -61,7 +61,7 @@ def test_stated_intervals_hold_the_truth_and_the_joint_covariance_is_right(machi
 
 
 def test_noise_free_readings_give_the_truth_to_a_tenth_of_a_nanometre(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0, radius_error=False)
+    raw = simulation.raw_drift(machine, TIMES, seed=0, radius_error=False)
     raw["distance"] = (("channel", "time"), machine.still_readings(TIMES, expansion=False, warm_up=False))
     errors = method.identify(raw, Settings(compensate_frame=False))
     miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
@@ -70,7 +70,7 @@ def test_noise_free_readings_give_the_truth_to_a_tenth_of_a_nanometre(machine, m
 
 
 def test_nominal_beams_are_worse_and_say_so(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=1, beams=detected(machine, method, 1))
+    raw = simulation.raw_drift(machine, TIMES, seed=1, beams=detected(machine, method, 1))
     frame = machine.frame
     raw["nominal_origin"] = (("channel", "direction"), frame.nominal_origin)
     raw["nominal_direction"] = (("channel", "direction"), frame.nominal_direction)
@@ -83,14 +83,14 @@ def test_nominal_beams_are_worse_and_say_so(machine, method):
 
 
 def test_ec_is_not_seen_and_never_zero(machine, method):
-    errors = method.identify(machine.raw_spindle_drift(TIMES, seed=0))
+    errors = method.identify(simulation.raw_drift(machine, TIMES, seed=0))
     assert np.isnan(errors["EC"]).all()
     assert np.isnan(errors["covariance"].sel(dof="EC")).all()
     validate(errors)
 
 
 def test_the_functional_point_may_be_chosen_and_only_moves_the_errors(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     at_end = method.identify(raw)
     higher = method.identify(raw, Settings(functional_point=(0.0, 0.0, 0.08)))
     moved = at_end.em.at([0.0, 0.0, 0.08])
@@ -99,14 +99,14 @@ def test_the_functional_point_may_be_chosen_and_only_moves_the_errors(machine, m
 
 
 def test_the_record_stays_as_it_was(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     copy = raw.copy(deep=True)
     method.identify(raw)
     xr.testing.assert_identical(raw, copy)
 
 
 def test_order_of_channels_and_dims_and_float32_do_not_matter(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     other = raw.isel(channel=[4, 2, 0, 3, 1]).transpose("time", ...)
     a, b = method.identify(raw), method.identify(other)
     np.testing.assert_allclose(a["EZ"], b["EZ"], rtol=0, atol=1e-15)
@@ -118,7 +118,7 @@ def test_order_of_channels_and_dims_and_float32_do_not_matter(machine, method):
 
 def test_means_of_a_fast_record_are_those_of_the_slow_one(machine, method):
     """2 s at 2 kHz, averaged here, against the same readings averaged beforehand."""
-    raw = machine.raw_spindle_drift(np.arange(0, 2, 1 / 2000), seed=5, averaged=1)
+    raw = simulation.raw_drift(machine, np.arange(0, 2, 1 / 2000), seed=5, averaged=1)
     raw = raw.drop_vars(["temperature", "spindle_speed", "sensor"])
     slow = raw.isel(time=slice(0, None, 1000)).copy(deep=True)
     slow["distance"] = (("channel", "time"), raw["distance"].values.reshape(5, 4, 1000).mean(axis=2))
@@ -130,7 +130,7 @@ def test_means_of_a_fast_record_are_those_of_the_slow_one(machine, method):
 
 def test_more_noise_than_stated_is_noticed_and_raises_the_uncertainty(machine, method):
     t = np.arange(0, 200, 0.5)
-    raw = machine.raw_spindle_drift(t, seed=6)
+    raw = simulation.raw_drift(machine, t, seed=6)
     noisy = raw.copy(deep=True)
     noisy["distance_noise"] = raw["distance_noise"] / 3
     auto, stated = method.identify(noisy), method.identify(noisy, Settings(noise="stated"))
@@ -144,7 +144,7 @@ def test_more_noise_than_stated_is_noticed_and_raises_the_uncertainty(machine, m
 
 def test_a_sensor_out_of_range_for_ten_minutes_loses_only_these(machine, method):
     t = np.arange(0, 3600.0, 10.0)
-    raw = machine.raw_spindle_drift(t, seed=7)
+    raw = simulation.raw_drift(machine, t, seed=7)
     gap = (t >= 1200) & (t < 1800)
     cut = raw.copy(deep=True)
     cut["distance"][1, gap] = np.nan
@@ -157,7 +157,7 @@ def test_a_sensor_out_of_range_for_ten_minutes_loses_only_these(machine, method)
 
 def test_the_frames_expansion_is_taken_out_by_its_temperature(machine, method):
     t = np.arange(0, 6000.0, 10.0)
-    raw = machine.raw_spindle_drift(t, seed=8, expansion=True)
+    raw = simulation.raw_drift(machine, t, seed=8, expansion=True)
     raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
     truth = np.asarray(machine.truth_spindle(t, [0, 0, 0]).em.twist())
     truth = truth - truth[0]
@@ -174,7 +174,7 @@ def test_a_record_that_begins_with_the_spindles_start_has_its_reference_after_it
     machine = VirtualMachine("cframe", seed=4)
     machine.start([Event(0.0, 15000.0)])
     rate = 2500.0
-    raw = machine.raw_spindle_drift(np.arange(0, 4, 1 / rate), seed=0, averaged=1)
+    raw = simulation.raw_drift(machine, np.arange(0, 4, 1 / rate), seed=0, averaged=1)
     raw["distance"] = (("channel", "time"), machine.distances(0, raw.sizes["time"], rate))
     raw["spindle_speed"] = ("time", np.full(raw.sizes["time"], 15000.0))
     errors = method.identify(raw)
@@ -192,7 +192,7 @@ def test_a_record_that_begins_with_the_spindles_start_has_its_reference_after_it
 
 
 def spoilt(machine, name):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     if name == "missing channel":
         return raw.isel(channel=[0, 1, 2, 4])
     if name == "bar radius in mm":
@@ -239,7 +239,7 @@ def test_plan_predicts_what_the_twin_shows(machine, method):
     plan = method.plan()
     validate(plan)
     predicted = np.sqrt(np.diagonal(plan["covariance"].values[-1]))[SEEN]
-    raw = machine.raw_spindle_drift(TIMES, seed=0, beams=detected(machine, method, 0))
+    raw = simulation.raw_drift(machine, TIMES, seed=0, beams=detected(machine, method, 0))
     stated = np.sqrt(np.diagonal(method.identify(raw)["covariance"].values[-1]))[SEEN]
     # The twin's frame is misaligned and its drift another one than the plan's: the same within a tenth.
     np.testing.assert_allclose(predicted, stated, rtol=0.1)
@@ -250,7 +250,7 @@ def test_plan_predicts_what_the_twin_shows(machine, method):
 
 def test_the_live_view_ends_where_the_identification_does(machine, method):
     t = np.arange(0, 600.0, 0.5)
-    raw = machine.raw_spindle_drift(t, seed=9)
+    raw = simulation.raw_drift(machine, t, seed=9)
     follow = method.follow(Settings(spin_up=0.0))
     for begin in range(0, t.size, 70):
         text = follow(raw.isel(time=slice(begin, begin + 70)))
@@ -266,7 +266,7 @@ def test_stopping_leaves_the_run_out_in_the_readings_and_the_uncertainty_says_so
     machine.start([Event(0.0, 15000.0), Event(8.0, 0.0)])
     rate, seconds = 2500.0, 16
     n = int(rate * seconds)
-    raw = machine.raw_spindle_drift(np.arange(n) / rate, seed=0, averaged=1)
+    raw = simulation.raw_drift(machine, np.arange(n) / rate, seed=0, averaged=1)
     raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
     raw["spindle_speed"] = ("time", np.where(np.arange(n) / rate < 8.0, 15000.0, 0.0))
     errors = method.identify(raw, Settings(compensate_frame=False))
@@ -293,7 +293,7 @@ def test_each_rest_is_a_draw_of_its_own_and_a_resting_reference_is_in_everything
     rate, seconds = 2500.0, 18
     n = int(rate * seconds)
     clock = np.arange(n) / rate
-    raw = machine.raw_spindle_drift(clock, seed=0, averaged=1)
+    raw = simulation.raw_drift(machine, clock, seed=0, averaged=1)
     raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
     raw["spindle_speed"] = ("time", np.where((clock < 6.0) | (clock >= 12.0), 0.0, -15000.0))
     errors = method.identify(raw, Settings(compensate_frame=False))
@@ -313,7 +313,7 @@ def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, met
     late, later = (t > 600) & (t <= 630), (t > 1500) & (t <= 1530)
     weights = later / later.sum() - late / late.sum()
     found, stated = [], []
-    raw = machine.raw_spindle_drift(t, seed=0, expansion=True)
+    raw = simulation.raw_drift(machine, t, seed=0, expansion=True)
     raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
     warm = raw["temperature"].sel(sensor="frame").values.copy()
     column = list(raw["sensor"].values).index("frame")
@@ -331,7 +331,7 @@ def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, met
 
 
 def test_beams_given_from_the_bar_to_the_sensor_are_refused(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     raw["beam_direction"] = -raw["beam_direction"]
     with pytest.raises(MethodError, match="the other way round"):
         method.identify(raw)
@@ -339,7 +339,7 @@ def test_beams_given_from_the_bar_to_the_sensor_are_refused(machine, method):
 
 @pytest.mark.parametrize("channel", [0, 3, 4])
 def test_one_reversed_beam_is_noticed(machine, method, channel):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     # Reversed about the point that it sees, so that all five still meet the bar.
     seen = raw["beam_origin"].values[channel] + raw["beam_direction"].values[channel] * 1e-3
     raw["beam_direction"][channel] *= -1.0
@@ -349,20 +349,20 @@ def test_one_reversed_beam_is_noticed(machine, method, channel):
 
 
 def test_levels_that_are_one_are_refused(machine, method):
-    raw = machine.raw_spindle_drift(TIMES, seed=0)
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
     raw["level"] = ("height", [0.01, 0.01])
     with pytest.raises(MethodError, match="expected two heights"):
         method.identify(raw)
 
 
 def test_a_record_of_one_mean_is_no_drift(machine, method):
-    raw = machine.raw_spindle_drift(np.arange(0, 2, 1 / 500), seed=0)
+    raw = simulation.raw_drift(machine, np.arange(0, 2, 1 / 500), seed=0)
     with pytest.raises(MethodError, match=r"gives 1 mean of 1\.5 s"):
         method.identify(raw, Settings(average=1.5))
 
 
 def test_a_stated_noise_of_zero_is_not_believed(machine, method):
-    raw = machine.raw_spindle_drift(np.arange(0, 200, 0.5), seed=6)
+    raw = simulation.raw_drift(machine, np.arange(0, 200, 0.5), seed=6)
     honest = method.identify(raw)
     raw["distance_noise"] = 0.0
     doubted = method.identify(raw)

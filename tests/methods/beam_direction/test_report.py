@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import DOF, build_errors, provenance
+from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.method import BeamDirection
 from errormotion.methods.beam_direction.settings import Settings
@@ -24,7 +25,8 @@ NOISE = 0.4e-6
 @cache
 def calibration():
     """A calibration with nothing between the rotations 10 and 90 degrees, and one setting that contradicts it."""
-    raw = VirtualMachine("cframe", seed=3).raw_inclination(
+    raw = simulation.raw_inclination(
+        VirtualMachine("cframe", seed=3),
         DEGREE * np.arange(-45, 46, 7.5),
         DEGREE * np.array([0, 5, 10, 90, 170, 175]),
         1e-3 * np.arange(-10, 11, 4),
@@ -421,7 +423,7 @@ def measured():
     """Four faces of a virtual sine gauge and a check bar, with a reading off its plane and one out of range."""
     machine = VirtualMachine("cframe", seed=3)
     faces = [(20 * DEGREE, angle * DEGREE) for angle in (0, 90, 180, 270)]
-    raw = machine.raw_beam_direction(faces, seed=1, check_bar=True, count=12)
+    raw = simulation.raw(machine, faces, seed=1, check_bar=True, count=12)
     raw["distance"][0, 4] += 40e-6
     raw["distance"][2, 0] = 10.2e-3
     return raw

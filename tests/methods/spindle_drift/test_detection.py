@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import load, save, validate
-from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
 from errormotion.methods.spindle_drift.acquisition.beams import last_attempts
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.twin import StepProgram, VirtualMachine
@@ -30,7 +30,7 @@ def method():
 def recorded(machine, method):
     """Return a detection as the runner stores it: every scan as a record, one after the other."""
     frame = machine.frame
-    whole = machine.raw_beam_detection(seed=0)
+    whole = simulation.raw_beam_detection(machine, seed=0)
     length = round(scan_seconds(SETTINGS.steps, SETTINGS.dwell) * RATE)
     offsets = np.linspace(-1e-3, 1e-3, SETTINGS.steps)
     scans = whole["scan_direction"].values
@@ -71,7 +71,7 @@ def misses(machine, beams):
 
 
 def test_beams_are_found_within_their_uncertainty_from_step_means(machine, method):
-    beams = method.identify(machine.raw_beam_detection(seed=1))
+    beams = method.identify(simulation.raw_beam_detection(machine, seed=1))
     validate(beams)
     assert np.abs(misses(machine, beams)).max() < 4.0  # of 30 values
     assert beams.attrs["component"] == "beam"
@@ -118,7 +118,7 @@ def test_correlation_of_shift_and_rotation_has_its_sign(machine, method):
     """Joint misses of all five freedoms: a wrong sign of a covariance shows in no single interval."""
     seeds, scores = 40, []
     for seed in range(seeds):
-        beams = method.identify(machine.raw_beam_detection(seed=seed))
+        beams = method.identify(simulation.raw_beam_detection(machine, seed=seed))
         turn = np.cross(machine.frame.nominal_direction, machine.frame.true_direction)
         truth = np.concatenate([machine.frame.true_origin - machine.frame.nominal_origin, turn], axis=1)
         twist = np.asarray(beams.em.twist())
@@ -133,7 +133,7 @@ def test_correlation_of_shift_and_rotation_has_its_sign(machine, method):
 def test_the_plan_predicts_the_uncertainty_of_the_detection(machine, method):
     plan = method.plan(Settings(procedure="beam_detection"))
     validate(plan)
-    beams = method.identify(machine.raw_beam_detection(seed=2))
+    beams = method.identify(simulation.raw_beam_detection(machine, seed=2))
     planned, found = (np.sqrt(np.diagonal(d["covariance"].values, axis1=1, axis2=2)) for d in (plan, beams))
     np.testing.assert_array_equal(np.isnan(planned), np.isnan(found))
     # 0.58 um a step on the twin (speckle and repeatability), 0.6 um in the plan; the beams stand otherwise.

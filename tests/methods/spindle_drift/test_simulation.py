@@ -6,15 +6,37 @@ from scipy.optimize import least_squares
 
 from errormotion.datasets import validate
 from errormotion.errors import BenchError
-from errormotion.twin import VirtualMachine, intersections
+from errormotion.methods.spindle_drift import simulation
+from errormotion.twin import Event, VirtualMachine, intersections
 from errormotion.twin.sensing import REPEATABILITY, SPECKLE
 
 T = np.linspace(1.0, 6240.0, 50)
+MINUTE = 60.0
+
+
+@pytest.fixture(scope="module")
+def machine() -> VirtualMachine:
+    """A cold machine at rest."""
+    return VirtualMachine("cframe", seed=3)
+
+
+@pytest.fixture(scope="module")
+def warming() -> VirtualMachine:
+    """15000 1/min; compensation of Z off after 101 min and of Y after 102 min."""
+    machine = VirtualMachine("cframe", seed=3)
+    machine.start(
+        [
+            Event(0, spindle_speed=15000),
+            Event(101 * MINUTE, compensation={"Z": False}),
+            Event(102 * MINUTE, compensation={"Y": False}),
+        ]
+    )
+    return machine
 
 
 @pytest.mark.parametrize("beams", ["true", "nominal"])
 def test_drift_is_a_valid_raw_dataset(warming, beams):
-    raw = warming.raw_spindle_drift(T, beams=beams, seed=1)
+    raw = simulation.raw_drift(warming, T, beams=beams, seed=1)
     validate(raw)
     assert not np.isnan(raw.distance).any()
     stated = getattr(warming.frame, f"{beams}_origin")
@@ -24,18 +46,18 @@ def test_drift_is_a_valid_raw_dataset(warming, beams):
 def test_beams_can_be_given_with_their_covariance(warming):
     covariance = np.tile(np.diag([1e-12] * 3 + [1e-8] * 3), (5, 1, 1))
     given = (warming.frame.nominal_origin, warming.frame.nominal_direction, covariance)
-    raw = warming.raw_spindle_drift(T, beams=given, seed=1)
+    raw = simulation.raw_drift(warming, T, beams=given, seed=1)
     validate(raw)
     assert np.array_equal(raw.beam_covariance, covariance)
 
 
 def test_unknown_beams_are_refused_in_words(warming):
     with pytest.raises(BenchError, match="'nominal'"):
-        warming.raw_spindle_drift(T, beams="drawn", seed=1)
+        simulation.raw_drift(warming, T, beams="drawn", seed=1)
 
 
 def test_beam_detection_is_a_valid_raw_dataset(machine):
-    raw = machine.raw_beam_detection(seed=1)
+    raw = simulation.raw_beam_detection(machine, seed=1)
     validate(raw)
     assert dict(raw.sizes) == {"channel": 5, "profile": 6, "step": 101, "direction": 3}
 
@@ -43,7 +65,7 @@ def test_beam_detection_is_a_valid_raw_dataset(machine):
 @pytest.mark.parametrize("averaged", [1, 100, 10000])
 def test_drift_noise_is_exactly_the_stated_one(warming, averaged):
     still = warming.still_readings(T, expansion=False)
-    raws = [warming.raw_spindle_drift(T, averaged=averaged, seed=s) for s in range(20)]
+    raws = [simulation.raw_drift(warming, T, averaged=averaged, seed=s) for s in range(20)]
     noise = np.array([raw.distance.values - still for raw in raws])
     stated = float(raws[0].distance_noise)
     assert stated == pytest.approx(0.3e-6 / np.sqrt(averaged))
@@ -52,7 +74,7 @@ def test_drift_noise_is_exactly_the_stated_one(warming, averaged):
 
 
 def test_beam_detection_noise_is_the_stated_one(machine):
-    raws = [machine.raw_beam_detection(seed=s) for s in range(5)]
+    raws = [simulation.raw_beam_detection(machine, seed=s) for s in range(5)]
     frame = machine.frame
     ideal = intersections.to_sphere(
         frame.true_origin[:, None, None, :],
@@ -68,27 +90,27 @@ def test_beam_detection_noise_is_the_stated_one(machine):
 
 
 def test_noise_seed_changes_the_noise_and_nothing_else(warming):
-    one, same, other = (warming.raw_spindle_drift(T, seed=s) for s in (1, 1, 2))
+    one, same, other = (simulation.raw_drift(warming, T, seed=s) for s in (1, 1, 2))
     assert one.identical(same)
     assert not np.array_equal(one.distance, other.distance)
     assert one.drop_vars("distance").identical(other.drop_vars("distance"))
-    assert warming.raw_beam_detection(seed=1).identical(warming.raw_beam_detection(seed=1))
+    assert simulation.raw_beam_detection(warming, seed=1).identical(simulation.raw_beam_detection(warming, seed=1))
 
 
 def test_systematic_effects_can_be_switched(warming):
-    plain = warming.raw_spindle_drift(T, seed=1, radius_error=False)
+    plain = simulation.raw_drift(warming, T, seed=1, radius_error=False)
     assert float(plain.bar_radius) == warming.bar.radius
-    assert float(warming.raw_spindle_drift(T, seed=1).bar_radius) == warming.bar_radius
-    expanding = warming.raw_spindle_drift(T, seed=1, expansion=True).distance - plain.distance
+    assert float(simulation.raw_drift(warming, T, seed=1).bar_radius) == warming.bar_radius
+    expanding = simulation.raw_drift(warming, T, seed=1, expansion=True).distance - plain.distance
     assert float(expanding[0, -1]) > 1e-6
     cold = VirtualMachine("cframe", 3, warm=False)
-    assert np.ptp(cold.raw_spindle_drift(T, seed=1).distance.values[0]) > 9e-6
-    assert np.ptp(cold.raw_spindle_drift(T, seed=1, warm_up=False).distance.values[0]) < 3e-6
+    assert np.ptp(simulation.raw_drift(cold, T, seed=1).distance.values[0]) > 9e-6
+    assert np.ptp(simulation.raw_drift(cold, T, seed=1, warm_up=False).distance.values[0]) < 3e-6
 
 
 def test_readings_and_truth_belong_together(warming):
     # A bar fitted to the five readings, sample by sample, lies where the true twist says.
-    raw = warming.raw_spindle_drift(T[[0, 20, 49]], averaged=10**12, seed=1, radius_error=False, warm_up=False)
+    raw = simulation.raw_drift(warming, T[[0, 20, 49]], averaged=10**12, seed=1, radius_error=False, warm_up=False)
     u, low, high = raw.beam_direction.values, *raw.level.values
     hits = raw.beam_origin.values[:, None] + raw.distance.values[..., None] * u[:, None]
     point, axis = warming.spindle_axis(raw.time)
