@@ -39,8 +39,6 @@ def builtin_subjects(
         return (beam_direction(cls),)
     if (group, plugin_id) == ("methods", "multilateration"):
         return (multilateration(cls),)
-    if (group, plugin_id) == ("methods", "normal_vector"):
-        return (normal_vector(cls),)
     if (group, plugin_id) == ("instruments", "profile_files"):
         return (InstrumentSubject(cls, str(scan_file())),)
     if (group, plugin_id) == ("instruments", "mtconnect"):
@@ -274,47 +272,6 @@ def tracker_readings(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     scale = TRACKER_SCALE * np.random.default_rng([seed, 3]).normal()
     raw = virtual.raw_multilateration(position, seed=seed, scale=scale, missing=0.02)
     return raw, virtual.truth_multilateration(position)
-
-
-def normal_vector(cls: Any) -> MethodSubject:
-    """Return ``normal_vector`` on a machine whose table moves in X and Y, so that the frame is turned about Z alone.
-
-    A gantry shows all six freedoms, but single precision at 4 m is as coarse as its touches.
-    """
-    balls = tuple({"centre": place} for place in ((-0.24, -0.2, 0.06), (0.24, -0.19, 0.23), (0.23, 0.2, 0.09)))
-    return MethodSubject(
-        cls,
-        touched_balls,
-        settings={"tool_axes": "Z", "functional_point": PROBED, "balls": balls},
-        setting_vectors={"functional_point": "point"},
-        raw_vectors={"touch": "point", "approach": "direction", "ball_nominal": "point"},
-        optional=(
-            *("touch_time", "touch_flag", "approach", "ball_radius", "ball_nominal", "touch_noise"),
-            *("temperature", "spindle_speed", "feed"),
-        ),
-        measured=("touch",),
-        motion=((0.0, 0.0, 0.5), (0.1, -0.2, 0.05)),
-        seeds=120,
-    )
-
-
-#: Where the error of the probing machine is stated, m.
-PROBED = (0.0, 0.0, 0.15)
-
-
-def touched_balls(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the touches of four balls, cold and six times while the spindle warms up, and the true error.
-
-    A cycle takes two minutes; its mean state is that of its middle.
-    """
-    virtual = VirtualMachine("cframe", seed=seed)
-    virtual.start((Event(120.0, 12000.0, None),))
-    raw = virtual.raw_normal_vector(600.0 * np.arange(7), seed=seed, cycle=120.0)
-    truth = virtual.truth_probing(60.0 + 20.0 * np.arange(190), PROBED)
-    for name in truth.data_vars:
-        if truth[name].dims == ("time",):
-            truth[name] = (truth[name] - truth[name][0]).assign_attrs(truth[name].attrs)
-    return raw, truth
 
 
 @cache

@@ -11,6 +11,7 @@ import xarray as xr
 from errormotion.campaign.monitor.report import log as monitor_log
 from errormotion.datasets import save
 from errormotion.errors import RunError
+from errormotion.methods.normal_vector import simulation
 from errormotion.report import write_report, write_run_report
 from errormotion.twin import VirtualMachine
 
@@ -189,6 +190,6 @@ def test_run_folder_without_results_is_no_log(tmp_path):
     folder.mkdir()
     machine = VirtualMachine("gantry", seed=3)
     machine.start([])
-    save(machine.raw_normal_vector(np.array([0.0, 600.0]), seed=1), folder / "raw.zarr")
+    save(simulation.raw(machine, np.array([0.0, 600.0]), seed=1), folder / "raw.zarr")
     with pytest.raises(RunError, match="errormotion identify"):
         write_run_report(folder)
