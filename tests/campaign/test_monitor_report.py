@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.campaign.monitor.report import log as monitor_log
+from errormotion.campaign.monitor import log as monitor_log
+from errormotion.campaign.monitor.plugin import MonitorLog
+from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.datasets import save
 from errormotion.errors import RunError
 from errormotion.methods.normal_vector import simulation
@@ -53,7 +55,7 @@ def log(n=200, interval=1.0, *, controller=True):
         "direction": ["x", "y", "z"],
     }
     attrs = {
-        "schema": monitor_log.SCHEMA,
+        "schema": SCHEMA,
         "machine": "Mill 5",
         "start": "2026-03-02T08:15:00+00:00",
         "interval": interval,
@@ -156,6 +158,15 @@ def test_short_gap_in_a_long_log_is_still_seen():
     found = monitor_log.read_log(log(5000, 60.0))
     at = np.flatnonzero(found.silent["thermo"])
     assert (np.abs(found.time[at] - 3501 * 60.0) < 600.0).any()
+
+
+def test_figures_are_those_of_the_page(html):
+    found = {figure.name: (figure.value, figure.unit) for figure in MonitorLog.figures(log())}
+    assert found["duration"] == (199.0, "s")
+    assert found["rows without a reading of thermo"] == (23.0, "1")
+    assert found["rows without a reading of control"] == (0.0, "1")
+    assert f"{found['temperature change of spindle'][0]:+.1f} K" in words(html)
+    assert f"{found['highest temperature of spindle'][0]:.1f} °C" in words(html)
 
 
 def test_log_of_one_row_and_of_none_have_a_page(tmp_path):

@@ -27,13 +27,13 @@ from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import RunFolder, now
 from errormotion.campaign.journal import journal
+from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.recorder import Recorder
 from errormotion.campaign.store import RawStore
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError
 
-SCHEMA = "errormotion.raw.monitor/1"
 TEST = "monitor"
 
 FLAGS = ("known", "open", "shorted", "out of range", "no answer", "unknown")

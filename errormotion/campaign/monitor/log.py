@@ -12,8 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.plugins import FigureOfMerit
 
-SCHEMA = "errormotion.raw.monitor/1"
 BINS = 600
 """Intervals of time that the log is thinned to; a page is no wider."""
 BLOCK = 65536
@@ -27,11 +27,6 @@ NUMBERS = (
     ("feed", "Feed", "m/min", 60.0),
 )
 """Working parameters: name in the log, title, field unit, and its number in one SI unit."""
-
-
-def is_log(dataset: xr.Dataset) -> bool:
-    """Return whether a dataset is the log of a monitor."""
-    return dataset.attrs.get("schema") == SCHEMA
 
 
 @dataclass(frozen=True)
@@ -199,6 +194,24 @@ def read_log(dataset: xr.Dataset) -> Log:
         {name: np.nan_to_num(_highest(silent.high[:, k], not whole)) for k, name in enumerate(sources)},
         _missing(time, _interval(dataset, time)),
     )
+
+
+def figures(dataset: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the duration of a log, its largest temperature change and highest temperature, and its gaps.
+
+    The uncertainty of the temperatures is not part of a log: U is NaN.
+    """
+    log = read_log(dataset)
+    found = [FigureOfMerit("duration", log.duration, math.nan, "s")]
+    known = [channel for channel in log.temperatures if channel.known]
+    if known:
+        most = max(known, key=lambda channel: abs(channel.last - channel.first))
+        highest = max(known, key=lambda channel: channel.high)
+        found.append(FigureOfMerit(f"temperature change of {most.name}", most.last - most.first, math.nan, "K"))
+        found.append(FigureOfMerit(f"highest temperature of {highest.name}", highest.high, math.nan, "degC"))
+    gaps = {name: sum(gap.rows for gap in gaps) for name, gaps in log.gaps.items()}
+    found += [FigureOfMerit(f"rows without a reading of {name}", float(rows), 0.0, "1") for name, rows in gaps.items()]
+    return found
 
 
 def _edges(time: Array, whole: bool) -> Array:

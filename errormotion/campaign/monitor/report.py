@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from errormotion.campaign.monitor.report.log import AXES, BINS, NUMBERS, Channel, Gap, Log, is_log, read_log
+from errormotion.campaign.monitor.log import AXES, BINS, NUMBERS, Channel, Gap, Log, read_log
 from errormotion.report import provenance, sensors, timeline
 from errormotion.report.canvas import COLOURS
 from errormotion.report.document import (
@@ -24,17 +24,15 @@ from errormotion.report.document import (
 )
 from errormotion.report.text import fixed, integer, listed, percent
 
-__all__ = ["is_log", "part"]
-
 _NAMED = 20
 _STRIPS = 8  # instruments with a strip of their own
 
 
-def part(source: Source, key: str) -> Part:
-    """Return the page's content; ``source.errors`` is the log."""
-    log = read_log(source.errors)
+def chapters(source: Source) -> list[Part]:
+    """Return the chapter of a log."""
+    log, key = read_log(source.errors), source.key
     found = _sensors(log, source)
-    return Part(
+    chapter = Part(
         "Log of a monitor",
         _key_figures(log, found),
         _summary(log, found),
@@ -44,7 +42,10 @@ def part(source: Source, key: str) -> Part:
             Section("gaps", "Gaps", _gaps(log)),
             Section("provenance", "Provenance", provenance.blocks(source)),
         ],
+        kind="Log",
+        stated=False,
     )
+    return [chapter]
 
 
 def duration(seconds: float) -> str:
