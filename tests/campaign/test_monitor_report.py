@@ -89,15 +89,15 @@ def test_page_is_that_of_a_log_and_not_of_a_test(html):
 
 
 def test_gaps_are_counted_drawn_and_listed(html):
-    found = {row[0]: row[1:] for row in rows(html, "Rows without a fresh reading")}
+    found = {row[0]: row[1:] for row in rows(html, "Rows without a recent reading")}
     assert found["control"] == ["0", "0", "0 %", "none", "no"]
     # A tenth of 200 rows, and three more; a gap ends with the first row that has a reading again.
     assert found["thermo"] == ["2", "23", "11.50 %", "20.0 s", "no"]
-    first, second = rows(html, "Gaps in their order")[1:]
+    first, second = rows(html, "Gaps in chronological order")[1:]
     assert first == ["thermo", "1.33", "1.67", "20.0 s", "20"]
     assert second == ["thermo", "2.33", "2.38", "3.0 s", "3"]
-    assert "Silent: thermo" in html
-    assert "Silent: control" not in html
+    assert "No answer: thermo" in html
+    assert "No answer: control" not in html
 
 
 def test_why_a_temperature_is_unknown_is_told(html):
@@ -121,7 +121,7 @@ def test_working_parameters_are_those_of_the_log(html):
 
 def test_log_without_a_controller_says_so(tmp_path):
     text = words(write_report(log(controller=False), tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "No controller was on the bench" in text
+    assert "The bench had no controller" in text
     assert "Spindle speed" not in text
 
 
@@ -129,7 +129,7 @@ def test_rows_that_were_never_written_are_a_gap_too(tmp_path):
     whole = log()
     part = whole.isel(time=np.r_[0:100, 150:200])
     text = words(write_report(part, tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "No rows were written in one stretch, 51.0 s in all." in text
+    assert "No rows were written in one interval, 51.0 s in total." in text
     assert np.isnan(monitor_log.read_log(part).temperatures[0].values).any()  # the curve breaks there
 
 
