@@ -1,4 +1,4 @@
-"""The log of a monitor, thinned to what a page shows while it is read block by block: logs of weeks fit."""
+"""The log of a monitor, read block by block and reduced to the resolution of a page, so that logs of weeks fit."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.plugins import FigureOfMerit
 
-SCHEMA = "errormotion.raw.monitor/1"
 BINS = 600
-"""Intervals of time that the log is thinned to; a page is no wider."""
+"""Number of intervals of the reduced log: the resolution of a page."""
 BLOCK = 65536
+"""Rows that are read at a time."""
 MISSED = 2.5
-"""Intervals between two rows from which on rows are missing."""
+"""Time between two rows, in intervals, above which rows are missing."""
 
 AXES = ("X", "Y", "Z")
 NUMBERS = (
@@ -26,12 +27,7 @@ NUMBERS = (
     ("spindle_load", "Spindle load", "%", 100.0),
     ("feed", "Feed", "m/min", 60.0),
 )
-"""Working parameters: name in the log, title, field unit, and its number in one SI unit."""
-
-
-def is_log(dataset: xr.Dataset) -> bool:
-    """Return whether a dataset is the log of a monitor."""
-    return dataset.attrs.get("schema") == SCHEMA
+"""Working parameters: name in the log, title, unit on the page, and number of these in one SI unit."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +38,11 @@ class Channel:
     ----------
     name : str
     first, low, high, last, mean : float
-        Of what is known, in the log's unit; NaN where nothing is.
+        Of the known values, in the unit of the log; NaN if there are none.
     known : int
         Rows with a value.
     values : (m,)
-        On the thinned time axis of the log: lowest and highest of each interval; NaN where nothing is known.
+        On the reduced time axis: lowest and highest value of each interval; NaN if unknown.
     """
 
     name: str
@@ -61,7 +57,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Gap:
-    """A stretch without readings; ``end`` is the first row after it, s, or the last row where none follows."""
+    """An interval without readings; ``end`` is the first row after it, s, or the last row if none follows."""
 
     start: float
     end: float
@@ -76,24 +72,24 @@ class Log:
     ----------
     rows : int
     interval : float
-        Between two rows as it was wanted, s; the median found where that is not stated.
+        Stated interval of the rows, s; the median found if not stated.
     duration : float
         First to last row, s.
     time : (m,)
-        Thinned, s.
+        Reduced, s.
     temperatures : list of Channel
     place : (sensor, 3)
         m; NaN = unknown.
     why : list of dict
-        For each sensor: reason to rows.
+        For each sensor: number of rows by reason of the unknown temperature.
     numbers : dict of str to Channel
-        Working parameters and positions ``X Y Z``, those that the log has.
+        Working parameters and positions ``X Y Z`` in the log.
     gaps : dict of str to list of Gap
         By instrument.
     silent : dict of str to (m,)
-        Where each instrument was silent, on the thinned axis: 1 where in any row.
+        1 where an instrument did not answer in any row, on the reduced axis.
     missing : list of Gap
-        Stretches in which no row was written.
+        Intervals in which no row was written.
     """
 
     rows: int
@@ -110,7 +106,7 @@ class Log:
 
 
 class _Thinner:
-    """Lowest and highest of every interval of time, and what is known of whole columns (n, c), block by block."""
+    """Lowest and highest value of every interval, and statistics of whole columns (n, c), block by block."""
 
     def __init__(self, count: int, bins: int) -> None:
         self.low, self.high = np.full((bins, count), np.inf), np.full((bins, count), -np.inf)
@@ -152,14 +148,14 @@ class _Thinner:
 
 
 def read_log(dataset: xr.Dataset) -> Log:
-    """Read a log once, from begin to end."""
+    """Return the reduced log."""
     time = np.asarray(dataset["time"].values, float)
     n = time.size
     sensors = _names(dataset, "sensor") if "temperature" in dataset else []
     sources = _names(dataset, "source")
     numbers = [name for name, *_ in NUMBERS if name in dataset and dataset[name].dims == ("time",)]
     columns = [*numbers, *(AXES if "position" in dataset else ())]
-    # A short log is shown row by row; in a long one each interval holds its lowest and highest value.
+    # A short log is shown row by row; a long one by the lowest and highest value of each interval.
     whole = n <= 2 * BINS
     edges = _edges(time, whole)
     bins = len(edges) if n else 0
@@ -201,8 +197,26 @@ def read_log(dataset: xr.Dataset) -> Log:
     )
 
 
+def figures(dataset: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the duration of a log, its largest temperature change and highest temperature, and its gaps.
+
+    The uncertainty of the temperatures is not part of a log: U is NaN.
+    """
+    log = read_log(dataset)
+    found = [FigureOfMerit("duration", log.duration, math.nan, "s")]
+    known = [channel for channel in log.temperatures if channel.known]
+    if known:
+        most = max(known, key=lambda channel: abs(channel.last - channel.first))
+        highest = max(known, key=lambda channel: channel.high)
+        found.append(FigureOfMerit(f"temperature change of {most.name}", most.last - most.first, math.nan, "K"))
+        found.append(FigureOfMerit(f"highest temperature of {highest.name}", highest.high, math.nan, "degC"))
+    gaps = {name: sum(gap.rows for gap in gaps) for name, gaps in log.gaps.items()}
+    found += [FigureOfMerit(f"rows without a reading of {name}", float(rows), 0.0, "1") for name, rows in gaps.items()]
+    return found
+
+
 def _edges(time: Array, whole: bool) -> Array:
-    """Return the begin of each interval; in a short log the rows themselves, and one in each hole."""
+    """Return the start of each interval; in a short log the rows themselves, and one in each gap."""
     if not time.size:
         return np.empty(0)
     if not whole:
@@ -233,7 +247,7 @@ def _names(dataset: xr.Dataset, dim: str) -> list[str]:
 
 
 def _meanings(dataset: xr.Dataset) -> list[str]:
-    """Return what the numbers of ``temperature_flag`` stand for."""
+    """Return the meanings of the numbers of ``temperature_flag``."""
     try:
         found = json.loads(str(dataset.attrs.get("flag_meanings", "[]")))
     except ValueError:
@@ -255,7 +269,7 @@ def _places(dataset: xr.Dataset, count: int) -> Array:
 
 
 def _extend(runs: list[Gap], where: NDArray[np.bool_], own: Array, time: Array, start: int) -> None:
-    """Add the gaps of one block, joined to one that the block before ended with."""
+    """Add the gaps of one block, joined to a gap at the end of the previous block."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
         end = float(time[min(start + stop, time.size - 1)])

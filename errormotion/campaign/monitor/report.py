@@ -1,4 +1,4 @@
-"""The page of a monitor's log: temperatures and working parameters over time, sensors on the machine, gaps."""
+"""Report chapter of a monitor's log: temperatures and working parameters over time, sensors, gaps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from errormotion.campaign.monitor.report.log import AXES, BINS, NUMBERS, Channel, Gap, Log, is_log, read_log
+from errormotion.campaign.monitor.log import AXES, BINS, NUMBERS, Channel, Gap, Log, read_log
 from errormotion.report import provenance, sensors, timeline
 from errormotion.report.canvas import COLOURS
 from errormotion.report.document import (
@@ -24,17 +24,17 @@ from errormotion.report.document import (
 )
 from errormotion.report.text import fixed, integer, listed, percent
 
-__all__ = ["is_log", "part"]
+_LISTED = 20
+"""Most gaps that are listed."""
+_STRIPS = 8
+"""Most instruments whose missing readings are drawn."""
 
-_NAMED = 20
-_STRIPS = 8  # instruments with a strip of their own
 
-
-def part(source: Source, key: str) -> Part:
-    """Return the page's content; ``source.errors`` is the log."""
-    log = read_log(source.errors)
+def chapters(source: Source) -> list[Part]:
+    """Return the chapter of a log."""
+    log, key = read_log(source.errors), source.key
     found = _sensors(log, source)
-    return Part(
+    chapter = Part(
         "Log of a monitor",
         _key_figures(log, found),
         _summary(log, found),
@@ -44,13 +44,16 @@ def part(source: Source, key: str) -> Part:
             Section("gaps", "Gaps", _gaps(log)),
             Section("provenance", "Provenance", provenance.blocks(source)),
         ],
+        kind="Log",
+        stated=False,
     )
+    return [chapter]
 
 
 def duration(seconds: float) -> str:
-    """Return a length of time in the unit that suits it."""
+    """Return a duration in a suitable unit."""
     if not math.isfinite(seconds):
-        return "an unknown time"
+        return "unknown"
     for size, unit, least in ((86400.0, "days", 2.0), (3600.0, "h", 2.0), (60.0, "min", 2.0)):
         if seconds >= least * size:
             return f"{fixed(seconds / size, 1)} {unit}"
@@ -80,17 +83,17 @@ def _sensors(log: Log, source: Source) -> list[sensors.Sensor]:
 
 def _key_figures(log: Log, found: Sequence[sensors.Sensor]) -> list[KeyFigure]:
     length, unit = duration(log.duration).rsplit(" ", 1)
-    figures = [KeyFigure("watched", Cell(length), unit, f"{integer(log.rows)} rows")]
+    figures = [KeyFigure("duration", Cell(length), unit, f"{integer(log.rows)} rows")]
     known = [sensor for sensor in found if math.isfinite(sensor.change)]
     if known:
         most = max(known, key=lambda sensor: abs(sensor.change))
         figures.append(KeyFigure("largest change", Cell(fixed(most.change, 1, signed=True)), "K", most.name))
         warm = max(known, key=lambda sensor: sensor.high)
-        figures.append(KeyFigure("warmest", Cell(fixed(warm.high, 1)), "°C", warm.name))
+        figures.append(KeyFigure("highest", Cell(fixed(warm.high, 1)), "°C", warm.name))
     speed = log.numbers.get("spindle_speed")
     if speed is not None and speed.known:
         top = max(abs(speed.low), abs(speed.high))
-        figures.append(KeyFigure("fastest", Cell(integer(top)), "/min", "spindle speed"))
+        figures.append(KeyFigure("highest speed", Cell(integer(top)), "/min", "spindle"))
     count = sum(map(len, log.gaps.values()))
     figures.append(KeyFigure("gaps", Cell(integer(count)), "", f"of {integer(len(log.gaps))} instruments"))
     return figures
@@ -102,14 +105,14 @@ def _summary(log: Log, found: list[sensors.Sensor]) -> list[str]:
         words.append(sensors.warmest(found))
     silent = [name for name, gaps in log.gaps.items() if gaps]
     if silent:
-        told = listed([f"{name} ({integer(len(log.gaps[name]))})" for name in silent])
-        words.append(f"Instruments that were silent for a time, with the number of gaps: {told}.")
+        counts = listed([f"{name} ({integer(len(log.gaps[name]))})" for name in silent])
+        words.append(f"Instruments that did not answer at times, with the number of gaps: {counts}.")
     else:
-        words.append("No instrument was silent at any row.")
+        words.append("Every instrument answered in all rows.")
     if log.missing:
         lost = sum(gap.end - gap.start for gap in log.missing)
-        where = "one stretch" if len(log.missing) == 1 else f"{integer(len(log.missing))} stretches"
-        words.append(f"No rows were written in {where}, {duration(lost)} in all.")
+        where = "one interval" if len(log.missing) == 1 else f"{integer(len(log.missing))} intervals"
+        words.append(f"No rows were written in {where}, {duration(lost)} in total.")
     return words
 
 
@@ -124,20 +127,20 @@ def _over_time(log: Log, key: str) -> list[Block]:
             panels.append(timeline.Panel(title, unit, [line], 0.3, strip=True))
     panels += _position(log)
     panels += [
-        timeline.Panel(f"Silent: {name}", "", [timeline.Line(name, silent, None, timeline.UNKNOWN)], 0.1, strip=True)
+        timeline.Panel(f"No answer: {name}", "", [timeline.Line(name, silent, None, timeline.UNKNOWN)], 0.1, strip=True)
         for name, silent in list(log.silent.items())[:_STRIPS]
         if silent.any()
     ]
     if not panels or log.time.size < 2:
-        return [Text("The log holds nothing to draw.", "warning")]
+        return [Text("The log contains no data to draw.", "warning")]
     words = ". ".join(panel.in_words() for panel in panels if panel.unit)
     thinned = (
-        f" Thinned to {integer(BINS)} intervals, of each of which the lowest and the highest value are drawn."
+        f" Reduced to {integer(BINS)} intervals; the lowest and highest value of each are drawn."
         if log.time.size != log.rows and log.rows > 2 * BINS
         else ""
     )
-    red = " Red: where an instrument was silent." if any(silent.any() for silent in log.silent.values()) else ""
-    caption = f"Temperatures and what the machine did, on one time axis since the start of the log.{red}{thinned}"
+    red = " Red: an instrument did not answer." if any(silent.any() for silent in log.silent.values()) else ""
+    caption = f"Temperatures and working parameters since the start of the log, on one time axis.{red}{thinned}"
     return [Figure(timeline.draw(log.time, panels, key), caption, f"Over time: {words}.")]
 
 
@@ -159,14 +162,14 @@ def _numbers(log: Log) -> list[Block]:
         title, unit, size = units.get(name, (f"Position {name}", "mm", 1e3))
         rows.append([title, unit, *_spans(channel, size), percent(channel.known / max(log.rows, 1))])
     if not rows:
-        return [Text("No controller was on the bench: working parameters were not recorded.", "note")]
+        return [Text("The bench had no controller: working parameters were not recorded.", "note")]
     return [
         Table("Working parameters.", ["parameter", "unit", "lowest", "mean", "highest", "last", "known"], rows),
     ]
 
 
 def _spans(channel: Channel, size: float) -> list[Cell | str]:
-    never = "never known"
+    never = "unknown in all rows"
     places = 0 if abs(size) == 1.0 else 1
     values = (channel.low, channel.mean, channel.high, channel.last)
     return [or_dash(fixed(size * value, places), never) for value in values]
@@ -174,7 +177,7 @@ def _spans(channel: Channel, size: float) -> list[Cell | str]:
 
 def _gaps(log: Log) -> list[Block]:
     if not log.gaps:
-        return [Text("The log names no instruments.", "warning")]
+        return [Text("The log lists no instruments.", "warning")]
     rows: list[list[Cell | str]] = []
     for name, gaps in log.gaps.items():
         lost = sum(gap.rows for gap in gaps)
@@ -190,28 +193,28 @@ def _gaps(log: Log) -> list[Block]:
         )
     blocks: list[Block] = [
         Table(
-            "Rows without a fresh reading, by instrument. A gap ends with the first row that has a reading again.",
-            ["instrument", "gaps", "rows", "share", "longest", "silent at the end"],
+            "Rows without a recent reading, by instrument. A gap ends with the next row that has a reading.",
+            ["instrument", "gaps", "rows", "fraction", "longest", "no answer at the end"],
             rows,
         )
     ]
-    told = [(name, gap) for name, gaps in log.gaps.items() for gap in gaps]
-    told += [("no rows written", gap) for gap in log.missing]
-    if told:
-        blocks.append(_named(sorted(told, key=lambda entry: entry[1].start)))
+    every = [(name, gap) for name, gaps in log.gaps.items() for gap in gaps]
+    every += [("no rows written", gap) for gap in log.missing]
+    if every:
+        blocks.append(_gap_list(sorted(every, key=lambda entry: entry[1].start)))
     return blocks
 
 
-def _named(told: Sequence[tuple[str, Gap]]) -> Table:
-    longest = sorted(told, key=lambda entry: entry[1].start - entry[1].end)[:_NAMED]
-    shown = [entry for entry in told if entry in longest]
-    more = f" The {_NAMED} longest of {integer(len(told))}." if len(told) > len(shown) else ""
+def _gap_list(every: Sequence[tuple[str, Gap]]) -> Table:
+    longest = sorted(every, key=lambda entry: entry[1].start - entry[1].end)[:_LISTED]
+    shown = [entry for entry in every if entry in longest]
+    more = f" The {_LISTED} longest of {integer(len(every))}." if len(every) > len(shown) else ""
     rows: list[list[Cell | str]] = [
         [name, fixed(gap.start / 60, 2), fixed(gap.end / 60, 2), duration(gap.end - gap.start), integer(gap.rows)]
         for name, gap in shown
     ]
     return Table(
-        f"Gaps in their order, since the start of the log.{more}",
-        ["instrument", "from / min", "to / min", "length", "rows"],
+        f"Gaps in chronological order; times since the start of the log.{more}",
+        ["instrument", "from / min", "to / min", "duration", "rows"],
         rows,
     )

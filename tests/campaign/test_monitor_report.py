@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.campaign.monitor.report import log as monitor_log
+from errormotion.campaign.monitor import log as monitor_log
+from errormotion.campaign.monitor.plugin import MonitorLog
+from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.datasets import save
 from errormotion.errors import RunError
+from errormotion.methods.normal_vector import simulation
 from errormotion.report import write_report, write_run_report
 from errormotion.twin import VirtualMachine
 
@@ -52,7 +55,7 @@ def log(n=200, interval=1.0, *, controller=True):
         "direction": ["x", "y", "z"],
     }
     attrs = {
-        "schema": monitor_log.SCHEMA,
+        "schema": SCHEMA,
         "machine": "Mill 5",
         "start": "2026-03-02T08:15:00+00:00",
         "interval": interval,
@@ -86,15 +89,15 @@ def test_page_is_that_of_a_log_and_not_of_a_test(html):
 
 
 def test_gaps_are_counted_drawn_and_listed(html):
-    found = {row[0]: row[1:] for row in rows(html, "Rows without a fresh reading")}
+    found = {row[0]: row[1:] for row in rows(html, "Rows without a recent reading")}
     assert found["control"] == ["0", "0", "0 %", "none", "no"]
     # A tenth of 200 rows, and three more; a gap ends with the first row that has a reading again.
     assert found["thermo"] == ["2", "23", "11.50 %", "20.0 s", "no"]
-    first, second = rows(html, "Gaps in their order")[1:]
+    first, second = rows(html, "Gaps in chronological order")[1:]
     assert first == ["thermo", "1.33", "1.67", "20.0 s", "20"]
     assert second == ["thermo", "2.33", "2.38", "3.0 s", "3"]
-    assert "Silent: thermo" in html
-    assert "Silent: control" not in html
+    assert "No answer: thermo" in html
+    assert "No answer: control" not in html
 
 
 def test_why_a_temperature_is_unknown_is_told(html):
@@ -118,7 +121,7 @@ def test_working_parameters_are_those_of_the_log(html):
 
 def test_log_without_a_controller_says_so(tmp_path):
     text = words(write_report(log(controller=False), tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "No controller was on the bench" in text
+    assert "The bench had no controller" in text
     assert "Spindle speed" not in text
 
 
@@ -126,7 +129,7 @@ def test_rows_that_were_never_written_are_a_gap_too(tmp_path):
     whole = log()
     part = whole.isel(time=np.r_[0:100, 150:200])
     text = words(write_report(part, tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "No rows were written in one stretch, 51.0 s in all." in text
+    assert "No rows were written in one interval, 51.0 s in total." in text
     assert np.isnan(monitor_log.read_log(part).temperatures[0].values).any()  # the curve breaks there
 
 
@@ -155,6 +158,15 @@ def test_short_gap_in_a_long_log_is_still_seen():
     found = monitor_log.read_log(log(5000, 60.0))
     at = np.flatnonzero(found.silent["thermo"])
     assert (np.abs(found.time[at] - 3501 * 60.0) < 600.0).any()
+
+
+def test_figures_are_those_of_the_page(html):
+    found = {figure.name: (figure.value, figure.unit) for figure in MonitorLog.figures(log())}
+    assert found["duration"] == (199.0, "s")
+    assert found["rows without a reading of thermo"] == (23.0, "1")
+    assert found["rows without a reading of control"] == (0.0, "1")
+    assert f"{found['temperature change of spindle'][0]:+.1f} K" in words(html)
+    assert f"{found['highest temperature of spindle'][0]:.1f} °C" in words(html)
 
 
 def test_log_of_one_row_and_of_none_have_a_page(tmp_path):
@@ -189,6 +201,6 @@ def test_run_folder_without_results_is_no_log(tmp_path):
     folder.mkdir()
     machine = VirtualMachine("gantry", seed=3)
     machine.start([])
-    save(machine.raw_normal_vector(np.array([0.0, 600.0]), seed=1), folder / "raw.zarr")
+    save(simulation.raw(machine, np.array([0.0, 600.0]), seed=1), folder / "raw.zarr")
     with pytest.raises(RunError, match="errormotion identify"):
         write_run_report(folder)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.methods.normal_vector import NormalVector
+from errormotion.methods.normal_vector import NormalVector, simulation
 from errormotion.methods.normal_vector.report.drawings import balls
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
@@ -35,7 +35,7 @@ def warm_up(kind="gantry", **more):
     """Return the raw data of an hour and a half with a cycle every ten minutes."""
     machine = VirtualMachine(kind, seed=3)
     machine.start([Event(0.0, 6000.0), Event(2400.0, 12000.0)])
-    return machine.raw_normal_vector(np.arange(0.0, 5401.0, 600.0), seed=5, **more)
+    return simulation.raw(machine, np.arange(0.0, 5401.0, 600.0), seed=5, **more)
 
 
 @cache
