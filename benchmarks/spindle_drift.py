@@ -112,6 +112,7 @@ def write_record(path: Path, hours: float) -> None:
     """Write a raw dataset of five channels at 20 kHz, as the runner stores one."""
     import zarr
 
+    from errormotion.datasets import save
     from errormotion.twin import Event, VirtualMachine
 
     machine = VirtualMachine("cframe", seed=3)
@@ -122,9 +123,7 @@ def write_record(path: Path, hours: float) -> None:
     skeleton = (
         skeleton.drop_vars(["distance", "time"]).drop_dims("time", errors="ignore").drop_dims("sensor", errors="ignore")
     )
-    skeleton.assign_attrs(sample_rate=float(RATE)).assign(distance_noise=0.3e-6).to_zarr(
-        path, zarr_format=3, consolidated=False
-    )
+    save(skeleton.assign_attrs(sample_rate=float(RATE)).assign(distance_noise=0.3e-6), path)
     array = zarr.open_group(path, mode="r+").create_array(
         "distance", shape=(5, samples), chunks=(5, piece), dtype="float32", fill_value=float("nan"),
         dimension_names=("channel", "time"), attributes={"units": "m"}, compressors=None,
@@ -133,7 +132,6 @@ def write_record(path: Path, hours: float) -> None:
     for begin in range(0, samples, piece):
         # The same half minute over and over, shifted by 1 nm each, so that no two windows are alike.
         array[:, begin : begin + piece] = (block + np.float32(1e-9 * (begin // piece)))[:, : samples - begin]
-    zarr.consolidate_metadata(path)
 
 
 def peak_memory() -> int:
