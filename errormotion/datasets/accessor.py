@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.errors import DatasetError
 from errormotion.kinematics import iso, twists
@@ -224,20 +225,20 @@ class ErrorMotion:
 
         return plot_errors(self._ds)
 
-    def _values(self) -> NDArray[np.float64]:
+    def _values(self) -> Array:
         return np.asarray(self.twist().values, dtype=float)
 
-    def _influence(self) -> NDArray[np.float64]:
+    def _influence(self) -> Array:
         if "influence" in self._ds.variables:
             return np.asarray(self._ds["influence"].values, dtype=float)
         return np.zeros((0, *self._values().shape))
 
-    def _independent(self) -> NDArray[np.float64]:
+    def _independent(self) -> Array:
         F = self._influence()
-        C: NDArray[np.float64] = self._ds["covariance"].values - np.einsum("s...i,s...j->...ij", F, F, optimize=True)
+        C: Array = self._ds["covariance"].values - np.einsum("s...i,s...j->...ij", F, F, optimize=True)
         return C
 
-    def _nothing(self, axis: int) -> NDArray[np.float64]:
+    def _nothing(self, axis: int) -> Array:
         return np.zeros(np.delete(self._values().shape, axis))
 
     def _coords(self, *dof: str, without: str = "") -> dict[str, Any]:
@@ -258,7 +259,7 @@ class ErrorMotion:
                 raise DatasetError(f"Expected an index below {size}; found {number}")
         return tuple(number % size for number, size in zip(index, sizes, strict=True))
 
-    def _transformed(self, A: NDArray[np.float64]) -> xr.Dataset:
+    def _transformed(self, A: Array) -> xr.Dataset:
         """Return a copy with twist, covariance and influence under a 6x6 matrix."""
         ds = self._ds.copy()
         E = twists.transform(self._values(), A)
@@ -270,7 +271,7 @@ class ErrorMotion:
         return ds
 
 
-def _point(point: ArrayLike) -> NDArray[np.float64]:
+def _point(point: ArrayLike) -> Array:
     array = np.array(point, dtype=float)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise DatasetError(f"Expected a point: three finite coordinates in m; found {point!r}")

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.checks import (
     dims as dims_text,
 )
@@ -132,7 +133,7 @@ def build_errors(
     return ds
 
 
-def _check_shapes(E: NDArray[np.float64], C: NDArray[np.float64], dims: tuple[str, ...]) -> None:
+def _check_shapes(E: Array, C: Array, dims: tuple[str, ...]) -> None:
     found = []
     if E.ndim != len(dims) + 1 or E.shape[-1] != 6:
         found.append(f"values: expected shape ({', '.join([*dims, '6'])}); found {E.shape}")
@@ -308,9 +309,7 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
     return found
 
 
-def _influence_violations(
-    ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: NDArray[np.float64], scale: NDArray[np.float64]
-) -> list[str]:
+def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
     F = np.asarray(ds.variables["influence"].values, dtype=float)
     F = F.reshape(F.shape[0], -1, 6)
     if not np.array_equal(np.isnan(F), np.broadcast_to(unseen, F.shape)):
@@ -334,7 +333,7 @@ def _pattern(name: str, wrong: NDArray[np.bool_]) -> str:
     return f"{name}: expected NaN exactly where the value is NaN; not so for {' '.join(names)}"
 
 
-def _is_positive(matrices: NDArray[np.float64]) -> bool:
+def _is_positive(matrices: Array) -> bool:
     """Whether no eigenvalue is below rounding; by Cholesky first, which is fast and mostly enough."""
     try:
         np.linalg.cholesky(matrices + ROUNDING * np.eye(6))

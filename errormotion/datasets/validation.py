@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import xarray as xr
 
-from errormotion.datasets.calibrations import inclination as calibration
+from errormotion import plugins
 from errormotion.datasets.error_dataset import error_violations
 from errormotion.datasets.raw import raw_violations, variant_of
-from errormotion.datasets.schemas import RAW_SCHEMAS, SCHEMA
+from errormotion.datasets.schemas import SCHEMA, known_schemas
 from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 
@@ -23,15 +23,16 @@ def violations(ds: xr.Dataset) -> list[str]:
     schema = ds.attrs.get("schema")
     if schema == SCHEMA:
         return error_violations(ds)
-    if schema == calibration.SCHEMA:
-        return calibration.violations(ds)
     raw = variant_of(ds)
     if raw is not None:
         return raw_violations(ds, raw)
-    known = {SCHEMA, calibration.SCHEMA, *(known.id for known in RAW_SCHEMAS)}
+    owner = plugins.owner_of_schema(str(schema))
+    if owner is not None:
+        return list(owner.violations(ds))
+    known = known_schemas()
     if schema is None:
         return [f"attribute 'schema': missing; expected one of {', '.join(sorted(known))}"]
-    return [f"attribute 'schema': '{schema}' is not known; {nearest(str(schema), known)}"]
+    return [f"attribute 'schema': '{schema}' is unknown; {nearest(str(schema), known)}"]
 
 
 def validate(ds: xr.Dataset) -> None:

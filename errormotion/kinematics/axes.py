@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.kinematics.iso import ROTARY_AXES, direction_of
 from errormotion.kinematics.poses import displaced
 
@@ -39,8 +40,8 @@ class ErrorMotion:
         Wrong shapes, positions that do not increase, or a table longer than its period.
     """
 
-    positions: NDArray[np.float64]
-    twists: NDArray[np.float64]
+    positions: Array
+    twists: Array
     period: float | None = None
 
     def __post_init__(self) -> None:
@@ -59,7 +60,7 @@ class ErrorMotion:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "twists", twists)
 
-    def __call__(self, commanded: ArrayLike) -> NDArray[np.float64]:
+    def __call__(self, commanded: ArrayLike) -> Array:
         """Return the error twist, (..., 6), at commanded positions (...)."""
         q = np.asarray(commanded, dtype=float)
         outside = None if self.period is not None else np.nan
@@ -87,7 +88,7 @@ class Axis:
 
     name: str
     carries_tool: bool
-    reference: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    reference: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         direction_of(self.name)
@@ -104,7 +105,7 @@ class Axis:
         return self.name in ROTARY_AXES
 
     @property
-    def direction(self) -> NDArray[np.float64]:
+    def direction(self) -> Array:
         """Unit vector, (3,), that the axis moves along or turns about."""
         direction = np.zeros(3)
         direction[direction_of(self.name)] = 1.0

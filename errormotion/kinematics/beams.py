@@ -14,8 +14,9 @@ published as a sensor's deflection is no third freedom: whatever way the sensor 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
 
@@ -30,7 +31,6 @@ __all__ = [
     "turned",
 ]
 
-Array = NDArray[np.float64]
 
 _ALONG = np.cos(np.radians(1e-4))
 """Cosine from which a direction counts as lying along an axis."""

@@ -12,9 +12,10 @@ from functools import cached_property, reduce
 from operator import mul
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.kinematics.axes import Axis
 from errormotion.kinematics.iso import DOF, LINEAR_AXES, ROTARY_AXES, iso_names, location_names
 from errormotion.kinematics.poses import displacement
@@ -90,9 +91,9 @@ class Machine:
     def errors_at(
         self,
         commanded: ArrayLike,
-        motions: Mapping[str, Callable[[NDArray[np.float64]], ArrayLike]],
+        motions: Mapping[str, Callable[[Array], ArrayLike]],
         locations: Mapping[str, float] | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return the error parameters at commanded places, in the order of `error_names`.
 
         Parameters
@@ -127,7 +128,7 @@ class Machine:
 
     def volumetric_error(
         self, commanded: ArrayLike, errors: ArrayLike, tool: ArrayLike = ORIGIN, *, exact: bool = False
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return the error twist of the tool relative to the workpiece.
 
         Parameters
@@ -161,7 +162,7 @@ class Machine:
             twist[known] = self._exact(q[known], e[known], np.asarray(tool, dtype=float))
         return twist.reshape(*batch, 6)
 
-    def jacobian(self, commanded: ArrayLike, tool: ArrayLike = ORIGIN) -> NDArray[np.float64]:
+    def jacobian(self, commanded: ArrayLike, tool: ArrayLike = ORIGIN) -> Array:
         """Return the derivative of the tool's error twist with respect to every error parameter.
 
         Parameters
@@ -190,7 +191,7 @@ class Machine:
             before = behind
         return J.reshape(*q.shape[:-1], 6, -1)
 
-    def _exact(self, q: NDArray[np.float64], e: NDArray[np.float64], tool: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _exact(self, q: Array, e: Array, tool: Array) -> Array:
         poses = []
         for joint in self.joints:
             i, location = 6 * self.axis_names.index(joint.name), np.zeros((len(q), 6))
@@ -205,18 +206,18 @@ class Machine:
         names = location_names(joint.name, self.axis_names)
         return [(self.error_names.index(name), DOF.index(dof)) for dof, name in names.items()]
 
-    def _of(self, joint: Axis, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        command: NDArray[np.float64] = q[:, self.axis_names.index(joint.name)]
+    def _of(self, joint: Axis, q: Array) -> Array:
+        command: Array = q[:, self.axis_names.index(joint.name)]
         return command
 
-    def _commands(self, commanded: ArrayLike) -> NDArray[np.float64]:
+    def _commands(self, commanded: ArrayLike) -> Array:
         q = np.asarray(commanded, dtype=float)
         if q.ndim == 0 or q.shape[-1] != len(self.axis_names):
             raise ValueError(f"expected commands (..., {len(self.axis_names)}) for {self.axis_names}, found {q.shape}")
         return q
 
 
-def _to_tool(pose: RigidTransform, reference: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_tool(pose: RigidTransform, reference: Array, at: Array) -> Array:
     """Return the adjoint from ``reference`` in the frame ``pose`` to the points ``at`` of the workpiece frame."""
     return adjoint(pose.rotation, pose.inv().apply(at) - reference)
 

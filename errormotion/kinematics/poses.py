@@ -7,9 +7,10 @@ this package: translation first, then rotation.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from errormotion.arrays import Array
 from errormotion.kinematics.twists import adjoint
 
 __all__ = ["adjoint_of", "displaced", "displacement", "exp", "log"]
@@ -27,7 +28,7 @@ def exp(twist: ArrayLike) -> RigidTransform:
     return RigidTransform.from_exp_coords(np.concatenate([t[..., 3:], t[..., :3]], axis=-1))
 
 
-def log(pose: RigidTransform) -> NDArray[np.float64]:
+def log(pose: RigidTransform) -> Array:
     """Return the twist, (..., 6), whose `exp` is the pose."""
     coordinates = np.asarray(pose.as_exp_coords(), dtype=float)
     return np.concatenate([coordinates[..., 3:], coordinates[..., :3]], axis=-1)
@@ -49,7 +50,7 @@ def displaced(twist: ArrayLike, point: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTran
     return RigidTransform.from_components(p + t[..., :3] - rotation.apply(p), rotation)
 
 
-def displacement(pose: RigidTransform, point: ArrayLike = (0.0, 0.0, 0.0)) -> NDArray[np.float64]:
+def displacement(pose: RigidTransform, point: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Return the twist, (..., 6), at a point of the body: how far the point went, and the rotation vector.
 
     The inverse of `displaced`.
@@ -58,7 +59,7 @@ def displacement(pose: RigidTransform, point: ArrayLike = (0.0, 0.0, 0.0)) -> ND
     return np.concatenate([pose.apply(p) - p, pose.rotation.as_rotvec()], axis=-1)
 
 
-def adjoint_of(pose: RigidTransform) -> NDArray[np.float64]:
+def adjoint_of(pose: RigidTransform) -> Array:
     """Return the 6x6 matrix of the change of frame ``pose * exp(twist) * pose.inv()``, twists at the frames' origins.
 
     Parameters

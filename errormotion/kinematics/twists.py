@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
@@ -21,7 +23,7 @@ __all__ = ["adjoint", "cross_matrix", "known_product", "move", "to_frame", "tran
 ROUNDING_OF_ROTATION = 1e-15
 
 
-def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
+def cross_matrix(v: ArrayLike) -> Array:
     """Return the matrix of the cross product: ``cross_matrix(v) @ w`` is ``v x w``.
 
     Parameters
@@ -46,7 +48,7 @@ def cross_matrix(v: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | None = None) -> NDArray[np.float64]:
+def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | None = None) -> Array:
     """Return the 6x6 matrix that takes a twist to another functional point and into another frame.
 
     The twist is moved first, ``E' = E + R x shift`` with ``shift`` in the old frame; then both its parts are rotated
@@ -79,7 +81,7 @@ def adjoint(rotation: ArrayLike | Rotation | None = None, shift: ArrayLike | Non
     return A
 
 
-def transform(twist: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
+def transform(twist: ArrayLike, A: ArrayLike) -> Array:
     """Return ``A @ twist``; a NaN freedom spoils only what depends on it.
 
     Parameters
@@ -95,7 +97,7 @@ def transform(twist: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
     return known_product(_six_by_six("matrix", A), _with_last("twist", twist, 6))
 
 
-def known_product(A: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def known_product(A: Array, x: Array) -> Array:
     """Return ``A @ x`` over the last axes, in which a NaN in ``x`` counts only where its coefficient is not zero.
 
     Parameters
@@ -115,7 +117,7 @@ def known_product(A: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.
     return np.where(spoilt, np.nan, known)
 
 
-def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> NDArray[np.float64]:
+def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> Array:
     """Return ``A @ covariance @ A.T``; NaN rows and columns spoil only what depends on them.
 
     Parameters
@@ -141,7 +143,7 @@ def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> NDArray[np.floa
     return np.where(spoilt, np.nan, moved)
 
 
-def move(twist: ArrayLike, shift: ArrayLike) -> NDArray[np.float64]:
+def move(twist: ArrayLike, shift: ArrayLike) -> Array:
     """Return the twist of the same body at another point: ``E' = E + R x shift``.
 
     Parameters
@@ -157,7 +159,7 @@ def move(twist: ArrayLike, shift: ArrayLike) -> NDArray[np.float64]:
     return transform(twist, adjoint(shift=shift))
 
 
-def to_frame(twist: ArrayLike, pose: RigidTransform) -> NDArray[np.float64]:
+def to_frame(twist: ArrayLike, pose: RigidTransform) -> Array:
     """Return the twist, at the same functional point, in another frame: both parts are rotated.
 
     Parameters
@@ -174,14 +176,14 @@ def to_frame(twist: ArrayLike, pose: RigidTransform) -> NDArray[np.float64]:
     return transform(twist, adjoint(rotation=pose.rotation))
 
 
-def _product(A: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _product(A: Array, x: Array) -> Array:
     if A.ndim == 2:
         return x @ A.T
-    product: NDArray[np.float64] = (A @ x[..., None])[..., 0]
+    product: Array = (A @ x[..., None])[..., 0]
     return product
 
 
-def _rotation_matrix(rotation: ArrayLike | Rotation | None) -> NDArray[np.float64]:
+def _rotation_matrix(rotation: ArrayLike | Rotation | None) -> Array:
     if rotation is None:
         return np.eye(3)
     Q = np.array(rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation, dtype=float)
@@ -193,14 +195,14 @@ def _rotation_matrix(rotation: ArrayLike | Rotation | None) -> NDArray[np.float6
     return Q
 
 
-def _with_last(what: str, value: ArrayLike, length: int) -> NDArray[np.float64]:
+def _with_last(what: str, value: ArrayLike, length: int) -> Array:
     array = np.asarray(value, dtype=float)
     if array.ndim == 0 or array.shape[-1] != length:
         raise ValueError(f"expected a {what} of shape (..., {length}), found {array.shape}")
     return array
 
 
-def _six_by_six(what: str, value: ArrayLike) -> NDArray[np.float64]:
+def _six_by_six(what: str, value: ArrayLike) -> Array:
     array = np.asarray(value, dtype=float)
     if array.ndim < 2 or array.shape[-2:] != (6, 6):
         raise ValueError(f"expected a {what} of shape (..., 6, 6), found {array.shape}")

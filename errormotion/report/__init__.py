@@ -1,15 +1,15 @@
-"""The page that a lab hands to its customer: one HTML file that needs nothing else.
+"""Reports: one HTML file that needs nothing else.
 
-``write_report`` writes one from error datasets, ``write_run_report`` from a run folder, ``write_model_report`` lays a
-thermal model against a measurement. They are loaded when first asked for, because drawing takes its time to import.
+``write_report`` writes a report from error datasets, ``write_run_report`` from a run folder, ``write_page`` from
+chapters. They are loaded at first use, because the drawing library takes time to import.
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from errormotion.report.write import write_model_report, write_report, write_run_report
+    from errormotion.report.write import write_page, write_report, write_run_report
 
-__all__ = ["write_model_report", "write_report", "write_run_report"]
+__all__ = ["write_page", "write_report", "write_run_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -107,23 +107,44 @@ class Section:
 
 @dataclass(frozen=True)
 class Part:
-    """What one error dataset contributes."""
+    """One chapter of a report.
+
+    ``kind`` is the title line of a report whose first chapter this is. ``stated`` is whether the chapter states errors
+    with their uncertainty; a log does not.
+    """
 
     title: str
     key_figures: Sequence[KeyFigure]
     summary: Sequence[str]
     sections: Sequence[Section]
     overview: Figure | None = None
+    kind: str = "Test report"
+    stated: bool = True
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a builder works from: one error dataset, and what else is known of the measurement."""
+    """What a chapter is made from: one dataset, and what else is known of the measurement.
+
+    Attributes
+    ----------
+    errors : Dataset
+        An error dataset, or another dataset for which a plugin writes chapters, such as a log.
+    raw : Dataset, optional
+        The raw dataset that the errors come from.
+    run : mapping
+        The content of ``run.json``, as far as there is one.
+    provenance : mapping
+        The provenance of the errors, read from its JSON.
+    key : str
+        Prefix that makes the identifiers of figures unique in the page.
+    """
 
     errors: xr.Dataset
     raw: xr.Dataset | None = None
     run: Mapping[str, Any] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    key: str = "p1"
 
     @property
     def settings(self) -> Mapping[str, Any]:

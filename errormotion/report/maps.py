@@ -9,11 +9,9 @@ from matplotlib.colors import BoundaryNorm, Colormap, LinearSegmentedColormap, L
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.report.canvas import BLUE, VERMILLION
-
-Array = NDArray[np.float64]
 
 #: Blue below zero, white at it, vermillion above: told apart with every kind of colour vision.
 DIVERGING = LinearSegmentedColormap.from_list(

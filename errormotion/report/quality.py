@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.spindle_drift.report.series import minutes_of
 from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.series import minutes_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, minutes, percent
 
 

@@ -12,13 +12,12 @@ import xarray as xr
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, or_dash
 from errormotion.report.text import DASH, finite, fixed, integer, listed, percent
 from errormotion.report.timeline import UNKNOWN, sensor_names
 from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
-
-Array = NDArray[np.float64]
 
 _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")

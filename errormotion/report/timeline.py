@@ -13,13 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
-from errormotion.methods.spindle_drift.report.series import Event
+from errormotion.arrays import Array
 from errormotion.report import canvas
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Table, estimate
+from errormotion.report.series import Event
 from errormotion.report.text import DASH, SECOND_OF_ARC, UM, finite, fixed, integer
-
-Array = NDArray[np.float64]
 
 DOTTED = 80
 """Up to so many instants each gets its dot: these were measured, and what lies between was not."""

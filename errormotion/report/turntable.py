@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from markupsafe import Markup, escape
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
 
 WIDE, HIGH = 497.0, 320.0  # points
 _MARGIN = 22.0

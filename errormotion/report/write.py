@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -14,26 +14,15 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
-from errormotion.campaign.monitor.report import chapter as monitor
-from errormotion.compensation.thermal_model.report import chapter as thermal_model
-from errormotion.compensation.thermal_model.report import check as thermal_model_check
+from errormotion import plugins
 from errormotion.errors import DatasetError, RunError
-from errormotion.methods.beam_direction.report import chapter as beam_direction
-from errormotion.methods.crossbeam_scan.report import chapter as crossbeam
-from errormotion.methods.crossbeam_scan.report import pose as crossbeam_pose
-from errormotion.methods.multilateration.report import chapter as multilateration
-from errormotion.methods.normal_vector.report import chapter as normal_vector
-from errormotion.methods.spindle_drift.report import beams as beam
-from errormotion.methods.spindle_drift.report import chapter as spindle
-from errormotion.report import generic, provenance
+from errormotion.report import beams, generic, provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.text import DASH
 
-Builder = Callable[[Source, str], Part]
-
-#: Who writes the chapter of a component; every other component gets the generic one.
-BUILDERS: dict[str, Builder] = {"spindle": spindle.part, "beam": beam.part}
+#: Chapters of components that several methods measure; used where the method brings no chapter of its own.
+COMPONENTS = {"beam": beams.part}
 
 
 def write_report(
@@ -72,47 +61,63 @@ def write_report(
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
         raise DatasetError("A report needs at least one error dataset, and none was given.")
-    for dataset in datasets:
-        if monitor.is_log(dataset):
-            continue
-        missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
-        if missing:
-            raise DatasetError(
-                f"A report is made from error datasets, or from a monitor's log; this one lacks {', '.join(missing)}. "
-                "Identify the raw dataset first."
-            )
-    sources = [Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {})) for dataset in datasets]
-    parts = [_builder(source.errors)(source, f"p{i + 1}") for i, source in enumerate(sources)]
-    return _write(_page(sources, parts, title), Path(out))
+    sources = []
+    for i, dataset in enumerate(datasets):
+        _check_reportable(dataset)
+        sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
+    return write_page(sources, [part for source in sources for part in chapters(source)], Path(out), title)
 
 
-def write_model_report(
-    model: xr.Dataset, measured: xr.Dataset, out: Path, *, predicted: xr.Dataset, figures: Mapping[str, Any]
-) -> Path:
-    """Write a page that lays a thermal model against a measured campaign.
+def chapters(source: Source) -> list[Part]:
+    """Return the chapters of one dataset: those of the plugin that made it, else the generic one."""
+    owner = _owner(source.errors)
+    own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
+    if own:
+        return own
+    return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
+
+
+def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, title: str | None = None) -> Path:
+    """Write chapters as one page.
 
     Parameters
     ----------
-    model : Dataset
-        Schema ``errormotion.model.thermal/1``.
-    measured : Dataset
-        Error dataset of a campaign that the model was not made of.
+    sources : sequence of Source
+        What the chapters were made from; the first one heads the page.
+    parts : sequence of Part
     out : Path
         The file; an older one is replaced in one step.
-    predicted : Dataset
-        What the model predicts of that campaign.
-    figures : mapping
-        What the comparison found: ``rms``, ``remaining``, ``removed`` and ``held``, six numbers each.
+    title : str, optional
 
     Returns
     -------
     Path
         ``out``.
     """
-    source = Source(predicted, None, {}, provenance.read(model))
-    made = thermal_model_check.part(source, "p1", model, measured, figures)
-    known = [Source(measured, None, {}, provenance.read(measured)), source]
-    return _write(_page(known, [made], None), Path(out))
+    return _write(_page(sources, parts, title), out)
+
+
+def _owner(dataset: xr.Dataset) -> Any:
+    """Return the plugin that a dataset comes from; None where there is none."""
+    schema = str(dataset.attrs.get("schema"))
+    if schema == plugins.ERRORS_SCHEMA:
+        return plugins.owner_of_method(str(dataset.attrs.get("method")))
+    return plugins.owner_of_schema(schema)
+
+
+def _is_log(dataset: xr.Dataset) -> bool:
+    """Return whether a dataset that is no error dataset has chapters of its own; raw data of a method have none."""
+    owner = _owner(dataset)
+    return isinstance(getattr(owner, "info", None), plugins.DatasetInfo) and hasattr(owner, "chapters")
+
+
+def _check_reportable(dataset: xr.Dataset) -> None:
+    missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
+    if missing and not _is_log(dataset):
+        raise DatasetError(
+            f"A report is made from error datasets, or from a log; this dataset lacks {', '.join(missing)}. "
+            "Identify the raw dataset first."
+        )
 
 
 def _write(page: str, out: Path) -> Path:
@@ -150,7 +155,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
         raise RunError(f"Expected a run folder, and there is none at {folder}.")
     files = sorted(folder.glob("errors/*/errors.nc"))
     raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
-    log = raw if raw is not None and not files and monitor.is_log(raw) else None
+    log = raw if raw is not None and not files and _is_log(raw) else None
     if not files and log is None:
         raise RunError(
             f"{folder} holds no errors/*/errors.nc: nothing was identified yet. Run 'errormotion identify' first."
@@ -170,28 +175,10 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
 
 
 def _provenance(dataset: xr.Dataset, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return where a dataset comes from; of a log, what its run says."""
-    if monitor.is_log(dataset):
+    """Return the provenance of a dataset; where it carries none, what its run says."""
+    if "provenance" not in dataset.attrs:
         return {name: run[name] for name in ("instruments", "settings", "software") if run.get(name)}
     return provenance.read(dataset)
-
-
-def _builder(errors: xr.Dataset) -> Builder:
-    if monitor.is_log(errors):
-        return monitor.part
-    if crossbeam.is_campaign(errors):
-        return crossbeam.part
-    if crossbeam_pose.is_pose(errors):
-        return crossbeam_pose.part
-    if beam_direction.is_direction(errors):
-        return beam_direction.part
-    if multilateration.is_multilateration(errors):
-        return multilateration.part
-    if normal_vector.is_normal_vector(errors):
-        return normal_vector.part
-    if thermal_model.is_prediction(errors):
-        return thermal_model.part
-    return BUILDERS.get(str(errors.attrs.get("component")), generic.part)
 
 
 def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -> str:
@@ -210,7 +197,6 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
     templates.tests["cell"] = lambda value: isinstance(value, Cell)
     templates.filters["kind"] = lambda block: type(block).__name__.lower()
     identity = sha256("".join(map(_identity, sources)).encode()).hexdigest()[:12]
-    logs = all(monitor.is_log(source.errors) for source in sources)
     return templates.get_template("report.html.j2").render(
         title=title or f"{machine}: {parts[0].title[0].lower()}{parts[0].title[1:]}",
         heading=title or parts[0].title,
@@ -219,8 +205,8 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
         replayed=provenance.replayed(everything),
         parts=parts,
         several=len(parts) > 1,
-        kind="Log" if logs else "Test report",
-        stated=not logs,
+        kind=parts[0].kind,
+        stated=any(part.stated for part in parts),
         identity=identity,
         version=errormotion.__version__,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -228,10 +214,10 @@ def _page(sources: Sequence[Source], parts: Sequence[Part], title: str | None) -
 
 
 def _identity(source: Source) -> str:
-    if monitor.is_log(source.errors):
-        attributes = source.errors.attrs
-        return f"{source.run.get('id')} {attributes.get('start')} {source.errors.sizes['time']}"
-    return str(source.errors.attrs.get("provenance", ""))
+    attributes = source.errors.attrs
+    if "provenance" in attributes:
+        return str(attributes["provenance"])
+    return f"{source.run.get('id')} {attributes.get('start')} {dict(source.errors.sizes)}"
 
 
 def _truth(sources: Sequence[Source]) -> str:
@@ -262,7 +248,7 @@ def _facts(source: Source, machine: str) -> list[tuple[str, str]]:
         ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
         ("Measured", _moment(known("started", "start", "created"))),
         ("Operator", known("operator")),
-        *([] if monitor.is_log(errors) else method),
+        *(method if "method" in attributes else []),
         ("Run", known("id", "run")),
         ("Instruments", "; ".join(_instrument(row) for row in instruments) or DASH),
     ]

@@ -9,19 +9,18 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from errormotion.plugins import InstrumentSubject, MethodSubject
+
 if TYPE_CHECKING:
     from errormotion.testing.kit import Check, CheckResult
     from errormotion.testing.pytest_classes import InstrumentConformance, MethodConformance
     from errormotion.testing.run import check_plugin, run_checks
-    from errormotion.testing.subjects import InstrumentSubject, MethodSubject
 
 _HOME = {
     "Check": "kit",
     "CheckResult": "kit",
     "InstrumentConformance": "pytest_classes",
-    "InstrumentSubject": "subjects",
     "MethodConformance": "pytest_classes",
-    "MethodSubject": "subjects",
     "check_plugin": "run",
     "run_checks": "run",
 }

@@ -16,8 +16,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.kinematics.poses import displacement
-from errormotion.plugins import Group
-from errormotion.testing.subjects import InstrumentSubject, MethodSubject
+from errormotion.plugins import Group, InstrumentSubject, MethodSubject
 from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.profiler import Profiler
 

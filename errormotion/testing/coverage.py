@@ -15,9 +15,9 @@ import numpy as np
 from scipy import stats
 
 from errormotion.kinematics.iso import DOF
+from errormotion.plugins import MethodSubject
 from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, truth_at_places, values
-from errormotion.testing.subjects import MethodSubject
 
 #: Probability that a method with the right covariance fails one of the checks below.
 FALSE_ALARM = 1e-3

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+from errormotion.plugins import InstrumentSubject, MethodSubject
 from errormotion.testing.kit import Check, CheckFailedError, run_check
 from errormotion.testing.run import checks_for
-from errormotion.testing.subjects import InstrumentSubject, MethodSubject
 
 
 def _as_test(check: Check[Any]) -> Callable[[Any], None]:

@@ -8,10 +8,9 @@ from typing import Any
 
 from errormotion import plugins
 from errormotion.errors import PluginError
-from errormotion.plugins import Group
+from errormotion.plugins import Group, InstrumentSubject, MethodSubject, load_object
 from errormotion.testing.builtin import builtin_subjects
 from errormotion.testing.kit import Check, CheckResult, run_check
-from errormotion.testing.subjects import InstrumentSubject, MethodSubject, load_object
 
 SIMULATED = "sim://cframe?seed=3"
 
@@ -64,8 +63,9 @@ def subjects_of(
 ) -> Sequence[InstrumentSubject | MethodSubject]:
     """Return what the kit examines of one plugin.
 
-    A plugin names its subject, or a tuple of subjects, in the class attribute ``conformance`` as ``module:name``. An
-    instrument without one is examined at ``sim://`` (or at ``address``) with its default settings.
+    A plugin states its subjects by the attribute ``conformance``: a function that returns one subject or a tuple of
+    them, or the text ``module:name`` of such subjects. An instrument without it is examined at ``sim://`` (or at
+    ``address``) with its default settings.
 
     Raises
     ------
@@ -73,11 +73,12 @@ def subjects_of(
         Nothing is stated and nothing can be guessed.
     """
     cls = plugins.get(group, plugin_id)
+    subjects: tuple[Any, ...] = ()
     if hasattr(cls, "conformance"):
-        stated = load_object(cls.conformance)
+        stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else cls.conformance()
         subjects = stated if isinstance(stated, tuple) else (stated,)
         if not all(isinstance(subject, InstrumentSubject | MethodSubject) for subject in subjects):
-            raise PluginError(f"'{cls.conformance}' of '{plugin_id}' is no InstrumentSubject or MethodSubject")
+            raise PluginError(f"The attribute conformance of '{plugin_id}' gives no InstrumentSubject or MethodSubject")
     else:
         subjects = builtin_subjects(group, plugin_id, cls)
     if not subjects and group == "methods":

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from errormotion.plugins import Samples
+from errormotion.plugins import InstrumentSubject, Samples
 from errormotion.testing.kit import require
-from errormotion.testing.subjects import InstrumentSubject
 
 
 @dataclass

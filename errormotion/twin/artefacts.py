@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.twin import surfaces
 
-Array = NDArray[np.float64]
 Surface = Callable[[Array, Array], ArrayLike]
 
 #: knots of a free form, m, and how many lie beyond the outline: the spline's memory of its end is 0.27 per knot

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
-
-Array = NDArray[np.float64]
 
 #: of a ball, m: nominal radius; how far the true one may be off; roundness from peak to valley
 RADIUS, RADIUS_ERROR, FORM = 12.5e-3, 3e-6, 0.5e-6

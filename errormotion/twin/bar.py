@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.twin import intersections
-
-Array = NDArray[np.float64]
 
 RADIUS = 5e-3
 #: angles in the table of what repeats every turn, and the highest harmonic in it

@@ -12,15 +12,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.beams import beam_errors, tilt_vector
 from errormotion.twin import kernels, truth
 from errormotion.twin.planes import CheckBar, SineGauge, Target, seeded_check_bar
 from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.raw.beam_direction/1"
 INCLINATION_SCHEMA = "errormotion.raw.inclination/1"

@@ -16,14 +16,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import xarray as xr
 from numpy.polynomial import polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
 from errormotion.twin.artefacts import Artefact
 from errormotion.twin.profiler import Profiler
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
 #: time constants of screw, beam and columns, s

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.twin import crossbeam as crossbeams
 from errormotion.twin import truth
 from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.profiler import Profiler
-
-Array = NDArray[np.float64]
 
 
 class CrossbeamMeasurements:

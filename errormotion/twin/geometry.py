@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, location_names
 from errormotion.kinematics.machines import Machine
-
-Array = NDArray[np.float64]
 
 #: waves over the travel, and how large the first one is on a metre of travel (it grows with the root): m, rad
 WAVES = 4

@@ -14,8 +14,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
+
 Function = TypeVar("Function", bound=Callable[..., Any])
-Array = NDArray[np.float64]
 
 _MASK = (1 << 64) - 1
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)

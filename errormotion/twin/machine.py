@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
@@ -24,8 +25,6 @@ from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
 from errormotion.twin.state import ThermalState, seeded_state
-
-Array = NDArray[np.float64]
 
 #: the spindle reaches full speed in this time, s
 SPIN_UP_TIME = 0.75

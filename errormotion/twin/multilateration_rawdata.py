@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.twists import cross_matrix, move
 from errormotion.twin import truth
 from errormotion.twin.geometry import GeometricErrors
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.raw.multilateration/1"
 #: where the reflector is with all axes at zero, m

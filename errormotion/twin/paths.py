@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
 
 #: a move along Y that warms the crossbeam up: at this feed at least, m/s, and longer than this, m
 WARM_UP_FEED, WARM_UP_WAY = 2.0 / 60, 0.2

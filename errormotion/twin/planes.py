@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.beams import turned
 from errormotion.twin import kernels
-
-Array = NDArray[np.float64]
 
 #: radius and length of the check bar by its certificate, m, and how far the true radius is off (one sigma), m
 BAR_RADIUS, BAR_LENGTH, BAR_RADIUS_ERROR = 25e-3, 0.2, 0.3e-6

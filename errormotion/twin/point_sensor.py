@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.kinematics.beams import tilt, turned
 from errormotion.twin.planes import Target
 from errormotion.twin.triangulation import Optics, key_of, speckle
-
-Array = NDArray[np.float64]
 
 #: place of the zero point while the stage stands at 0, by the drawing, m
 NOMINAL_ORIGIN = (0.05, 0.0, -0.08)

@@ -17,13 +17,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.twin import kernels, truth
 from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
 from errormotion.twin.geometry import GeometricErrors
 from errormotion.twin.probing_rawdata import Cycles, Moved, touches_dataset
 from errormotion.twin.state import ThermalState
 
-Array = NDArray[np.float64]
 ErrorAt = Callable[[Array], Array]
 
 #: balls on the table unless more are asked for

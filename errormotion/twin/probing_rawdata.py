@@ -11,10 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.twin.balls import Balls, Probe
 
-Array = NDArray[np.float64]
 Moved = tuple[int, float, ArrayLike]
 
 SCHEMA = "errormotion.raw.normal_vector/1"

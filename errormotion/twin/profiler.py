@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.twin import kernels, surfaces
 from errormotion.twin.artefacts import Artefact
-
-Array = NDArray[np.float64]
 
 _JITTER_Y, _BLOBS, _STREAMS = 1, 2, 10
 

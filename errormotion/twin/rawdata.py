@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.twin import intersections
 from errormotion.twin.frame import FrameGeometry
 
-Array = NDArray[np.float64]
 Beams = tuple[Array, Array, Array | None]
 
 SCHEMA = "errormotion.raw.spindle_drift/1"

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
-
-Array = NDArray[np.float64]
 
 #: Time in which the control takes a compensation away or brings it back, s.
 SLEW = 0.5

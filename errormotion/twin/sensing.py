@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.twin import kernels
 from errormotion.twin.bar import Bar
 from errormotion.twin.frame import FrameGeometry
 from errormotion.twin.schedule import StepProgram
 from errormotion.twin.state import ThermalState
 
-Array = NDArray[np.float64]
 Channels = NDArray[np.int64]
 
 #: grid of the slow motion, s, and its intervals per chunk

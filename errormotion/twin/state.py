@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.twin.kinds import MachineKind
 from errormotion.twin.schedule import Schedule
 from errormotion.twin.thermal import Ambient, ThermalNetwork, lag_response
-
-Array = NDArray[np.float64]
 
 _DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
 

@@ -11,9 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.twin.kernels import compiled, mixed, normal
-
-Array = NDArray[np.float64]
 
 #: shapes
 FREEFORM, PLANE, SPHERE, POCKET = 0, 1, 2, 3

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
 from errormotion.twin.profiler import Profiler
-
-Array = NDArray[np.float64]
 
 #: from one artefact to the next where nobody says otherwise, m
 SPACING = 0.2

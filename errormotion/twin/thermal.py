@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
 
 
 def lag_response(t: ArrayLike, rates: Array, times: Array, inputs: Array) -> Array:

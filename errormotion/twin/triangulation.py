@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.twin import kernels
-
-Array = NDArray[np.float64]
 
 #: rings of places in the aperture: radius as a share of the aperture's, number of places, weight of each
 _RINGS = ((0.0, 1, 1.0), (0.55, 6, 1.2), (0.9, 12, 1.0))

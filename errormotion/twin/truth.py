@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.twin.schedule import Event
 
@@ -25,11 +25,11 @@ class Origin:
 
 
 def dataset(
-    twist: NDArray[np.float64],
+    twist: Array,
     dims: str | tuple[str, ...],
     coords: Mapping[str, Any],
     component: str,
-    functional_point: NDArray[np.float64],
+    functional_point: Array,
     reference: str,
     origin: Origin,
     frame: str = "machine",

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.tilt_support import TiltSupport
 from errormotion.kinematics.beams import tilt_vector
-
-Array = NDArray[np.float64]
 
 EVERY_10 = range(0, 360, 10)
 EVERY_30 = range(0, 360, 30)

@@ -13,10 +13,10 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.kinematics.poses import displaced
+from errormotion.plugins.readings import Profiles
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import circular_pocket, swept
 from errormotion.twin.profiler import Disturbances, Profiler

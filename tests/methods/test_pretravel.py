@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import save
 from errormotion.datasets.calibrations.pretravel import (
     ROWS,
@@ -26,7 +26,6 @@ from errormotion.methods.normal_vector.identification.pretravel import (
 from errormotion.twin import VirtualMachine
 from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
 
-Array = NDArray[np.float64]
 TRAVEL = {"X": (-0.3, 0.3), "Y": (-0.25, 0.25), "Z": (0.0, 0.46)}
 STRAIN = 15e-6
 

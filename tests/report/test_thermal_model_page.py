@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from errormotion.compensation.thermal_model import Settings, check, fit
+from errormotion.compensation.thermal_model.report import write_model_report
 from errormotion.datasets.schemas import DOF
-from errormotion.report import write_model_report, write_report
+from errormotion.report import write_report
 from errormotion.report.text import fixed
 from errormotion.twin import Event, VirtualMachine
 

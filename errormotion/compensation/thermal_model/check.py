@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.compensation.thermal_model.model import ThermalModel
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.compensation.thermal_model.record import Inputs
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from errormotion.compensation.thermal_model import regression
@@ -21,8 +20,6 @@ from errormotion.compensation.thermal_model.record import instruments_of, read_r
 from errormotion.compensation.thermal_model.settings import Settings
 from errormotion.datasets import provenance
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 LAGS: tuple[tuple[float, ...], ...] = ((), (600.0,), (1800.0,), (600.0, 1800.0))
 TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (

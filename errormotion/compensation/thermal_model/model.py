@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.compensation.thermal_model.features import Feature, matrix
 from errormotion.compensation.thermal_model.record import instruments_of, read_inputs
 from errormotion.datasets import build_errors, provenance
@@ -21,8 +21,6 @@ from errormotion.datasets.schemas import DOF, Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.model.thermal/1"
 """Schema of the model as a dataset."""

@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

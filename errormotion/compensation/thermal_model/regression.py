@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from sklearn.linear_model import Ridge
 from sklearn.model_selection import LeaveOneGroupOut
 
+from errormotion.arrays import Array
 from errormotion.compensation.thermal_model.features import Feature, matrix
 from errormotion.compensation.thermal_model.record import Record
-
-Array = NDArray[np.float64]
 
 STRENGTHS = 10.0 ** np.arange(-7.0, 1.0)
 """Of the regularisation, as shares of the sum of weights; features have unit mean square."""

@@ -25,6 +25,7 @@ import xarray as xr
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.tilt_support import Hole, TiltSupport
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.folders import folders_beside
@@ -34,8 +35,6 @@ from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import inclination_rotation, tilt_vector
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.calibration.inclination/1"
 """Schema of the calibration dataset."""

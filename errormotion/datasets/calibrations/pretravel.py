@@ -19,13 +19,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
 from errormotion.errors import DatasetError
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.calibration.pretravel/1"
 """Schema of the map as a dataset."""

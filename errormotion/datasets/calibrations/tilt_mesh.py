@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
+
 if TYPE_CHECKING:
     from scipy.spatial import Delaunay
 
-Array = NDArray[np.float64]
 
 _FLAT = 1e-9
 """Singular value, relative to the largest, below which points lie on one line."""

@@ -28,10 +28,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.tilt_mesh import Mesh
 from errormotion.kinematics.beams import inclination_rotation
-
-Array = NDArray[np.float64]
 
 REACH = 1.25
 """Steps of the inclination within which a setting must lie on either side of the middle of an empty place."""

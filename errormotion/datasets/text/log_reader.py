@@ -13,7 +13,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.datasets.text.import_map import Format
+from errormotion.arrays import Array
+from errormotion.datasets.text.log_format import Format
 from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 
@@ -60,7 +61,7 @@ class Columns:
         Date and time of the first line, if the log has dates.
     """
 
-    values: dict[str, NDArray[np.float64]]
+    values: dict[str, Array]
     lines: NDArray[np.int64]
     start: str = ""
 

@@ -28,7 +28,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from errormotion.datasets.schemas import RAW_SCHEMAS, Row, variants
+from errormotion.arrays import Array
+from errormotion.datasets.schemas import Row, raw_schemas, variants
 from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.text.log_reader import Complaints
 from errormotion.datasets.tomlfile import nearest
@@ -69,7 +70,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
     header, tables = blocks(path)
     complaints = Complaints(path)
     if "schema" not in header:
-        known = ", ".join(sorted({raw.id for raw in RAW_SCHEMAS}))
+        known = ", ".join(sorted({raw.id for raw in raw_schemas()}))
         raise DatasetError(
             f"{path}: expected a line '# schema = ...' that names one of {known}; found none. "
             "Logs of other software come in by 'errormotion import'."
@@ -78,7 +79,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
     names = _Names.of(schema)
     if names is None:
         raise DatasetError(
-            f"{path}, line {line}: schema '{schema}' is not known; {nearest(schema, {raw.id for raw in RAW_SCHEMAS})}"
+            f"{path}, line {line}: schema '{schema}' is not known; {nearest(schema, {raw.id for raw in raw_schemas()})}"
         )
     found = _Found()
     for key, (line, text) in header.items():
@@ -192,9 +193,7 @@ def _units(row: Row) -> dict[str, str]:
     return {"units": row.unit} if row.unit else {}
 
 
-def _converted(
-    values: NDArray[np.float64], unit: str, row: Row, place: str, line: int, complaints: Complaints
-) -> NDArray[np.float64] | None:
+def _converted(values: Array, unit: str, row: Row, place: str, line: int, complaints: Complaints) -> Array | None:
     """Return values in the schema's unit, or None and a complaint."""
     if row.unit in ("", "1") and unit in ("", "1"):
         return values
@@ -209,7 +208,7 @@ def _converted(
 
 
 def _plausible(
-    inside: NDArray[np.float64],
+    inside: Array,
     lines: NDArray[np.int64],
     row: Row,
     place: str,
@@ -227,9 +226,7 @@ def _plausible(
     return not outside.size
 
 
-def _unit_vectors(
-    values: NDArray[np.float64], row: Row, lines: NDArray[np.int64], complaints: Complaints
-) -> NDArray[np.float64]:
+def _unit_vectors(values: Array, row: Row, lines: NDArray[np.int64], complaints: Complaints) -> Array:
     """Return directions of length 1: four digits, as people write them, leave them a little long or short."""
     if row.unit != "1" or row.dims[-1] != "direction":
         return values
@@ -240,7 +237,7 @@ def _unit_vectors(
             int(lines.flat[0]), f"{row.name}: expected a vector of length 1; found {norms.flat[wrong[0]]:.4g}"
         )
         return values
-    directions: NDArray[np.float64] = values / norms[..., None]
+    directions: Array = values / norms[..., None]
     return directions
 
 
@@ -258,7 +255,7 @@ def _read_table(table: Table, names: _Names, found: _Found, complaints: Complain
         return
     lines = np.array([number for number, _ in table.rows])
     shape = tuple(found.sizes[dim][0] for dim in record)
-    arrays: dict[str, NDArray[np.float64]] = {}
+    arrays: dict[str, Array] = {}
     for place, (row, component, unit) in columns.items():
         inside = _converted(cells[place], unit, row, f"column '{titles[place]}'", line, complaints)
         if inside is None or not _plausible(inside, lines, row, f"column '{titles[place]}'", unit, complaints):
@@ -278,9 +275,7 @@ def _read_table(table: Table, names: _Names, found: _Found, complaints: Complain
         found.variables[name] = xr.Variable(dims, array, _units(row)).transpose(*row.dims)
 
 
-def _filled(
-    shape: tuple[int, ...], places: tuple[NDArray[np.int64], ...], inside: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _filled(shape: tuple[int, ...], places: tuple[NDArray[np.int64], ...], inside: Array) -> Array:
     array = np.full(shape, np.nan)
     array[places] = inside
     return array
@@ -358,7 +353,7 @@ def _incomplete(
 
 def _cells(
     table: Table, columns: Mapping[int, tuple[Row, int | None, str]], titles: list[str], complaints: Complaints
-) -> dict[int, NDArray[np.float64]]:
+) -> dict[int, Array]:
     """Return the numbers of each column; complains of every cell that is none."""
     if not table.rows:
         complaints.add(table.head[0], "expected lines of numbers below the column names; found none")

@@ -13,9 +13,9 @@ from pydantic import Field
 
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
-from errormotion.instruments.laser_tracker.measurement import Environment
 from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins.readings import Environment
 
 UNITS = {"displacement": "m", "temperature": "degC", "pressure": "Pa", "humidity": "%"}
 

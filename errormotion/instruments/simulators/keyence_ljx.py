@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,8 @@ class SimulatedLJX(SimulatedDevice):
     Parameters of the address: ``artefact`` (``twin``, what stands on the gantry's table, see `gantry_profiles`;
     or a name of `profile_sources.SOURCES`, of which profiles are taken at a rate), ``points`` (3200), ``pitch`` (m,
     12.5e-6), ``intensity`` (0 or 1), ``trigger_start`` (0); where nothing triggers profiles, ``encoder_start`` (0),
-    ``encoder_step`` (counts from profile to profile, 25) and ``rate`` (profiles per second at ``pace=1``, 1000).
+    ``encoder_step`` (counts from profile to profile, 25) and ``rate`` (profiles per second at ``pace=1``, 1000);
+    ``notice_delay`` (s from the last profile of a stream to the notice that ends it, 0).
 
     Parameters
     ----------
@@ -56,6 +58,7 @@ class SimulatedLJX(SimulatedDevice):
         self._points = int(address.number("points", codec.MOST_POINTS))
         self._kind = INTENSITY if address.number("intensity", 0) else 0
         self._trigger_start = int(address.number("trigger_start", 0))
+        self._notice_delay = address.number("notice_delay", 0.0)
         self._program = 0
         self._x_pitch = round(address.number("pitch", 12.5e-6) / LENGTH)
         self._errors: list[int] = []
@@ -224,6 +227,7 @@ class SimulatedLJX(SimulatedDevice):
         """Send profiles until told to stop, then the notice."""
         try:
             if self._send_all(layout):
+                time.sleep(self._notice_delay)
                 self._data.send(codec.notice(1))
         finally:
             self._feed.end()

@@ -18,10 +18,11 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.kinematics.fits._axial import Cone, Cylinder
 from errormotion.kinematics.fits._robust import outliers
-from errormotion.kinematics.fits._shapes import Circle, Circle3D, Floats, Line, Plane, Shape, Sphere
+from errormotion.kinematics.fits._shapes import Circle, Circle3D, Line, Plane, Shape, Sphere
 from errormotion.kinematics.fits._solver import estimate
 from errormotion.kinematics.fits.results import CircleFit, ConeFit, CylinderFit, Fit, LineFit, PlaneFit, SphereFit
 
@@ -173,16 +174,16 @@ def fit_cone(
 
 
 class _Common(TypedDict):
-    parameters: Floats
+    parameters: Array
     parameter_names: tuple[str, ...]
-    covariance: Floats
-    residuals: Floats
+    covariance: Array
+    residuals: Array
     left_out: tuple[int, ...]
     sigma: float
     dof: int
 
 
-def _fit(shape: Shape, points: Floats, robust: bool, sigma: float | None, weights: ArrayLike | None) -> dict[str, Any]:
+def _fit(shape: Shape, points: Array, robust: bool, sigma: float | None, weights: ArrayLike | None) -> dict[str, Any]:
     """Return the fields of the result: the common ones, and the shape's parameters by name."""
     if sigma is not None and not (np.isfinite(sigma) and sigma > 0):
         raise FitError(f"expected a positive sigma in the unit of the points; found {sigma}")
@@ -207,7 +208,7 @@ def _fit(shape: Shape, points: Floats, robust: bool, sigma: float | None, weight
     return values | dict(common)
 
 
-def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Floats:
+def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Array:
     try:
         p = np.asarray(points, dtype=float)
     except (TypeError, ValueError) as error:
@@ -222,7 +223,7 @@ def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Floats:
     return p
 
 
-def _weights(weights: ArrayLike | None, n: int) -> Floats:
+def _weights(weights: ArrayLike | None, n: int) -> Array:
     if weights is None:
         return np.ones(n)
     w = np.asarray(weights, dtype=float)
@@ -231,7 +232,7 @@ def _weights(weights: ArrayLike | None, n: int) -> Floats:
     return w
 
 
-def _direction(direction: ArrayLike | None) -> Floats | None:
+def _direction(direction: ArrayLike | None) -> Array | None:
     if direction is None:
         return None
     u = np.asarray(direction, dtype=float)

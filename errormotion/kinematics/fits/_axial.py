@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from errormotion.kinematics.fits._shapes import Floats, Group, Shape, about_axis, complement, signed
+from errormotion.arrays import Array
+from errormotion.kinematics.fits._shapes import Group, Shape, about_axis, complement, signed
 
 __all__ = ["Cone", "Cylinder"]
 
@@ -24,19 +25,19 @@ class _Axial(Shape):
 
     spans = 3
     elements: int  # points that determine a candidate along a known direction
-    near: Floats | None = None
+    near: Array | None = None
     robust_tries = 24
 
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         return self._search(q, np.random.default_rng(len(q)), robust=False)
 
-    def preference(self, theta: Floats) -> float:
+    def preference(self, theta: Array) -> float:
         return 0.0 if self.near is None else -abs(float(self.near @ theta[3:6]))
 
-    def robust_starts(self, q: Floats, rng: np.random.Generator) -> Iterator[Floats]:
+    def robust_starts(self, q: Array, rng: np.random.Generator) -> Iterator[Array]:
         yield from self._search(q, rng, robust=True)
 
-    def _search(self, q: Floats, rng: np.random.Generator, *, robust: bool) -> list[Floats]:
+    def _search(self, q: Array, rng: np.random.Generator, *, robust: bool) -> list[Array]:
         q = q[rng.permutation(len(q))[:SEARCHED_POINTS]]
         u = self._directions(q)
         B = np.stack([complement(direction) for direction in u])
@@ -60,7 +61,7 @@ class _Axial(Shape):
             if np.isfinite(cost[k, i])
         ]
 
-    def _directions(self, q: Floats) -> Floats:
+    def _directions(self, q: Array) -> Array:
         """Return the principal directions of the points, and directions spread over the half sphere."""
         z = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
         turn = np.pi * (1 + np.sqrt(5)) * np.arange(DIRECTIONS)
@@ -69,11 +70,11 @@ class _Axial(Shape):
             return np.concatenate([self.near[None], spread[np.abs(spread @ self.near) > np.cos(np.radians(20))]])
         return np.concatenate([np.linalg.svd(q - q.mean(axis=0), full_matrices=False)[2], spread])
 
-    def _candidates(self, xy: Floats, h: Floats) -> tuple[Floats, Floats, Floats]:
+    def _candidates(self, xy: Array, h: Array) -> tuple[Array, Array, Array]:
         """Return centre (k, m, 2), radius at height 0 and growth per height, (k, m), for points (k, m, e, 2)."""
         raise NotImplementedError
 
-    def _vector(self, point: Floats, direction: Floats, radius: float, growth: float) -> Floats:
+    def _vector(self, point: Array, direction: Array, radius: float, growth: float) -> Array:
         raise NotImplementedError
 
 
@@ -82,7 +83,7 @@ class Cylinder(_Axial):
 
     name = "cylinder"
 
-    def __init__(self, radius: float | None = None, near: Floats | None = None) -> None:
+    def __init__(self, radius: float | None = None, near: Array | None = None) -> None:
         self.radius, self.near = radius, near
         self.groups = (Group("point", "place", 3), Group("direction", "direction", 3))
         # A known radius is held even by two lines along the cylinder, a free one only by more than a plane.
@@ -94,26 +95,26 @@ class Cylinder(_Axial):
     def scaled(self, scale: float) -> Cylinder:
         return Cylinder(None if self.radius is None else self.radius / scale, self.near)
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         _, rho, _ = about_axis(theta, q)
         return (rho - (theta[6] if self.radius is None else self.radius))[:, None]
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         h, _, n = about_axis(theta, q)
         columns = [-n, -h[:, None] * n]
         if self.radius is None:
             columns.append(np.full((len(q), 1), -1.0))
         return np.concatenate(columns, axis=1).reshape(len(q), 1, -1)
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         T = _axis_tangent(theta)
         return T if self.radius is None else T[:6, :4]
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         c, u = theta[:3], signed(theta[3:6])
         return np.array([*(c - u * (u @ c)), *u, *np.abs(theta[6:])])
 
-    def _candidates(self, xy: Floats, h: Floats) -> tuple[Floats, Floats, Floats]:
+    def _candidates(self, xy: Array, h: Array) -> tuple[Array, Array, Array]:
         del h
         if self.radius is not None and xy.shape[2] == 2:
             c = _circles_of_radius(self.radius, xy)
@@ -123,7 +124,7 @@ class Cylinder(_Axial):
         r = np.sqrt(x[..., 2] + np.sum(c**2, axis=-1))
         return c, r if self.radius is None else np.full_like(r, self.radius), np.zeros_like(r)
 
-    def _vector(self, point: Floats, direction: Floats, radius: float, growth: float) -> Floats:
+    def _vector(self, point: Array, direction: Array, radius: float, growth: float) -> Array:
         del growth
         return np.array([*point, *direction, radius][: 7 if self.radius is None else 6])
 
@@ -139,15 +140,15 @@ class Cone(_Axial):
         Group("half_angle", "angle"),
     )
 
-    def __init__(self, near: Floats | None = None) -> None:
+    def __init__(self, near: Array | None = None) -> None:
         self.near = near
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         h, rho, _ = about_axis(theta, q)
-        miss: Floats = (rho - theta[6]) * np.cos(theta[7]) - h * np.sin(theta[7])
+        miss: Array = (rho - theta[6]) * np.cos(theta[7]) - h * np.sin(theta[7])
         return miss[:, None]
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         h, rho, n = about_axis(theta, q)
         sin, cos = np.sin(theta[7]), np.cos(theta[7])
         by_point = -cos * n + sin * theta[3:6]
@@ -157,7 +158,7 @@ class Cone(_Axial):
         columns = [by_point, by_direction, by_radius[:, None], by_angle[:, None]]
         return np.concatenate(columns, axis=1).reshape(len(q), 1, 8)
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         T = np.zeros((8, 6))
         T[:7, :5] = _axis_tangent(theta)
         # The point slides along the axis to stay nearest to the origin, and the radius with it.
@@ -165,25 +166,25 @@ class Cone(_Axial):
         T[7, 5] = 1.0
         return T
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         c, u, r, angle = theta[:3], theta[3:6] / np.linalg.norm(theta[3:6]), theta[6], theta[7]
         if angle < 0:
             u, angle = -u, -angle
         slide = -(u @ c)
         return np.array([*(c + slide * u), *u, r + slide * np.tan(angle), angle])
 
-    def _candidates(self, xy: Floats, h: Floats) -> tuple[Floats, Floats, Floats]:
+    def _candidates(self, xy: Array, h: Array) -> tuple[Array, Array, Array]:
         h = h[..., None]
         x = _least_squares(np.concatenate([2 * xy, np.ones_like(h), 2 * h, h**2], axis=-1), np.sum(xy**2, axis=-1))
         c = x[..., :2]
         r = np.sqrt(x[..., 2] + np.sum(c**2, axis=-1))
         return c, r, x[..., 3] / r
 
-    def _vector(self, point: Floats, direction: Floats, radius: float, growth: float) -> Floats:
+    def _vector(self, point: Array, direction: Array, radius: float, growth: float) -> Array:
         return np.array([*point, *direction, radius, np.arctan(growth)])
 
 
-def _axis_tangent(theta: Floats) -> Floats:
+def _axis_tangent(theta: Array) -> Array:
     """Return the free steps of (point, direction, radius): two shifts across, two tilts, the radius."""
     c, u = theta[:3], theta[3:6]
     B = complement(u)
@@ -195,12 +196,12 @@ def _axis_tangent(theta: Floats) -> Floats:
     return T
 
 
-def _least_squares(A: Floats, b: Floats) -> Floats:
-    solution: Floats = (np.linalg.pinv(A, rcond=1e-9) @ b[..., None])[..., 0]
+def _least_squares(A: Array, b: Array) -> Array:
+    solution: Array = (np.linalg.pinv(A, rcond=1e-9) @ b[..., None])[..., 0]
     return solution
 
 
-def _circles_of_radius(radius: float, xy: Floats) -> Floats:
+def _circles_of_radius(radius: float, xy: Array) -> Array:
     """Return the centres, (k, 2 m, 2), of the circles of one radius through pairs of points (k, m, 2, 2)."""
     middle, chord = xy.mean(axis=2), xy[:, :, 1] - xy[:, :, 0]
     length = np.linalg.norm(chord, axis=-1, keepdims=True)

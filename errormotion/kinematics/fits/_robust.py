@@ -17,8 +17,9 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.kinematics.fits._shapes import Floats, Shape
+from errormotion.kinematics.fits._shapes import Shape
 from errormotion.kinematics.fits._solver import EPS, Frame, design, levenberg
 
 __all__ = ["FALSE_ALARMS", "outliers"]
@@ -29,7 +30,7 @@ FALSE_ALARMS = 0.01  # fits of clean Gaussian data in which any point is named; 
 SEED = 230
 
 
-def outliers(shape: Shape, points: Floats, weights: Floats, sigma: float | None) -> tuple[int, ...]:
+def outliers(shape: Shape, points: Array, weights: Array, sigma: float | None) -> tuple[int, ...]:
     """Return the indices of the points that do not belong to the shape.
 
     Raises
@@ -60,7 +61,7 @@ def outliers(shape: Shape, points: Floats, weights: Floats, sigma: float | None)
     return tuple(int(i) for i in np.flatnonzero(~clean))
 
 
-def _grown(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> Flags:
+def _grown(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
     """Refit and judge until the clean set no longer changes."""
     seen: set[bytes] = set()
     while clean.tobytes() not in seen:
@@ -72,7 +73,7 @@ def _grown(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, f
     return clean
 
 
-def _stand_out(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> bool:
+def _stand_out(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> bool:
     """Whether leaving these points out gains more than the luckiest choice of clean ones would.
 
     An F test of what the sum of squares loses; among n points there are n! / k! (n - k)! choices of k.
@@ -90,12 +91,12 @@ def _stand_out(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flag
     return bool(betainc(dof / 2, freedoms / 2, dof / (dof + max(gain, 0.0))) <= FALSE_ALARMS / 2 * np.exp(-choices))
 
 
-def _least_trimmed(shape: Shape, q: Floats, root: Floats) -> tuple[Floats, float]:
+def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
     """Return the shape that the nearest half of the points agree on best, and their robust standard deviation."""
     n, rng = len(q), np.random.default_rng(SEED)
     half = min(n - 1, (n + shape.minimum + 1) // 2)
 
-    def rank(theta: Floats) -> float:
+    def rank(theta: Array) -> float:
         return float(np.partition(_misses(shape, theta, q, root), half - 1)[half - 1])
 
     starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
@@ -108,7 +109,7 @@ def _least_trimmed(shape: Shape, q: Floats, root: Floats) -> tuple[Floats, float
     return best, rank(best) / quantile * small_sample
 
 
-def _concentrate(shape: Shape, theta: Floats, q: Floats, root: Floats, half: int) -> Floats:
+def _concentrate(shape: Shape, theta: Array, q: Array, root: Array, half: int) -> Array:
     before: NDArray[np.intp] | None = None
     for _ in range(15):
         nearest = np.sort(np.argpartition(_misses(shape, theta, q, root), half - 1)[:half])
@@ -119,7 +120,7 @@ def _concentrate(shape: Shape, theta: Floats, q: Floats, root: Floats, half: int
     return theta
 
 
-def _belongs(shape: Shape, theta: Floats, q: Floats, root: Floats, clean: Flags, floor: float) -> Flags:
+def _belongs(shape: Shape, theta: Array, q: Array, root: Array, clean: Flags, floor: float) -> Flags:
     """Judge every point by the fit to the clean set without it."""
     J, f = design(shape, theta, q, root)
     m, p = shape.components, J.shape[1]
@@ -156,8 +157,8 @@ def _normal_length(share: float, m: int) -> float:
     return NormalDist().inv_cdf((1 + share) / 2) if m == 1 else float(np.sqrt(-2 * np.log(1 - share)))
 
 
-def _misses(shape: Shape, theta: Floats, q: Floats, root: Floats) -> Floats:
-    length: Floats = np.linalg.norm(shape.residuals(theta, q), axis=1) * root
+def _misses(shape: Shape, theta: Array, q: Array, root: Array) -> Array:
+    length: Array = np.linalg.norm(shape.residuals(theta, q), axis=1) * root
     return length
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from errormotion.arrays import Array
+
 Kind = Literal["place", "direction", "length", "angle"]
 
-__all__ = ["Circle", "Circle3D", "Floats", "Group", "Line", "Plane", "Shape", "Sphere", "complement", "norms"]
+__all__ = ["Array", "Circle", "Circle3D", "Group", "Line", "Plane", "Shape", "Sphere", "complement", "norms"]
 
 
 @dataclass(frozen=True)
@@ -61,26 +61,26 @@ class Shape(ABC):
     robust_tries: int = 8
 
     @abstractmethod
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         """Return parameter vectors to start from, best first; none if the points allow none."""
 
     @abstractmethod
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         """Return the orthogonal distances, (n, components)."""
 
     @abstractmethod
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         """Return the residuals' derivative by theta, (n, components, k)."""
 
     @abstractmethod
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         """Return the free steps as columns, (k, p): theta may go to ``settle(theta + tangent @ step)``."""
 
     @abstractmethod
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         """Return the same shape with unit directions, a fixed sign, and its point nearest to the origin."""
 
-    def preference(self, theta: Floats) -> float:  # noqa: ARG002 - only shapes with a hint have one
+    def preference(self, theta: Array) -> float:  # noqa: ARG002 - only shapes with a hint have one
         """Return what is least for the shape to choose where several leave no residual."""
         return 0.0
 
@@ -88,7 +88,7 @@ class Shape(ABC):
         """Return the shape to fit when lengths are divided by ``scale``."""
         return self
 
-    def robust_starts(self, q: Floats, rng: np.random.Generator) -> Iterator[Floats]:
+    def robust_starts(self, q: Array, rng: np.random.Generator) -> Iterator[Array]:
         """Yield candidates through few points each, some of which miss the outliers."""
         for _ in range(50 * self.minimum):
             yield from self.starts(q[rng.choice(len(q), self.minimum, replace=False)])
@@ -104,29 +104,29 @@ class Line(Shape):
         self.groups = (Group("point", "place", dimensions), Group("direction", "direction", dimensions))
         self.components = dimensions - 1
 
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         middle = q.mean(axis=0)
         _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
         if s[0] - s[1] <= 1e-9 * s[0]:
             return []  # no direction is better than the others
         return [self.settle(np.concatenate([middle, axes[0]]))]
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         c, u = np.split(theta, 2)
         return (q - c) @ complement(u)
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         c, u = np.split(theta, 2)
         across = np.broadcast_to(complement(u).T, (len(q), self.components, self.dimensions))
         h = ((q - c) @ u)[:, None, None]
         return np.concatenate([-across, -h * across], axis=2)
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         c, u = np.split(theta, 2)
         B = complement(u)
         return np.block([[B, -np.outer(u, c @ B)], [np.zeros_like(B), B]])
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         c, u = np.split(theta, 2)
         u = signed(u)
         return np.concatenate([c - u * (u @ c), u])
@@ -138,27 +138,27 @@ class Plane(Shape):
     name, minimum, spans = "plane", 3, 2
     groups = (Group("point", "place", 3), Group("normal", "direction", 3))
 
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         middle = q.mean(axis=0)
         _, s, axes = np.linalg.svd(q - middle, full_matrices=False)
         if s[1] - s[2] <= 1e-9 * s[0]:
             return []
         return [self.settle(np.concatenate([middle, axes[2]]))]
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         c, u = np.split(theta, 2)
         return ((q - c) @ u)[:, None]
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         c, u = np.split(theta, 2)
         return np.concatenate([np.broadcast_to(-u, q.shape), q - c], axis=1)[:, None, :]
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         c, u = np.split(theta, 2)
         B = complement(u)
         return np.block([[u[:, None], (c @ u) * B], [np.zeros((3, 1)), B]])
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         c, u = np.split(theta, 2)
         u = signed(u)
         return np.concatenate([(u @ c) * u, u])
@@ -172,7 +172,7 @@ class Sphere(Shape):
     def __init__(self) -> None:
         self.groups = (Group("centre", "place", self.dimensions), Group("radius", "length"))
 
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         """Return Taubin's algebraic fit (IEEE Trans. PAMI 13 (1991) 1115), by singular values."""
         middle = q.mean(axis=0)
         d = q - middle
@@ -187,18 +187,18 @@ class Sphere(Shape):
         c = -a[1:] / (2 * a0)
         return [np.array([*(c + middle), np.sqrt(c @ c + mean)])]
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
-        miss: Floats = norms(q - theta[:-1])[0] - theta[-1]
+    def residuals(self, theta: Array, q: Array) -> Array:
+        miss: Array = norms(q - theta[:-1])[0] - theta[-1]
         return miss[:, None]
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         n = norms(q - theta[:-1])[1]
         return np.concatenate([-n, np.full((len(q), 1), -1.0)], axis=1).reshape(len(q), 1, -1)
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         return np.eye(len(theta))
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         return np.array([*theta[:-1], abs(theta[-1])])
 
 
@@ -214,7 +214,7 @@ class Circle3D(Shape):
     name, minimum, spans, components = "circle", 3, 2, 2
     groups = (Group("centre", "place", 3), Group("normal", "direction", 3), Group("radius", "length"))
 
-    def starts(self, q: Floats) -> list[Floats]:
+    def starts(self, q: Array) -> list[Array]:
         found = []
         for plane in Plane().starts(q):
             c, u = np.split(plane, 2)
@@ -222,49 +222,49 @@ class Circle3D(Shape):
             found = [self.settle(np.array([*(c + B @ flat[:2]), *u, flat[2]])) for flat in Circle().starts((q - c) @ B)]
         return found
 
-    def residuals(self, theta: Floats, q: Floats) -> Floats:
+    def residuals(self, theta: Array, q: Array) -> Array:
         h, rho, _ = about_axis(theta, q)
         return np.column_stack([rho - theta[6], h])
 
-    def gradient(self, theta: Floats, q: Floats) -> Floats:
+    def gradient(self, theta: Array, q: Array) -> Array:
         h, _, n = about_axis(theta, q)
         one = np.ones((len(q), 1))
         in_plane = np.concatenate([-n, -h[:, None] * n, -one], axis=1)
         across = np.concatenate([-one * theta[3:6], q - theta[:3], 0 * one], axis=1)
         return np.stack([in_plane, across], axis=1)
 
-    def tangent(self, theta: Floats) -> Floats:
+    def tangent(self, theta: Array) -> Array:
         T = np.zeros((7, 6))
         T[:3, :3] = np.eye(3)
         T[3:6, 3:5] = complement(theta[3:6])
         T[6, 5] = 1.0
         return T
 
-    def settle(self, theta: Floats) -> Floats:
+    def settle(self, theta: Array) -> Array:
         return np.array([*theta[:3], *signed(theta[3:6]), abs(theta[6])])
 
 
-def norms(d: Floats) -> tuple[Floats, Floats]:
+def norms(d: Array) -> tuple[Array, Array]:
     """Return lengths, (n,), and unit vectors, (n, dimensions); the unit vector of nothing is 0."""
     length = np.sqrt(np.einsum("ni,ni->n", d, d))
     return length, d / np.where(length > 0, length, 1.0)[:, None]
 
 
-def about_axis(theta: Floats, q: Floats) -> tuple[Floats, Floats, Floats]:
+def about_axis(theta: Array, q: Array) -> tuple[Array, Array, Array]:
     """Return height along, distance from and unit vector away from the axis (point theta[:3], direction theta[3:6])."""
     d, u = q - theta[:3], theta[3:6]
     h = d @ u
     return h, *norms(d - h[:, None] * u)
 
 
-def complement(u: Floats) -> Floats:
+def complement(u: Array) -> Array:
     """Return orthonormal vectors across the unit vector ``u`` as columns, (d, d - 1), by a Householder reflection."""
     v = u.copy()
     v[0] += np.copysign(1.0, u[0])
     return (np.eye(len(u)) - np.outer(v, v) * (2 / (v @ v)))[:, 1:]
 
 
-def signed(u: Floats) -> Floats:
+def signed(u: Array) -> Array:
     """Return the unit vector along ``u`` whose largest component is positive."""
     u = u / np.linalg.norm(u)
     return u if u[np.argmax(np.abs(u))] > 0 else -u

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.kinematics.fits._shapes import Floats, Shape, norms
+from errormotion.kinematics.fits._shapes import Shape, norms
 
 __all__ = ["Estimate", "Frame", "Solution", "design", "estimate", "levenberg"]
 
@@ -33,7 +34,7 @@ TOO_UNCERTAIN = 0.5
 class Solution:
     """Where the solver stopped."""
 
-    theta: Floats
+    theta: Array
     cost: float
     converged: bool
 
@@ -42,14 +43,14 @@ class Solution:
 class Frame:
     """Centre and scale of the points: ``q = (p - centre) / scale``."""
 
-    centre: Floats
+    centre: Array
     scale: float
 
-    def inside(self, points: Floats) -> Floats:
+    def inside(self, points: Array) -> Array:
         """Return points in the frame."""
         return (points - self.centre) / self.scale
 
-    def outside(self, shape: Shape, theta: Floats) -> tuple[Floats, Floats]:
+    def outside(self, shape: Shape, theta: Array) -> tuple[Array, Array]:
         """Return parameters in the points' own unit, and the scale of each."""
         shift: list[float] = []
         scale: list[float] = []
@@ -64,16 +65,16 @@ class Estimate:
     """A fitted shape in the points' own unit; ``residuals`` of all points, the left-out ones included."""
 
     shape: Shape
-    theta: Floats
-    covariance: Floats
-    residuals: Floats
+    theta: Array
+    covariance: Array
+    residuals: Array
     left_out: tuple[int, ...]
     sigma: float
     dof: int
 
 
 def estimate(
-    shape: Shape, points: Floats, weights: Floats, sigma: float | None, left_out: tuple[int, ...] = ()
+    shape: Shape, points: Array, weights: Array, sigma: float | None, left_out: tuple[int, ...] = ()
 ) -> Estimate:
     """Fit a shape to all points but the left-out ones.
 
@@ -112,7 +113,7 @@ def estimate(
     return Estimate(shape, outside, covariance, residuals, left_out, float(unit * frame.scale), dof)
 
 
-def design(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> tuple[Floats, Floats]:
+def design(shape: Shape, theta: Array, q: Array, root_weights: Array) -> tuple[Array, Array]:
     """Return the weighted Jacobian by the free steps, (n components, p), and the weighted residuals."""
     J = (shape.gradient(theta, q) @ shape.tangent(theta)) * root_weights[:, None, None]
     f = shape.residuals(theta, q) * root_weights[:, None]
@@ -120,7 +121,7 @@ def design(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> tupl
 
 
 def levenberg(
-    shape: Shape, theta: Floats, q: Floats, root_weights: Floats, *, limit: int = 200, last_digits: bool = True
+    shape: Shape, theta: Array, q: Array, root_weights: Array, *, limit: int = 200, last_digits: bool = True
 ) -> Solution:
     """Go from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
     damping, cost = 1e-3, np.inf
@@ -145,7 +146,7 @@ def levenberg(
     return Solution(theta, cost, converged=False)
 
 
-def _last_digits(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -> Solution:
+def _last_digits(shape: Shape, theta: Array, q: Array, root_weights: Array) -> Solution:
     """Gauss-Newton as long as its steps shrink."""
     before = np.inf
     for _ in range(100):
@@ -158,7 +159,7 @@ def _last_digits(shape: Shape, theta: Floats, q: Floats, root_weights: Floats) -
     return Solution(theta, float(f @ f), converged=True)
 
 
-def _best(shape: Shape, q: Floats, root_weights: Floats) -> Solution:
+def _best(shape: Shape, q: Array, root_weights: Array) -> Solution:
     starts = shape.starts(q)
     if not starts:
         raise FitError(f"the points single out no {shape.name}: they fit several equally well. Add points elsewhere")
@@ -169,16 +170,16 @@ def _best(shape: Shape, q: Floats, root_weights: Floats) -> Solution:
     return levenberg(shape, starts[0], q, root_weights)
 
 
-def _triangle(J: Floats, f: Floats) -> tuple[Floats, Floats]:
+def _triangle(J: Array, f: Array) -> tuple[Array, Array]:
     Q, R = np.linalg.qr(J)
     return R, np.asarray(Q.T @ f)
 
 
-def _solve(R: Floats, g: Floats) -> Floats:
+def _solve(R: Array, g: Array) -> Array:
     return np.asarray(np.linalg.lstsq(R, -g, rcond=1e-14)[0], dtype=float)
 
 
-def _frame(shape: Shape, points: Floats, weights: Floats) -> Frame:
+def _frame(shape: Shape, points: Array, weights: Array) -> Frame:
     _enough(shape, points)
     centre = np.average(points, axis=0, weights=weights)
     scale = float(np.sqrt(np.mean((points - centre) ** 2) * points.shape[1]))
@@ -187,12 +188,12 @@ def _frame(shape: Shape, points: Floats, weights: Floats) -> Frame:
     return Frame(centre, scale)
 
 
-def _enough(shape: Shape, points: Floats) -> None:
+def _enough(shape: Shape, points: Array) -> None:
     if len(points) < shape.minimum:
         raise FitError(f"a {shape.name} needs at least {shape.minimum} points; found {len(points)}. Measure more")
 
 
-def _refuse_flat(shape: Shape, points: Floats, frame: Frame) -> None:
+def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
     s = np.linalg.svd(frame.inside(points), compute_uv=False)
     rounding = 1e-12 + 100 * EPS * np.abs(points).max() / frame.scale
     spread = int(np.sum(s > rounding * s[0]))
@@ -205,7 +206,7 @@ def _refuse_flat(shape: Shape, points: Floats, frame: Frame) -> None:
         )
 
 
-def _loose(shape: Shape, points: Floats, direction: Floats) -> FitError:
+def _loose(shape: Shape, points: Array, direction: Array) -> FitError:
     """Return the error that names the parameters which may change without moving the shape off the points."""
     names, start = [], 0
     for group in shape.groups:
@@ -218,12 +219,12 @@ def _loose(shape: Shape, points: Floats, direction: Floats) -> FitError:
     )
 
 
-def _repeated(shape: Shape, points: Floats) -> str:
+def _repeated(shape: Shape, points: Array) -> str:
     distinct = len(np.unique(points, axis=0))
     return f". Only {distinct} of the {len(points)} points are distinct" if distinct < shape.minimum else ""
 
 
-def _refuse_uncertain(shape: Shape, theta: Floats, half: Floats) -> None:
+def _refuse_uncertain(shape: Shape, theta: Array, half: Array) -> None:
     start = 0
     for group in shape.groups:
         part = slice(start, start + group.size)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.kinematics.fits._shapes import Floats
+from errormotion.arrays import Array
 
 __all__ = ["CircleFit", "ConeFit", "CylinderFit", "Fit", "LineFit", "PlaneFit", "SphereFit"]
 
@@ -36,10 +36,10 @@ class Fit:
         Degrees of freedom: components of residuals less freedoms of the shape.
     """
 
-    parameters: Floats
+    parameters: Array
     parameter_names: tuple[str, ...]
-    covariance: Floats
-    residuals: Floats
+    covariance: Array
+    residuals: Array
     left_out: tuple[int, ...]
     sigma: float
     dof: int
@@ -65,32 +65,32 @@ class Fit:
 class LineFit(Fit):
     """A line: the point nearest to the points' centroid, (d,), and the unit direction, (d,)."""
 
-    point: Floats
-    direction: Floats
+    point: Array
+    direction: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlaneFit(Fit):
     """A plane: the point nearest to the points' centroid, (3,), and the unit normal, (3,)."""
 
-    point: Floats
-    normal: Floats
+    point: Array
+    normal: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CircleFit(Fit):
     """A circle: centre, (d,), radius, and in 3D the unit normal, (3,)."""
 
-    centre: Floats
+    centre: Array
     radius: float
-    normal: Floats | None = None
+    normal: Array | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereFit(Fit):
     """A sphere: centre, (3,), and radius."""
 
-    centre: Floats
+    centre: Array
     radius: float
 
 
@@ -101,8 +101,8 @@ class CylinderFit(Fit):
     A known radius is repeated here and is none of the `parameters`.
     """
 
-    point: Floats
-    direction: Floats
+    point: Array
+    direction: Array
     radius: float
 
 
@@ -113,13 +113,13 @@ class ConeFit(Fit):
     ``radius`` is that of the cone at ``point``, ``half_angle`` the one between axis and surface, rad.
     """
 
-    point: Floats
-    direction: Floats
+    point: Array
+    direction: Array
     radius: float
     half_angle: float
 
     @property
-    def apex(self) -> Floats:
+    def apex(self) -> Array:
         """The tip, (3,); infinitely far for a cylinder."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.point - self.direction * (self.radius / np.tan(self.half_angle)))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.planning import design
@@ -20,12 +21,10 @@ from errormotion.methods.beam_direction.planning import design
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.beam_direction.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 SCHEMA = "errormotion.raw.beam_direction/1"
 NO_VALUE = "no value"

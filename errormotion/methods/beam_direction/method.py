@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -33,6 +33,8 @@ class BeamDirection:
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
+    raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.beam_direction.report:chapters")
 
     def acquire(
         self,

@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -31,10 +31,10 @@ class CrossbeamScan:
             "errors between two artefacts that neither of them shows",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("line_profiler",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = ScanSettings
+    raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
 
     def acquire(
         self,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import transform_covariance
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import MethodInfo
 
-Array = NDArray[np.float64]
 
 EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
 """Errors (m, rad) of which a wrong pose and lever take their share in a plan."""

@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -32,10 +32,10 @@ class Multilateration:
             "drift that shifts and turns the machine as a whole from one set-up to the next",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("laser_tracker",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("laser_tracker",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
+    raw_schemas = lazy("errormotion.methods.multilateration.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.multilateration.report:chapters")
 
     def acquire(
         self,

@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -34,10 +34,10 @@ class NormalVector:
             "drift faster than the probing cycles follow one another",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("touch_probe",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BallSettings
+    raw_schemas = lazy("errormotion.methods.normal_vector.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.normal_vector.report:chapters")
 
     def acquire(
         self,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
@@ -18,12 +19,10 @@ from errormotion.methods.normal_vector.identification.rigid import Observations,
 from errormotion.methods.normal_vector.identification.spheres import centres
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.normal_vector.settings import Settings
     from errormotion.plugins import Method
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 TIP_RADIUS, NOISE = 3e-3, 0.25e-6
 """Taken where the settings leave them to the probe, m."""

@@ -13,7 +13,7 @@ from errormotion.methods.spindle_drift.identification.detection import identify_
 from errormotion.methods.spindle_drift.identification.drift import identify_drift
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -33,10 +33,10 @@ class SpindleDrift:
             "what moves the sensors' frame and is not in its temperature",
         ),
     )
-    needs: ClassVar[Needs] = Needs(
-        instruments=("spindle_frame",), raw_schema=SCHEMA, optional_instruments=("controller", "thermometer")
-    )
+    needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
+    raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
+    chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
 
     def acquire(
         self,

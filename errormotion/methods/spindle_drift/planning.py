@@ -8,10 +8,10 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.kinematics.beams import beam_errors
 from errormotion.methods.spindle_drift.acquisition.beams import machine_axes
 from errormotion.methods.spindle_drift.identification.beams import fisher_bound
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.method import SpindleDrift

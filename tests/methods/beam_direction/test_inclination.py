@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset, provenance
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
@@ -12,8 +12,6 @@ from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate
 from errormotion.methods.beam_direction.identification.inclination.surface import degrees_to
 from errormotion.twin import VirtualMachine
-
-Array = NDArray[np.float64]
 
 DEPTHS = 1e-3 * np.arange(-10.0, 11.0, 2.0)
 GRID = (np.radians([0.0, 10, 20, 30, 40]), np.radians(np.arange(0.0, 360.0, 30.0)))

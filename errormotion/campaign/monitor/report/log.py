@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
 
 SCHEMA = "errormotion.raw.monitor/1"
 BINS = 600

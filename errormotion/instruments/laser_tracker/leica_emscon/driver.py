@@ -14,15 +14,10 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import Packet
 from errormotion.instruments.laser_tracker.leica_emscon.link import Event, Link, RefusedError
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
 from errormotion.instruments.laser_tracker.leica_emscon.streaming import points
-from errormotion.instruments.laser_tracker.measurement import (
-    BeamBrokenError,
-    Environment,
-    Measurement,
-    Reflector,
-    polar,
-)
+from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError, Reflector, polar
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins.readings import Environment, Measurement
 
 MILLIBAR = 100.0  # Pa
 METEO = {"manual": codec.METEO_OFF, "read": codec.METEO_READ, "refraction": codec.METEO_REFRACTION}

@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from errormotion.errors import InstrumentError, ReplayError
-from errormotion.instruments.line_profiler.profile_files.readers import READERS, Scan, read_scan
+from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins.readings import Profiles, Scan
 
 FORMAT = "errormotion-scans/1"
 BLOCK = 100

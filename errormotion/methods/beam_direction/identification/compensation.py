@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, tilt, turned
 from errormotion.methods.beam_direction.identification.direction import Direction, solve
@@ -23,11 +24,9 @@ from errormotion.methods.beam_direction.identification.direction import Directio
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from errormotion.datasets.calibrations.inclination import InclinationCalibration
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
 """What all planes share: the first two where the inclination error is compensated, the last one where it is not."""

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, turned
 from errormotion.methods.beam_direction.identification.slopes import gradient_covariance
@@ -31,9 +32,7 @@ from errormotion.methods.beam_direction.identification.slopes import gradient_co
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    Array = Array
 
 GRAZING = 10.0
 """Largest gradient: the beam meets the plane at 6 degrees, and a micrometre across it is ten along the beam."""

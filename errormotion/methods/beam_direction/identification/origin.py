@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
+if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.direction import Direction
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 INDEPENDENT = 0.02
 """Least singular value of the normals, over the root of their number, at which they fix a point."""

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, tilt_text
 from errormotion.errors import MethodError
@@ -27,11 +28,9 @@ from errormotion.methods.beam_direction.identification.reading import Readings, 
 from errormotion.methods.beam_direction.identification.slopes import UNKNOWNS, PlaneFit, fit_plane_readings
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.beam_direction.identification.compensation import Planes, uncompensated
 from errormotion.methods.beam_direction.identification.origin import locate
 from errormotion.methods.beam_direction.identification.slopes import expected_covariance
@@ -14,12 +15,10 @@ from errormotion.methods.beam_direction.identification.slopes import expected_co
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.beam_direction.identification.compensation import Settled
     from errormotion.methods.beam_direction.identification.origin import Origin
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 @dataclass(frozen=True)

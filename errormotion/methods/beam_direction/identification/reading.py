@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 LOST = 0.3
 """Largest share of a plane's readings that may be missing."""

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
     Mask = NDArray[np.bool_]
 
 UNKNOWNS = 4

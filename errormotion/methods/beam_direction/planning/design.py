@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 LEAST_READINGS = 3
 """A stroke has so many readings at least, so that it shows whether it is straight."""

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import map_coordinates
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.datasets.units import format_quantity
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
     from errormotion.plugins import Method
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 PAPER = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
 """Two faces turned by 90 deg, the widest of the pairs in table 1 of Lu et al.; the inclination is not printed there."""

@@ -11,9 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.kinematics.beams import across
 from errormotion.methods.beam_direction.report.drawings import number, round_down
-from errormotion.methods.beam_direction.report.view import STROKES, Array
+from errormotion.methods.beam_direction.report.view import STROKES
 from errormotion.methods.crossbeam_scan.report.view import field
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, estimate, or_dash

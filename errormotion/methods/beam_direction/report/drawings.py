@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.spatial import ConvexHull, QhullError
 
-from errormotion.methods.beam_direction.report.view import Array, Found, across
+from errormotion.arrays import Array
+from errormotion.methods.beam_direction.report.view import Found, across
 from errormotion.report import canvas
 from errormotion.report.document import Figure
 from errormotion.report.text import ARCSEC, fixed, integer, significant

@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
+from errormotion.arrays import Array
 from errormotion.methods.beam_direction.report.drawings import look_of
-from errormotion.methods.beam_direction.report.view import STROKES, Array, Planes
+from errormotion.methods.beam_direction.report.view import STROKES, Planes
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Table, Text, estimate, or_dash
 from errormotion.report.text import DASH, finite, fixed, integer, listed

@@ -12,10 +12,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure as Canvas
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError
 from errormotion.kinematics.beams import tilt_vector
-from errormotion.methods.beam_direction.report.view import Array, Found, Planes
+from errormotion.methods.beam_direction.report.view import Found, Planes
 from errormotion.report import canvas
 from errormotion.report import maps as crossbeam_maps
 from errormotion.report.document import Block, Figure, Source, Text

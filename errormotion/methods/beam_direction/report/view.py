@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report.view import field
 
-Array = NDArray[np.float64]
 STROKES = "XYZ"
 _BEYOND = 2  # in `left_out`: out of range
 

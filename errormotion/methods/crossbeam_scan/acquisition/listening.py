@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.acquisition.programs import Program
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 BLOCK_LINES = 64
 """Most lines that are asked for at once."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = NDArray[np.float64]
+    Array = Array
     Heights = NDArray[np.float32]
 
 log = logging.getLogger(__name__)

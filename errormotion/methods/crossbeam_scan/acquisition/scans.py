@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
@@ -27,12 +28,10 @@ from errormotion.methods.crossbeam_scan.identification.cutting import interrupti
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -10,15 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.kinematics.twists import transform, transform_covariance
 from errormotion.methods.crossbeam_scan.identification import chain, strain
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import adjoint_of
 from errormotion.kinematics.twists import adjoint, cross_matrix, transform, transform_covariance
-
-Array = NDArray[np.float64]
 
 #: names of the influences and what they belong to in the budget
 SOURCES = (*(f"profiler pose {k}" for k in range(1, 7)), "lever x", "lever y", "lever z")

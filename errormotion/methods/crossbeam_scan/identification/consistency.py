@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.smoothing import ORDER, smooth
-
-Array = NDArray[np.float64]
 
 #: artefacts without which their neighbours say nothing
 FEWEST = 4

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig
 from errormotion.methods.crossbeam_scan.identification.chain import CarriageErrors, carriage_errors
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
 from errormotion.methods.crossbeam_scan.identification.smoothing import smooth_twists, warm_up_scale
-
-Array = NDArray[np.float64]
 
 PLACES, MOMENTS = 41, 41
 """Points of a curve over position and over time."""

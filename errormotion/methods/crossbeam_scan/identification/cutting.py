@@ -18,10 +18,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import OVERFLOW, folded
 
-Array = NDArray[np.float64]
 Scan = tuple[NDArray[np.float32], Array, Array, float]
 
 log = logging.getLogger(__name__)

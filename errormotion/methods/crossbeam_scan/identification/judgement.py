@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
 from errormotion.methods.crossbeam_scan.identification.consistency import Consistency, cold_repeats, moved_artefacts
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
@@ -15,7 +16,6 @@ from errormotion.methods.crossbeam_scan.identification.registrations import Regi
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-Array = NDArray[np.float64]
 
 MOVED = "the artefact had moved"
 """Reason of errors that are left out because of it."""

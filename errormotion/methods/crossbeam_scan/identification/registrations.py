@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem
@@ -23,7 +24,6 @@ from errormotion.methods.crossbeam_scan.identification.strain import DRIFT, FEED
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-Array = NDArray[np.float64]
 Scan = tuple[NDArray[np.float32], Array, Array, float]
 
 log = logging.getLogger(__name__)

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.datasets import DOF, build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig, carriage
@@ -23,7 +24,6 @@ from errormotion.methods.crossbeam_scan.identification.registrations import Maps
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-Array = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

@@ -27,9 +27,8 @@ from math import comb, factorial, prod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
-
-Array = NDArray[np.float64]
 
 #: of a curve that has the points for it
 ORDER = 3

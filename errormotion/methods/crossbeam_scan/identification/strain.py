@@ -23,15 +23,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.chain import feed_direction
-
-Array = NDArray[np.float64]
 
 FEED = ("feed_x", "feed_y", "feed_z")
 """Parameters of the registration that take the drift along a scan."""

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from errormotion.methods.crossbeam_scan.report.view import Array, Campaign, after, field, millimetres, unit_of
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, field, millimetres, unit_of
 from errormotion.report import canvas
 from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS

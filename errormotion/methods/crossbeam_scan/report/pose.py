@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
-from errormotion.methods.crossbeam_scan.report.view import Array, field, remarks
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.report.view import field, remarks
 from errormotion.report import provenance, quality
 from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, estimate
 from errormotion.report.text import fixed, integer

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report.view import (
     NO_REASON,
-    Array,
     Campaign,
     after,
     at_y,

@@ -8,7 +8,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.crossbeam_scan.report.view import Array, Campaign, after, at_y, field
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y, field
 from errormotion.report import canvas
 from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report import pose as crossbeam_pose
-from errormotion.methods.crossbeam_scan.report.view import Array, Campaign, millimetres
+from errormotion.methods.crossbeam_scan.report.view import Campaign, millimetres
 from errormotion.report import canvas
 from errormotion.report.canvas import BLUE, GREEN, PURPLE, VERMILLION
 from errormotion.report.document import Block, Cell, Figure, Text

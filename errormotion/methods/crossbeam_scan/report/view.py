@@ -10,11 +10,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.kinematics.iso import iso_names
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.text import SECOND_OF_ARC, UM, fixed
 
-Array = NDArray[np.float64]
 AXES = ("time", "position")
 NO_REASON = "no value, and the result states no reason"
 _ABSENT = ("missing", "no scan", "not scanned", "not recorded", "no line")

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 from pydantic import Field
 
+from errormotion.arrays import Array
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.acquisition.scales import Scales
@@ -25,12 +26,10 @@ from errormotion.plugins import PluginSettings
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.multilateration.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 SCHEMA = "errormotion.raw.multilateration/1"
 NO_VALUE = "no value"

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.plugins import Bench
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

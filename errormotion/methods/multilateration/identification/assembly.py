@@ -6,15 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    Array = Array
 
 BLOCK = 50_000
 """Targets that are checked at a time."""

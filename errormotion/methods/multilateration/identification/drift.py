@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.expansion import Shared
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 SAME_PLACE = 1e-9
 """Commanded places closer than this are one, m."""

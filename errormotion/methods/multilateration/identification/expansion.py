@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification.refraction import (
     index_uncertainty,
@@ -20,11 +21,10 @@ from errormotion.methods.multilateration.identification.refraction import (
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
     from errormotion.methods.multilateration.settings import Air, Expansion
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
 

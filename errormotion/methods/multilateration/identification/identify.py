@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.datasets import provenance
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import assembly, repeatability, uncertainty
@@ -33,14 +34,12 @@ from errormotion.methods.multilateration.network.solver import solve
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.multilateration.identification.repeatability import Repeatability
     from errormotion.methods.multilateration.identification.uncertainty import Parts, Scatter
     from errormotion.methods.multilateration.network.network import Network
     from errormotion.methods.multilateration.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

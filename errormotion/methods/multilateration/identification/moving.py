@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.solver import solve
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _MOST = 1000  # targets that are looked at
 _CUTS = 9

@@ -24,12 +24,11 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
-
-Array = NDArray[np.float64]
 
 AXES = ("X", "Y", "Z")
 ALIKE = "not told from "

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 @dataclass(frozen=True)

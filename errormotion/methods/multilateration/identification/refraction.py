@@ -17,12 +17,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
-    Array = NDArray[np.float64]
+    Array = Array
 
 HELIUM_NEON = 632.9912e-9
 """Wavelength in vacuum of the usual red laser, m."""

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.uncertainty import Scatter
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.identification.drift import Drift
     from errormotion.methods.multilateration.network.network import Network
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 FALSE_ALARM = 1e-3
 """Chance at which sound readings are said to contradict what is stated."""

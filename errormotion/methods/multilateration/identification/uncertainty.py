@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.model import directions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.multilateration.identification.expansion import Shared
     from errormotion.methods.multilateration.network.network import Network
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 BLOCK = 16384
 """Targets at a time."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification.parameters import ALIKE, AXES, Chain, Parametric, Term
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 CURVE_POINTS = 41
 """Positions at which an error motion is tabulated."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations, directions
 from errormotion.methods.multilateration.network.start import initial_stations
@@ -19,7 +20,7 @@ _SOME = 1000
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 WEAK = 10.0
 """So many times as uncertain as the middle one, the stations known. Of m targets one of sqrt(m) times is harmless to

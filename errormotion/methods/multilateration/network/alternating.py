@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.turning import fitted
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
 _HALF_STEPS = 2

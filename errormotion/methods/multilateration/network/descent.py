@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from errormotion.methods.multilateration.network.kernels.compiling import Array, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.problem import Problem, Sums
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import Array, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 
 LOOSE = 0.05

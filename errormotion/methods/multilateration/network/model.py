@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.network import determinacy, outliers
-from errormotion.methods.multilateration.network.kernels.compiling import Array
 from errormotion.methods.multilateration.network.kernels.examination import datum_sums, examine, residuals
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 

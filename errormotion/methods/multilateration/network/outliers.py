@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.general import screen_targets
 from errormotion.methods.multilateration.network.model import directions
 
 if TYPE_CHECKING:
     from errormotion.methods.multilateration.network.network import Network
 
-Array = NDArray[np.float64]
 
 FALSE_ALARMS = 0.01
 """Probability of leaving out any good reading of a network."""

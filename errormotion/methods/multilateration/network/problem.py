@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import Array, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.kernels.general import reduce_targets
 from errormotion.methods.multilateration.network.model import Stations
 

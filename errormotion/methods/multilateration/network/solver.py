@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.weakness import carriers
 from errormotion.methods.multilateration.network import determinacy, outliers
 from errormotion.methods.multilateration.network.descent import State, descend
-from errormotion.methods.multilateration.network.kernels.compiling import Array, compiled
+from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.kernels.examination import datum_sums
 from errormotion.methods.multilateration.network.kernels.general import settle_targets
 from errormotion.methods.multilateration.network.model import Stations

@@ -16,12 +16,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.kernels.compiling import compiled
-
-Array = NDArray[np.float64]
 
 SOME = 150
 """Readings of a station that are looked at: enough to tell where it is."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.methods.multilateration.network.kernels.compiling import Array, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 
 

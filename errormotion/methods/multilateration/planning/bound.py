@@ -8,8 +8,9 @@ readings for exact: it puts their noise into everything else, and its own covari
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network import determinacy
 from errormotion.methods.multilateration.network.descent import State
@@ -17,8 +18,6 @@ from errormotion.methods.multilateration.network.model import Stations, readings
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import state_problem
 from errormotion.methods.multilateration.network.solver import conclude
-
-Array = NDArray[np.float64]
 
 _EXACT = 1e-3
 """Noise of the first target's readings, in units of their own, that counts as none."""

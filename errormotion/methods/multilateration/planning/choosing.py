@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from errormotion.arrays import Array
 from errormotion.datasets.units import Angle, Length, Time
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.planning.box import Box, Place
 from errormotion.plugins import PluginSettings
-
-Array = NDArray[np.float64]
 
 
 class Choosing(PluginSettings):

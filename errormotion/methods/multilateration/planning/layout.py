@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.planning.sight import Sight
     from errormotion.methods.multilateration.settings import Layout
 
-Array = NDArray[np.float64]
 
 LEAST = 4
 """Stations, and readings of each."""

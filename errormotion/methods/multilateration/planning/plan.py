@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Settings
     from errormotion.plugins import MethodInfo
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 SETUPS = ("as set", "best")
 _COARSE = 4

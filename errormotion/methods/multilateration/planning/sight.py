@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from errormotion.arrays import Array
 from errormotion.datasets.units import Angle, Length
 from errormotion.methods.multilateration.planning.box import Box
 from errormotion.methods.multilateration.planning.choosing import Choosing
 from errormotion.plugins import PluginSettings
-
-Array = NDArray[np.float64]
 
 _MARGIN = 1e-9
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from errormotion.methods.multilateration.planning.sight import Planning, Sight
     from errormotion.methods.multilateration.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _ROUNDS = 3
 _ENOUGH = 0.01

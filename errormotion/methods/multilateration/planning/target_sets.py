@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.parameters import Chain, Term, first_order, unknowns
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 POWERS = {"mean": 1.0, "largest": 16.0}
 _LOOSE = 0.1

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
+if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Layout
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _ACROSS, _LEVELS = 7, 3
 

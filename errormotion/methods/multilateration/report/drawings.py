@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.multilateration.report.view import AXES, Array, Network, enlargement, thinned
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.report.view import AXES, Network, enlargement, thinned
 from errormotion.report import canvas
 from errormotion.report.document import Block, Figure, Text
 from errormotion.report.text import finite, fixed, integer, listed, significant

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.multilateration.report.view import Array
+from errormotion.arrays import Array
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Table, Text, or_dash
 from errormotion.report.text import finite, fixed, integer

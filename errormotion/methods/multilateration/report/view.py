@@ -9,9 +9,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.report.budget import FREEDOMS
-
-Array = NDArray[np.float64]
 
 AXES = ("X", "Y", "Z")
 _READING = ("station", "target")

@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.acquisition import touching
 from errormotion.plugins import Step, Touch
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 Place = tuple[float, float, float]
 

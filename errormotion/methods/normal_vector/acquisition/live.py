@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.methods.normal_vector.acquisition import cycle
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 class LiveBalls:

@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError
 from errormotion.methods.normal_vector.acquisition import cycle, touching
 from errormotion.plugins import Bench, Contact
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
+if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 def touch_normals(touches: int, elevation: float = 0.0) -> Array:

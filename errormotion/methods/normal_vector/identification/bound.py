@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.methods.normal_vector.identification.rigid import knot_weights
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.normal_vector.identification.freedoms import Motion
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 def bound(

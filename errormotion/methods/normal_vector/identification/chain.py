@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
-    Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    Array = Array
 
 
 @dataclass(frozen=True)

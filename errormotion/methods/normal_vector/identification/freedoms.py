@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    Array = Array
 
 FEWEST = 3
 """Balls that are asked for."""

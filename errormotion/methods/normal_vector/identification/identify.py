@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.identification import normals, rigid
@@ -19,11 +20,9 @@ from errormotion.methods.normal_vector.identification.reading import Readings, c
 from errormotion.methods.normal_vector.identification.spheres import Centres, centres
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

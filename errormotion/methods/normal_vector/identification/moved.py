@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.identification.rigid import Observations, Rigid, determined, fit
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.identification.freedoms import Motion
 
-    Array = NDArray[np.float64]
+    Array = Array
     Flags = NDArray[np.bool_]
 
 FALSE_ALARM = 1e-3

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.normal_vector.identification.freedoms import turned
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    Array = Array
 
 STEP = 1e-6
 """Step of the derivative, m; its square over the balls' distances is far below rounding of a twist."""

@@ -16,16 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from errormotion.arrays import Array
 from errormotion.datasets import provenance
 from errormotion.datasets.calibrations.pretravel import HIGHEST, PretravelMap, assemble, harmonics, terms_up_to, unit
 from errormotion.datasets.units import Length
 from errormotion.errors import FitError
 from errormotion.plugins import PluginSettings, Touch
-
-Array = NDArray[np.float64]
 
 SPARE = 4
 """Touches more than unknowns, at least."""

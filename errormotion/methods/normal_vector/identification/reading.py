@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.identification.rigid import Observations
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 FLAGS = {1: "no trip", 2: "tripped at the start", 3: "repeat differs", 4: "not made"}
 """What a touch's flag says; 0 is a good touch."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError, MethodError
 from errormotion.kinematics.fits import fit_sphere
 from errormotion.methods.normal_vector.identification import chain
@@ -27,7 +28,7 @@ from errormotion.methods.normal_vector.identification.freedoms import FLAT, Moti
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 SETTLED = 1e-12
 """Change of the twist, m and rad, at which the iteration ends: far below any noise, above rounding at 4 m."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
+if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.rigid import Observations
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 STEPS = 12
 FLAT = 1e-6

@@ -1,1 +1,11 @@
-"""Report chapter: probed balls."""
+"""Report chapter: probed balls during a warm-up."""
+
+from __future__ import annotations
+
+from errormotion.methods.normal_vector.report import chapter, view
+from errormotion.report.document import Part, Source
+
+
+def chapters(source: Source) -> list[Part]:
+    """Return the chapter of a result over time; none for other results."""
+    return [chapter.part(source, source.key)] if view.is_normal_vector(source.errors) else []

@@ -20,7 +20,6 @@ from errormotion.methods.normal_vector.report.view import (
     is_normal_vector,
     probing,
 )
-from errormotion.methods.spindle_drift.report.series import events
 from errormotion.report import budget, provenance, quality, sensors, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
@@ -37,6 +36,7 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.generic import unit_at
+from errormotion.report.series import events
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
 __all__ = ["is_normal_vector", "part"]

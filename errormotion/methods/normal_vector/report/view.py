@@ -9,10 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.provenance import read
-
-Array = NDArray[np.float64]
 
 USED, MISSING, WRONG, MOVED, UNDETERMINED = range(5)
 """What ``left_out`` says of a touch."""

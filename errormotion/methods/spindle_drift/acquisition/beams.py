@@ -12,21 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.kinematics.beams import across
 from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS, SCHEMA
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.plugins import Bench
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from numpy.typing import NDArray
-
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:

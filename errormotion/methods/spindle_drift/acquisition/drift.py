@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
+from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

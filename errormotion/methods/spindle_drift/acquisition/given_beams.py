@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

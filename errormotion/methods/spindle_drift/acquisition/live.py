@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
 from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
 from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
 from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _ARCSEC = np.degrees(1.0) * 3600.0
 

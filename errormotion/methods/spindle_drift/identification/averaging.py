@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from xarray.indexes import RangeIndex
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def _valid_sum(x: NDArray[Any], start: int, end: int, step: int) -> tuple[float,
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
 def _sum_rows(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: NDArray[np.float64], counts: NDArray[np.int64]
+    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
 ) -> None:  # pragma: no cover - compiled
     """Sum ``x`` (channel, sample) between consecutive ``edges``."""
     channels, windows = sums.shape
@@ -60,7 +61,7 @@ def _sum_rows(
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
 def _sum_columns(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: NDArray[np.float64], counts: NDArray[np.int64]
+    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
 ) -> None:  # pragma: no cover - compiled
     """Sum ``x`` (sample, channel) between consecutive ``edges``.
 
@@ -88,9 +89,7 @@ def _sum_columns(
                 counts[channel, window] = valid
 
 
-def window_sums(
-    values: NDArray[np.floating[Any]], edges: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Return sums and numbers of the values that are not NaN, between consecutive edges.
 
     Parameters
@@ -142,8 +141,8 @@ class Averages:
         Number of samples, valid or not.
     """
 
-    time: NDArray[np.float64]
-    mean: NDArray[np.float64]
+    time: Array
+    mean: Array
     count: NDArray[np.int64]
     expected: NDArray[np.int64]
 
@@ -159,7 +158,7 @@ class Averager:
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._own: bool | None = None
-        self._lone: tuple[NDArray[np.float64], NDArray[np.floating[Any]]] | None = None
+        self._lone: tuple[Array, NDArray[np.floating[Any]]] | None = None
         self._slack = self._full = 0.0
         self._index = -1
         self._sum = np.zeros(channels)
@@ -167,7 +166,7 @@ class Averager:
         self._time = 0.0
         self._samples = 0
 
-    def update(self, time: NDArray[np.float64], values: NDArray[np.floating[Any]]) -> Averages:
+    def update(self, time: Array, values: NDArray[np.floating[Any]]) -> Averages:
         """Take in ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
         if time.size == 0:
             return self._averages([], [], [], [])
@@ -233,7 +232,7 @@ class Averager:
         return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
 
 
-def _each(time: NDArray[np.float64], values: NDArray[np.floating[Any]]) -> Averages:
+def _each(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
     """Return every sample as a window of its own."""
     counts = np.isfinite(values).astype(np.int64)
     return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
@@ -249,7 +248,7 @@ def join(parts: list[Averages]) -> Averages:
     )
 
 
-def slices(raw: xr.Dataset) -> Iterator[tuple[NDArray[np.float64], xr.Dataset]]:
+def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     """Yield (time, slice of the dataset) of a record along ``time``, a few tens of megabytes at a time.
 
     The time comes from the variable ``time``, or from the attributes ``sample_rate`` (Hz) and ``time_start`` (s).

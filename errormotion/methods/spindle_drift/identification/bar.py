@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from errormotion.arrays import Array
 
-    Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    Array = Array
 
 SIDE = 4
 """Number of side channels: X1, X2, Y1, Y2 come first, Z last."""

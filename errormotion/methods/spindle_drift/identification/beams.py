@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import least_squares
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, turned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""

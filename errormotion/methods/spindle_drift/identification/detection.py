@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors
@@ -15,11 +16,9 @@ from errormotion.methods.spindle_drift.identification.beams import Beam, circles
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds, segment_steps
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

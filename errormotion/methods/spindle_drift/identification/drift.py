@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.hashing import DatasetHasher
-from errormotion.datasets.schemas import CHANNELS
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.averaging import one_thread
@@ -39,6 +39,7 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
     reading_sources,
     twist,
 )
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.record import Record
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

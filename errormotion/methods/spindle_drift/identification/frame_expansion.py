@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.methods.spindle_drift.identification.record import Record, sensors
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.uncertainty import State
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _MOST_KNOTS = 32
 

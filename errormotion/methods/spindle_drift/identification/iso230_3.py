@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import minimize_scalar
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.turning import turns
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
     Index = NDArray[np.int64]
 
 QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
 from errormotion.methods.spindle_drift.identification.turning import turns
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from errormotion.datasets.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 # Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
 _CHANCE = 3.3
@@ -85,9 +86,7 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
 
 
-def _scatter(
-    time: NDArray[np.float64], readings: NDArray[np.floating[Any]], speed: NDArray[np.float64], settings: Settings
-) -> Array | None:
+def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: Settings) -> Array | None:
     """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
     turning = turns(speed)
     start = int(np.argmax(turning))

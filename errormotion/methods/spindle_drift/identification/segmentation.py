@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 _TICK = 0.01
 # The moves out and back change the reading by tens of micrometres, noise and single steps by a hundredth of that.

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.spindle_drift.identification.record import Record
 
-    Array = NDArray[np.float64]
+    Array = Array
     Mask = NDArray[np.bool_]
 
 _SAME_SPEED = 0.02

@@ -20,15 +20,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.arrays import Array
 from errormotion.methods.spindle_drift.identification.bar import PARAMETERS, state_jacobian
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
+    Array = Array
 
 _BLOCK = 1024
 

@@ -1,1 +1,11 @@
-"""Report chapter: spindle drift."""
+"""Report chapter: a spindle test after ISO 230-3."""
+
+from __future__ import annotations
+
+from errormotion.methods.spindle_drift.report import chapter
+from errormotion.report.document import Part, Source
+
+
+def chapters(source: Source) -> list[Part]:
+    """Return the chapter of a drift; none for a detection of beams, which has the chapter of its component."""
+    return [chapter.part(source, source.key)] if source.errors.attrs.get("component") == "spindle" else []

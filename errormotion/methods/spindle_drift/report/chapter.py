@@ -11,7 +11,9 @@ import xarray as xr
 from errormotion.kinematics.iso import iso_names
 from errormotion.methods.spindle_drift.report import drawings as spindle_figures
 from errormotion.methods.spindle_drift.report import iso230_3, setup_drawing
-from errormotion.methods.spindle_drift.report.series import (
+from errormotion.report import budget, provenance, quality
+from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
+from errormotion.report.series import (
     QUANTITIES,
     WHAT,
     Curve,
@@ -23,8 +25,6 @@ from errormotion.methods.spindle_drift.report.series import (
     minutes_of,
     unit_of,
 )
-from errormotion.report import budget, provenance, quality
-from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
 from errormotion.report.text import UM, finite, fixed, integer, listed, minutes
 
 _AT_ONCE, _AROUND = 1 / 60, 10 / 60  # min: what is left out about a switched compensation, and what is averaged

@@ -10,22 +10,12 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.spindle_drift.report.series import Curve, Event, curves, last_known, minutes_of, running
 from errormotion.report import canvas
-from errormotion.report.canvas import BLUE, DASHES, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from errormotion.report.canvas import BLUE, DASHES
 from errormotion.report.document import Figure
+from errormotion.report.series import LOOK, Curve, Event, curves, last_known, minutes_of, running
 from errormotion.report.text import UM, fixed
 from errormotion.report.timeline import events_in_words, mark
-
-LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
-    "X1": (BLUE, None),
-    "X2": (SKY, (5, 2)),
-    "Y1": (VERMILLION, None),
-    "Y2": (ORANGE, (5, 2)),
-    "Z": (GREEN, None),
-    "A": (PURPLE, None),
-    "B": (BLUE, (5, 2)),
-}
 
 
 def overview(errors: xr.Dataset, done: Sequence[Event], key: str) -> Figure | None:

@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
-from errormotion.methods.spindle_drift.report.series import (
+from errormotion.report.document import Cell, Table, estimate
+from errormotion.report.series import (
     QUANTITIES,
     Event,
     curves,
@@ -18,7 +19,6 @@ from errormotion.methods.spindle_drift.report.series import (
     minutes_of,
     unit_of,
 )
-from errormotion.report.document import Cell, Table, estimate
 from errormotion.report.text import fixed
 
 #: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.

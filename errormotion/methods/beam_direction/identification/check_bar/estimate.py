@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.kinematics.beams import across
 from errormotion.kinematics.fits import fit_circle, fit_cylinder
 
 __all__ = ["FALSE_ALARMS", "Bar", "Judged", "judged", "settled", "start"]
 
-Array = NDArray[np.float64]
 
 FALSE_ALARMS = 0.01
 """Chance at which a bar without fault is called systematic, or noisier than stated."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from errormotion.arrays import Array
 
 __all__ = ["likeness"]
-
-Array = NDArray[np.float64]
 
 
 def likeness(f: Array, M: Array) -> tuple[float, float]:

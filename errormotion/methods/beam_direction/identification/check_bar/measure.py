@@ -15,8 +15,9 @@ from typing import Literal
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.check_bar.estimate import (
@@ -31,8 +32,6 @@ from errormotion.methods.beam_direction.identification.check_bar.scanning import
 from errormotion.methods.beam_direction.identification.check_bar.surfaces import round_bar
 
 __all__ = ["BarFit", "fit_bar", "measure_bar"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from errormotion.datasets.calibrations.inclination import InclinationCalibration
     from errormotion.methods.beam_direction.identification.compensation import Sensor
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = NDArray[np.float64]
+    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
@@ -28,7 +29,6 @@ from errormotion.methods.beam_direction.identification.check_bar.surfaces import
 
 __all__ = ["Points", "Surface", "along_curve", "over_surface", "points", "round_bar"]
 
-Array = NDArray[np.float64]
 
 AT_REST = 1e-10
 """Change of a point, m, below which it rests."""

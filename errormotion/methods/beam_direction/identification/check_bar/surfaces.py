@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across
 from errormotion.kinematics.fits import fit_circle
 
 __all__ = ["Surface", "along_curve", "over_surface", "round_bar"]
 
-Array = NDArray[np.float64]
 
 Surface = Callable[[Array], Array]
 """Gives the unit normals (n, 3) of a surface at points (n, 3) of it, measured in this order; their sign is free."""

@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from errormotion.arrays import Array
 from errormotion.datasets import provenance, validate
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, hole_texts, terms
 from errormotion.errors import MethodError
@@ -23,8 +24,6 @@ from errormotion.methods.beam_direction.identification.inclination import lines 
 from errormotion.methods.beam_direction.identification.inclination import surface as inclination_surface
 from errormotion.methods.beam_direction.identification.inclination.lines import Lines, MidRange, Readings
 from errormotion.methods.beam_direction.identification.inclination.surface import Surface
-
-Array = NDArray[np.float64]
 
 SCHEMA = "errormotion.raw.inclination/1"
 """Schema of the readings."""

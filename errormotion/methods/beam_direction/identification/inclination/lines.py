@@ -12,9 +12,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SAME = 1e-5

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import terms
-
-Array = NDArray[np.float64]
 
 HIGHEST = 12
 """Highest order that is tried."""

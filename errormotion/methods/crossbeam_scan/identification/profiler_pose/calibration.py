@@ -23,12 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from errormotion.arrays import Array
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import edges
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges import Tilt
-
-Array = NDArray[np.float64]
 
 #: a, b, g (rad), dx, dy, dz (m)
 PARAMETERS = ("a", "b", "g", "dx", "dy", "dz")

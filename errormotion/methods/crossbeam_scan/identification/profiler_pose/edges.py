@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 #: what stray light may spoil beside an edge, and how far the floor is looked at from there, m

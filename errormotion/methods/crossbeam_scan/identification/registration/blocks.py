@@ -14,13 +14,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration import kernels, sums
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
 from errormotion.methods.crossbeam_scan.identification.registration.kernels import COLUMNS, POINTS, ROWS
 from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface, repaired
-
-Array = NDArray[np.float64]
 
 LARGEST = 1.0
 """No artefact is larger than this, m: larger numbers are millimetres."""

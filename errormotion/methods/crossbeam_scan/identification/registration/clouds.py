@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
-Scan = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]
+Scan = tuple[NDArray[np.float32], Array, Array]
 Found = tuple[RigidTransform, float, int]
 
 EDGE = 20
@@ -50,7 +51,7 @@ def open3d() -> Any:
     return module
 
 
-def points_of(scan: Scan, edge: int = 0) -> NDArray[np.float64]:
+def points_of(scan: Scan, edge: int = 0) -> Array:
     """Return the points (n, 3) of a height map that have a value, without ``edge`` columns at both ends."""
     z, x, y = scan
     kept = slice(edge, z.shape[1] - edge)
@@ -79,7 +80,7 @@ def plane_icp(cold: ArrayLike, warm: ArrayLike) -> Found:
     return _icp(o3d, source, target, np.eye(4), method)
 
 
-def normals(points: ArrayLike) -> tuple[NDArray[np.float64], float]:
+def normals(points: ArrayLike) -> tuple[Array, float]:
     """Return the unit normals (n, 3) of a cloud, of either sign, from neighbours within 0.25 mm, and their variance.
 
     The variance of a normal's tilt about one direction is that of its neighbours about their plane over their spread
@@ -117,7 +118,7 @@ def _cloud(o3d: Any, points: ArrayLike) -> Any:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(values[np.isfinite(values).all(axis=1)]))
 
 
-def _icp(o3d: Any, source: Any, target: Any, begin: NDArray[np.float64], method: Any) -> Found:
+def _icp(o3d: Any, source: Any, target: Any, begin: Array, method: Any) -> Found:
     """Run ICP with tolerances below the noise of the pose."""
     fine = o3d.pipelines.registration
     criteria = fine.ICPConvergenceCriteria(1e-10, 1e-12, _ICP_STEPS)

@@ -11,7 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
-from errormotion.methods.crossbeam_scan.identification.registration.kernels import FAST, Array, compiled
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.identification.registration.kernels import FAST, compiled
 
 
 @compiled(inline="always")

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import adjoint, known_product
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import (
@@ -22,8 +22,6 @@ from errormotion.methods.crossbeam_scan.identification.registration.freedoms imp
     scales,
     undetermined,
 )
-
-Array = NDArray[np.float64]
 
 
 def _entry(i: int, j: int) -> Array:

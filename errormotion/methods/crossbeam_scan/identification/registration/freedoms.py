@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
-
-Array = NDArray[np.float64]
 
 MOTIONS = np.zeros((6, 3, 4))
 """Displacement (3,) of a point by a unit of twist, affine in its place (1, X, Y, Z): (6, 3, 4)."""

@@ -12,16 +12,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from errormotion.arrays import Array
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.registration import clouds
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import freedoms, refuse, scales
 from errormotion.methods.crossbeam_scan.identification.registration.result import Registration
 from errormotion.methods.crossbeam_scan.identification.registration.solver import inverse
-
-Array = NDArray[np.float64]
 
 NOISY = 10.0
 """Information counts beyond this many times what the noise of the normals makes of nothing."""

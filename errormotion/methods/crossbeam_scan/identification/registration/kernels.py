@@ -13,7 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from errormotion.arrays import Array
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 COLUMNS = 16

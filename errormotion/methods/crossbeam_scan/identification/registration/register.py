@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from errormotion.arrays import Array
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import THIN, BlockMap
@@ -29,7 +30,6 @@ from errormotion.methods.crossbeam_scan.identification.registration.solver impor
 from errormotion.methods.crossbeam_scan.identification.registration.start import Start, descend, search
 from errormotion.methods.crossbeam_scan.identification.registration.sums import within
 
-Array = NDArray[np.float64]
 Backend = Literal["height_map", "open3d_plane", "paper"]
 
 GATE = 5.0

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import (
     accumulate,
@@ -37,8 +37,6 @@ from errormotion.methods.crossbeam_scan.identification.registration.comparison i
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import scales
 from errormotion.methods.crossbeam_scan.identification.registration.sums import median_size_of_some
-
-Array = NDArray[np.float64]
 
 NONE = Extra.of(None)
 LINE = [2, 1]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.registration.solver import (
     Noise,
     Problem,
@@ -14,8 +14,6 @@ from errormotion.methods.crossbeam_scan.identification.registration.solver impor
     normal_equations,
     solve,
 )
-
-Array = NDArray[np.float64]
 
 SHIFTS = np.linspace(-2e-3, 2e-3, 5)
 SETTLED = 1e-7

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.methods.crossbeam_scan.identification.registration.kernels import Array, _median, compiled
+from errormotion.arrays import Array
+from errormotion.methods.crossbeam_scan.identification.registration.kernels import _median, compiled
 
 
 @compiled()

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.registration import kernels
-
-Array = NDArray[np.float64]
 
 SWEEPS = 40
 _BAND = 4

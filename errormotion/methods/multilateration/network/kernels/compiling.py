@@ -6,10 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
-import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 CHUNK = 1024

@@ -10,7 +10,8 @@ import math
 import numba
 import numpy as np
 
-from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
 from errormotion.methods.multilateration.network.kernels.four_examined import Flags, datum_four, examine_four
 from errormotion.methods.multilateration.network.kernels.general import sight
 

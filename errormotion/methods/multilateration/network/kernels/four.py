@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 
-from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, Array, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, compiled
 
 # A target with its directions this close to a plane is not moved, and has no place.
 _FLAT = 1e-13

@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, Array, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import EXACT, FAST, LANES, compiled
 
 Flags = NDArray[np.bool_]
 # Directions to the stations closer to a plane than this, squared, leave a target without a place.

@@ -15,7 +15,8 @@ import math
 import numba
 import numpy as np
 
-from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, Array, chunks, compiled
+from errormotion.arrays import Array
+from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
 from errormotion.methods.multilateration.network.kernels.four import reduce_four, screen_four, settle_four
 
 LANES = 128

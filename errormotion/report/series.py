@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from errormotion.report.canvas import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from errormotion.report.document import Source
 from errormotion.report.provenance import read
 from errormotion.report.text import SECOND_OF_ARC, UM
@@ -24,6 +25,17 @@ WHAT = {
     "A": "tilt about X",
     "B": "tilt about Y",
 }
+
+LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
+    "X1": (BLUE, None),
+    "X2": (SKY, (5, 2)),
+    "Y1": (VERMILLION, None),
+    "Y2": (ORANGE, (5, 2)),
+    "Z": (GREEN, None),
+    "A": (PURPLE, None),
+    "B": (BLUE, (5, 2)),
+}
+"""Colour and dashes of each channel and quantity."""
 
 
 @dataclass(frozen=True)

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import codecs
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from errormotion.datasets.schemas import CHANNELS
+from errormotion.datasets.text.log_format import TIMESTAMP, Column, Format, LogTable
 from errormotion.datasets.units import Angle, Length, convert
 from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.schema import CHANNELS
 
 MAP_SCHEMA = "errormotion.map/1"
-TIMESTAMP = "iso8601"
-"""Unit of a time column that holds dates and times of day."""
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _convertible(target: str) -> AfterValidator:
@@ -42,42 +36,14 @@ def _time_unit(unit: str) -> str:
     return unit
 
 
-def _known_encoding(name: str) -> str:
-    try:
-        return codecs.lookup(name).name
-    except LookupError as error:
-        raise ValueError("expected an encoding such as 'utf-8', 'cp1252' or 'utf-16'") from error
-
-
-Column = Annotated[str | Annotated[int, Field(ge=1)], Field(description="name of the column, or its number from 1")]
-
-
-class Format(_Table):
-    """How the text is written."""
-
-    encoding: Annotated[str, AfterValidator(_known_encoding)] = "utf-8"
-    delimiter: Literal[",", ";", "\t", " ", "auto"] = "auto"
-    decimal: Literal[".", ","] = "."
-    comment: str = "#"
-    header: bool = True
-    skip: int = Field(0, ge=0)
-    missing: tuple[str, ...] = ("NaN", "nan")
-
-    @model_validator(mode="after")
-    def _decimal_is_no_delimiter(self) -> Self:
-        if self.decimal == self.delimiter:
-            raise ValueError("decimal sign and delimiter are both ','; a log with decimal commas has another delimiter")
-        return self
-
-
-class TimeColumn(_Table):
+class TimeColumn(LogTable):
     """The column of the time."""
 
     column: Column
     unit: Annotated[str, AfterValidator(_time_unit)] = Field(description="a unit such as 's', or 'iso8601'")
 
 
-class Channel(_Table):
+class Channel(LogTable):
     """A column of readings, and the beam that they are along."""
 
     column: Column
@@ -101,7 +67,7 @@ class Channel(_Table):
         return self
 
 
-class Channels(_Table):
+class Channels(LogTable):
     """The five channels."""
 
     X1: Channel
@@ -115,21 +81,21 @@ class Channels(_Table):
         return channel
 
 
-class TemperatureColumn(_Table):
+class TemperatureColumn(LogTable):
     """A column of one temperature sensor."""
 
     column: Column
     unit: Annotated[str, _convertible("degC")] = Field("degC", description="unit, such as 'degC'")
 
 
-class SpeedColumn(_Table):
+class SpeedColumn(LogTable):
     """The column of the spindle speed."""
 
     column: Column
     unit: Annotated[str, _convertible("1/min")] = Field("/min", description="unit, such as '/min'")
 
 
-class ImportMap(_Table):
+class ImportMap(LogTable):
     """A map file for ``errormotion import``."""
 
     schema_: Literal["errormotion.map/1"] = Field(alias="schema", description=f'"{MAP_SCHEMA}"')

@@ -1,19 +1,9 @@
-"""What an instrument and a method are, and the registry that finds them.
-
-A plugin is a plain class, named in the entry-point group ``errormotion.instruments`` or ``errormotion.methods`` of any
-distribution. The built-in ones come through the same door. The registry reads the entry points once, loads a plugin
-only when it is asked for, and keeps a broken one in its list together with its error.
-"""
+"""What a plugin is: an instrument, a method, a kind of dataset; and the data that they exchange."""
 
 from __future__ import annotations
 
-import traceback
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
-from functools import cache
-from importlib.metadata import Distribution, EntryPoint, distributions
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
@@ -21,11 +11,10 @@ import numpy as np
 import xarray as xr
 from pydantic import BaseModel, ConfigDict
 
-from errormotion.errors import PluginError
-
 Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
-Group = Literal["instruments", "methods"]
-GROUPS: tuple[Group, ...] = ("instruments", "methods")
+
+ERRORS_SCHEMA = "errormotion.errors/1"
+"""Schema of every error dataset, whichever method it comes from."""
 
 
 class PluginSettings(BaseModel):
@@ -62,12 +51,49 @@ class MethodInfo:
 
 
 @dataclass(frozen=True)
+class DatasetInfo:
+    """Description of a kind of dataset that is neither raw data of a method nor its errors: a log, a model.
+
+    ``schemas`` are the values of the attribute ``schema`` that its datasets have. ``methods`` are the values of the
+    attribute ``method`` of error datasets that it makes, such as the predictions of a model.
+    """
+
+    id: str
+    summary: str
+    schemas: tuple[str, ...]
+    methods: tuple[str, ...] = ()
+    version: str = "1"
+
+
+@dataclass(frozen=True)
+class FigureOfMerit:
+    """One number of a result that a person looks at first: on the command line, in a summary, in a comparison.
+
+    Attributes
+    ----------
+    name : str
+        In the words of the standard that defines it, with its place or time where it has one.
+    value, expanded_uncertainty : float
+        SI; k = 2. NaN where unknown.
+    unit : str
+        SI unit of both: ``m``, ``rad``, ``1``, ``degC``.
+    limit : float, optional
+        Largest absolute value that is accepted, where one is known.
+    """
+
+    name: str
+    value: float
+    expanded_uncertainty: float
+    unit: str
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
 class Needs:
     """What a method needs: instrument kinds to acquire, a raw schema to identify."""
 
     instruments: tuple[str, ...]
     raw_schema: str
-    optional_instruments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -222,12 +248,31 @@ class Bench(Protocol):
 class Method(Protocol):
     """What is measured and how it becomes an error dataset.
 
-    A method may also have ``follow(settings)``: it returns a function that takes each acquired dataset and returns a
-    line of text for the person at the machine. It may have ``programs(settings, instruments)``: the NC programs with
-    which a machine makes the test, the name of each file to its text. And ``motions(settings, instruments)``: every
-    `Step` that the machine will make; they are held against the limits of the bench before anything moves. Both get
-    the settings of the bench's instruments by kind. And ``check(settings)``: what is wrong with files that settings
-    name, by setting, told when a campaign is read.
+    Optional attributes. Where one is heavy to import, `lazy` loads it when it is first used.
+
+    ``raw_schemas`` : tuple of `errormotion.datasets.schemas.RawSchema`
+        The tables that validation, CSV reading, import and the reference pages follow.
+    ``chapters(source)`` : list of `errormotion.report.document.Part`
+        The report of one of its error datasets; without it, the generic chapter.
+    ``figures(errors)`` : list of `FigureOfMerit`
+        The numbers that the command line and summaries show.
+    ``simulate(settings, seed)`` : (raw, truth)
+        Raw data with a known truth: a raw dataset, and an error dataset relative to the same reference.
+    ``conformance()`` : tuple of `MethodSubject`
+        What the conformance kit examines.
+    ``follow(settings)`` : function
+        Takes each acquired dataset and returns a line of text for the operator.
+    ``programs(settings, instruments)`` : mapping of str to str
+        The NC programs of the test, file name to text.
+    ``motions(settings, instruments)`` : list of `Step`
+        Every step of the machine; checked against the limits of the bench before anything moves.
+    ``check(settings)`` : mapping of str to str
+        What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
+
+    ``doctor`` : mapping of str to function
+        Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
+
+    ``programs`` and ``motions`` get the settings of the bench's instruments by kind.
     """
 
     info: ClassVar[MethodInfo]
@@ -259,148 +304,3 @@ class Method(Protocol):
 
     def plan(self, settings: Any) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect."""
-
-
-@dataclass(frozen=True)
-class Plugin:
-    """One entry of the registry: the class, or why it could not be loaded."""
-
-    id: str
-    group: Group
-    entry_point: EntryPoint
-    cls: Any = None
-    error: str = ""
-    traceback: str = ""
-
-    @property
-    def distribution(self) -> str:
-        """Name and version of the distribution that brought the plugin."""
-        return _name_and_version(self.entry_point.dist)
-
-
-#: What the registry asks of a class before it hands it out; the conformance kit asks for the rest.
-_REQUIRED: Mapping[Group, tuple[type[InstrumentInfo] | type[MethodInfo], tuple[str, ...]]] = {
-    "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
-    "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
-}
-
-
-def _name_and_version(dist: Distribution | None) -> str:
-    try:
-        return f"{dist.name} {dist.version}" if dist is not None else "unknown"
-    except (AttributeError, KeyError, OSError, TypeError):  # a distribution without readable metadata
-        return "unknown"
-
-
-@cache
-def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
-    """Read the entry points of every distribution.
-
-    Where a distribution's list cannot be read, an entry point without a value stands for it.
-    """
-    found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
-    seen: set[str] = set()
-    for dist in distributions():
-        name = _name_and_version(dist).partition(" ")[0]
-        if name in seen:  # an older copy further down the path
-            continue
-        if name != "unknown":
-            seen.add(name)
-        try:
-            points = tuple(dist.entry_points)
-        except Exception:  # noqa: BLE001 - a list of whatever form harms nobody else
-            text = dist.read_text("entry_points.txt") or ""
-            points = tuple(EntryPoint(name, "", f"errormotion.{group}") for group in GROUPS if group in text)
-        for group in GROUPS:
-            found[group].extend(point for point in points if point.group == f"errormotion.{group}")
-    return {group: tuple(points) for group, points in found.items()}
-
-
-@cache
-def _loaded(group: Group, point: EntryPoint) -> Plugin:
-    kind, required = _REQUIRED[group]
-    try:
-        if not point.value:
-            raise PluginError("entry_points.txt cannot be read; expected sections with lines 'id = module:Class'")
-        cls = point.load()
-        info = getattr(cls, "info", None)
-        if not isinstance(info, kind):
-            raise PluginError(f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}")
-        if missing := [name for name in required if not hasattr(cls, name)]:
-            raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
-        if info.id != point.name:
-            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{info.id}'")
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
-        return Plugin(
-            point.name,
-            group,
-            point,
-            error=f"{type(error).__name__}: {error}",
-            traceback=traceback.format_exc(),
-        )
-    return Plugin(point.name, group, point, cls)
-
-
-def available(group: Group) -> list[Plugin]:
-    """Return every plugin of a group, broken ones and rival claims to one id included, sorted by id."""
-    points = sorted(_found()[group], key=lambda point: point.name)
-    claims = Counter(point.name for point in points)
-    return [
-        _loaded(group, point)
-        if claims[point.name] == 1
-        else Plugin(point.name, group, point, error=_rivals(group, point.name))
-        for point in points
-    ]
-
-
-def _rivals(group: Group, plugin_id: str) -> str:
-    sources = ", ".join(_name_and_version(point.dist) for point in _found()[group] if point.name == plugin_id)
-    return f"Several distributions claim the {group.rstrip('s')} '{plugin_id}': {sources}. Remove all but one."
-
-
-def get(group: Group, plugin_id: str) -> Any:
-    """Return a plugin's class.
-
-    Raises
-    ------
-    PluginError
-        Unknown id (the nearest known ones are named), two distributions claiming one id, or a plugin that does not
-        load.
-    """
-    points = [point for point in _found()[group] if point.name == plugin_id]
-    what = group.rstrip("s")
-    if not points:
-        names = sorted({point.name for point in _found()[group]})
-        near = get_close_matches(plugin_id, names, n=1)
-        hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise PluginError(f"No {what} plugin '{plugin_id}'; there are: {', '.join(names) or 'none'}.{hint}")
-    if len(points) > 1:
-        raise PluginError(_rivals(group, plugin_id))
-    plugin = _loaded(group, points[0])
-    if plugin.error:
-        raise PluginError(f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}")
-    return plugin.cls
-
-
-def refresh() -> None:
-    """Forget what was found: entry points are read again at the next call."""
-    _found.cache_clear()
-    _loaded.cache_clear()
-
-
-__all__: Sequence[str] = [
-    "GROUPS",
-    "Bench",
-    "Identity",
-    "Instrument",
-    "InstrumentInfo",
-    "Method",
-    "MethodInfo",
-    "Needs",
-    "Plugin",
-    "PluginSettings",
-    "Samples",
-    "available",
-    "get",
-    "refresh",
-]

@@ -7,23 +7,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit, urlunsplit
 
 import xarray as xr
 
-from errormotion.errors import PluginError
-
-#: Bounds of a believable reading in SI units, by kind of instrument. Their job is to catch mm taken for m.
-PLAUSIBLE: Mapping[str, tuple[float, float]] = {
-    "point_lds": (-0.05, 0.5),
-    "spindle_frame": (-0.05, 0.5),
-    "line_profiler": (-0.5, 0.5),
-    "thermometer": (-60.0, 400.0),
-    "laser_tracker": (-160.0, 160.0),
-}
+from errormotion.plugins import kind_registry
+from errormotion.plugins.lazy import load_object
 
 #: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.
 Vector = Literal["pose", "point", "direction", "x", "y", "z", "covariance"]
@@ -34,23 +25,6 @@ def with_query(address: str, query: str) -> str:
     parts = urlsplit(address)
     joined = "&".join(part for part in (parts.query, query) if part)
     return urlunsplit(parts._replace(query=joined))
-
-
-def load_object(path: str) -> Any:
-    """Return the object that ``module:name`` names.
-
-    Raises
-    ------
-    PluginError
-        The text has not this form, the module is not there, or has no such name.
-    """
-    module, colon, name = path.partition(":")
-    if not colon:
-        raise PluginError(f"expected 'module:name', found '{path}'")
-    try:
-        return getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise PluginError(f"'{path}' does not load: {error}") from error
 
 
 LONGEST_WARM_UP = 240.0
@@ -84,7 +58,7 @@ class InstrumentSubject:
         Fault that leaves samples out (asked for with ``fault_at=10``, from the tenth on), and fault that cuts the
         frames into pieces.
     plausible : (float, float), optional
-        Lowest and highest believable reading in SI units; default by kind from ``PLAUSIBLE``. None: no bounds.
+        Lowest and highest plausible reading in SI units; default: those of its kind. None: no bounds.
     blocks : int
         How many blocks of a stream the kit looks at.
     time_limit : float
@@ -133,8 +107,8 @@ class InstrumentSubject:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Lowest and highest believable reading."""
-        return self.plausible or PLAUSIBLE.get(self.plugin.info.kind)
+        """Lowest and highest plausible reading."""
+        return self.plausible or kind_registry.plausible(self.plugin.info.kind)
 
     @property
     def streams(self) -> bool:
@@ -202,7 +176,6 @@ class MethodSubject:
         errors: xr.Dataset = self.plugin().identify(raw, self.effective_settings())
         return errors
 
-    @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
     def warm_up(self) -> None:
         """Let the plugin compile what it compiles at first use: that is no part of a check's time. Once a process."""
         if not self.compiles or self.plugin in _WARM:
@@ -217,6 +190,7 @@ class MethodSubject:
         worker.start()
         worker.join(LONGEST_WARM_UP)
 
+    @lru_cache(maxsize=1024)  # noqa: B019 - subjects live as long as the tests that share their results
     def outcome(self, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return the result and the truth of one seed."""
         raw, truth = self.make(seed)

@@ -8,23 +8,23 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from errormotion.datasets.schemas import CHANNELS, RAW_SCHEMAS
+from errormotion.arrays import Array
 from errormotion.datasets.storage import save
-from errormotion.datasets.text.import_map import (
-    TIMESTAMP,
+from errormotion.datasets.text.log_format import TIMESTAMP
+from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
+from errormotion.datasets.tomlfile import load_model
+from errormotion.datasets.units import convert
+from errormotion.datasets.validation import validate
+from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.log_import.import_map import (
     Channel,
     ImportMap,
     SpeedColumn,
     TemperatureColumn,
     TimeColumn,
 )
-from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
-from errormotion.datasets.tomlfile import load_model
-from errormotion.datasets.units import convert
-from errormotion.datasets.validation import validate
-from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
 
 _DRIFT = RAW_SCHEMAS[0]
 _ROWS = {row.name: row for row in _DRIFT.rows}
@@ -45,7 +45,7 @@ def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwr
         Text with one line an instant. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON,
         key of the map to count).
     map_file : str or Path
-        TOML; see `errormotion.datasets.text.import_map.ImportMap`.
+        TOML; see `errormotion.methods.spindle_drift.log_import.import_map.ImportMap`.
     out : str or Path
         ``.nc`` or ``.zarr``.
     overwrite : bool
@@ -121,7 +121,7 @@ def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | Temperature
     return settings.spindle_speed if table == "spindle_speed" and settings.spindle_speed else settings.time
 
 
-def _inside(key: str, values: NDArray[np.float64], settings: ImportMap) -> NDArray[np.float64]:
+def _inside(key: str, values: Array, settings: ImportMap) -> Array:
     """Return a column in inside units."""
     column = _column(key, settings)
     if column.unit == TIMESTAMP:
@@ -167,7 +167,7 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
     return xr.Dataset(variables, coords, attrs)
 
 
-def _beam_covariance(settings: ImportMap, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _beam_covariance(settings: ImportMap, direction: Array) -> Array:
     """Return (channel, 6, 6): equal in each coordinate of the origin, and across the beam in the direction."""
     C = np.zeros((len(CHANNELS), 6, 6))
     for k, name in enumerate(CHANNELS):

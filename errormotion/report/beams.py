@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.spindle_drift.report.drawings import LOOK
 from errormotion.report import canvas, provenance, quality
 from errormotion.report.document import (
     Block,
@@ -23,6 +22,7 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
+from errormotion.report.series import LOOK
 from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
 
 _UNKNOWN = "the beam was not determined"

@@ -1,0 +1,20 @@
+"""The plugin ``thermal_model``: models that predict errors from temperatures, and their predictions."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from errormotion.plugins import DatasetInfo, lazy
+
+
+class ThermalModelDataset:
+    """A thermal model as a dataset, and the error datasets that it predicts."""
+
+    info: ClassVar[DatasetInfo] = DatasetInfo(
+        id="thermal_model",
+        summary="Thermal model: errors predicted from temperatures and spindle speed",
+        schemas=("errormotion.model.thermal/1",),
+        methods=("thermal_model",),
+    )
+    violations = lazy("errormotion.compensation.thermal_model.model:violations")
+    chapters = lazy("errormotion.compensation.thermal_model.report:chapters")

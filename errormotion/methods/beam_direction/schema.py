@@ -1,0 +1,117 @@
+"""Raw schemas of the method: readings on planes and a check bar, and the readings of an inclination calibration."""
+
+from errormotion.datasets.schemas import DIRECTION, NOISE, POSITION, RADIUS, READING, UNIT_VECTOR, XYZ, RawSchema, Row
+
+_POINT_SENSOR = (
+    Row(
+        "triangulation_normal",
+        ("direction",),
+        "1",
+        *UNIT_VECTOR,
+        "normal of the sensor's triangulation plane, for the inclination compensation",
+        required=False,
+    ),
+    Row(
+        "triangulation_normal_uncertainty",
+        (),
+        "rad",
+        0.0,
+        0.5,
+        "standard uncertainty of that normal's angle about the beam",
+        required=False,
+    ),
+    Row("mid_range", (), "m", *READING, "reading at which the inclination error vanishes", required=False),
+    Row("reading_range", ("limit",), "m", *READING, "least and greatest reading of the sensor", required=False),
+    Row(
+        "speckle",
+        (),
+        "m",
+        *NOISE,
+        "standard deviation of what the surface adds along a stroke",
+        required=False,
+    ),
+    Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
+)
+
+RAW_SCHEMAS = (
+    RawSchema(
+        "errormotion.raw.beam_direction/1",
+        "planes",
+        "stage",
+        (
+            Row("distance", ("plane", "reading"), "m", -2.0, 2.0, "reading along the beam; NaN = none", missing=True),
+            Row(
+                "stage",
+                ("plane", "reading", "direction"),
+                "m",
+                *POSITION,
+                "place of the stage; NaN only where a plane has fewer readings than others",
+                missing=True,
+            ),
+            Row("nominal_direction", ("direction",), "1", *UNIT_VECTOR, "rough direction of the beam"),
+            Row("distance_noise", (), "m", *NOISE, "standard deviation of one reading"),
+            Row("nominal_origin", ("direction",), "m", *POSITION, "zero point while the stage is at 0", required=False),
+            Row(
+                "nominal_normal",
+                ("plane", "direction"),
+                "1",
+                *UNIT_VECTOR,
+                "normal of each plane as set, to compare; the method needs none",
+                required=False,
+            ),
+            *_POINT_SENSOR,
+            Row("plane_point", ("plane", "direction"), "m", *POSITION, "known point of each plane", required=False),
+            Row(
+                "plane_point_uncertainty",
+                (),
+                "m",
+                *NOISE,
+                "standard uncertainty of `plane_point` along the normal, independent by plane",
+                required=False,
+            ),
+            Row("bar_distance", ("bar_reading",), "m", -2.0, 2.0, "reading on a check bar; NaN = none", required=False),
+            Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "place of the stage there", required=False),
+            Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar", required=False),
+            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = to be found", required=False),
+        ),
+        sizes={**DIRECTION, "limit": 2},
+        labels=XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.beam_direction/1",
+        "check bar alone",
+        "bar_distance",
+        (
+            Row("bar_distance", ("bar_reading",), "m", -2.0, 2.0, "reading on a check bar; NaN = none", missing=True),
+            Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "place of the stage there"),
+            Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar"),
+            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = to be found", required=False),
+            Row("nominal_direction", ("direction",), "1", *UNIT_VECTOR, "direction of the beam"),
+            Row("distance_noise", (), "m", *NOISE, "standard deviation of one reading"),
+            Row("nominal_origin", ("direction",), "m", *POSITION, "zero point while the stage is at 0", required=False),
+            *_POINT_SENSOR,
+        ),
+        sizes={**DIRECTION, "limit": 2},
+        labels=XYZ,
+    ),
+    RawSchema(
+        "errormotion.raw.inclination/1",
+        "",
+        "group",
+        (
+            Row("reading", ("group",), "m", *READING, "of the sensor; NaN = none", missing=True),
+            Row("reference", ("group",), "m", *READING, "true depth, by an interferometer, counted as the reading is"),
+            Row("inclination", ("group",), "rad", -1.5, 1.5, "of the surface; negative: tilted the other way"),
+            Row("rotation", ("group",), "rad", -6.3, 6.3, "azimuth of the tilt from the triangulation plane"),
+            Row("reading_noise", (), "m", *NOISE, "standard deviation of one reading", required=False),
+            Row(
+                "mid_range",
+                (),
+                "m",
+                *READING,
+                "reading at which the error vanishes; 0 where not given",
+                required=False,
+            ),
+        ),
+    ),
+)

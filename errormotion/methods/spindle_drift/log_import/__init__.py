@@ -1,0 +1,1 @@
+"""Logs of a lab become raw datasets of the method: columns of text, described by a map."""

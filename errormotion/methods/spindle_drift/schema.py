@@ -1,0 +1,128 @@
+"""Raw schema of the method: the variables of a drift record and of a beam detection."""
+
+from errormotion.datasets.schemas import (
+    DIRECTION,
+    NO_LIMIT,
+    NOISE,
+    POSITION,
+    RADIUS,
+    READING,
+    UNIT_VECTOR,
+    XYZ,
+    RawSchema,
+    Row,
+)
+
+CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
+"""Channels of the five-sensor frame."""
+
+_STEPPED_SPHERE = (
+    Row(
+        "sphere_centre",
+        ("channel", "profile", "step", "direction"),
+        "m",
+        *POSITION,
+        "commanded centre of the sphere",
+    ),
+    Row("sphere_radius", (), "m", *RADIUS, "radius of the calibrated sphere"),
+    Row("scan_direction", ("channel", "profile", "direction"), "1", *UNIT_VECTOR, "direction of the steps"),
+    Row("nominal_origin", ("channel", "direction"), "m", *POSITION, "origin of the beam, from the drawing"),
+    Row(
+        "nominal_direction",
+        ("channel", "direction"),
+        "1",
+        *UNIT_VECTOR,
+        "direction of the beam, from the drawing",
+    ),
+)
+
+RAW_SCHEMAS = (
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
+        "drift",
+        "time",
+        (
+            Row(
+                "distance",
+                ("channel", "time"),
+                "m",
+                *READING,
+                "reading along the beam from its origin; NaN = none",
+                missing=True,
+            ),
+            Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "increasing; or the attribute `sample_rate` (Hz)"),
+            Row("beam_origin", ("channel", "direction"), "m", *POSITION, "place where the reading is zero"),
+            Row("beam_direction", ("channel", "direction"), "1", *UNIT_VECTOR, "unit vector from sensor to bar"),
+            Row(
+                "beam_covariance",
+                ("channel", "p", "p_"),
+                "",
+                -1e-2,
+                1e-2,
+                "covariance of (origin, direction), one draw for the record; m^2, m, 1",
+                required=False,
+            ),
+            Row("bar_radius", (), "m", *RADIUS, "radius of the bar at the side beams"),
+            Row("distance_noise", (), "m", *NOISE, "standard deviation of one sample of `distance`"),
+            Row("level", ("height",), "m", *POSITION, "z of the levels L1 and L2"),
+            Row(
+                "temperature", ("time", "sensor"), "degC", -60.0, 200.0, "of each sensor; NaN = unknown", required=False
+            ),
+            Row("spindle_speed", ("time",), "1/min", -5e5, 5e5, "turns per minute; NaN = unknown", required=False),
+            Row(
+                "frame_expansion",
+                ("channel", "direction"),
+                "m/K",
+                -1e-4,
+                1e-4,
+                "how each beam's origin moves as the measuring frame warms",
+                required=False,
+            ),
+            Row("nominal_origin", ("channel", "direction"), "m", *POSITION, "from the drawing", required=False),
+            Row("nominal_direction", ("channel", "direction"), "1", *UNIT_VECTOR, "from the drawing", required=False),
+        ),
+        sizes={**DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
+        labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
+    ),
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
+        "beam detection as recorded",
+        "scan",
+        (
+            Row(
+                "record", ("sample",), "m", *READING, "reading along the beam that is scanned; NaN = none", missing=True
+            ),
+            Row("scan", ("sample",), "", 0, 1000, "number of the scan: channel times profiles plus profile"),
+            Row("attempt", ("sample",), "", 0, 1000, "number of the attempt; the last one counts", required=False),
+            *_STEPPED_SPHERE,
+        ),
+        sizes={**DIRECTION, "channel": 5},
+        labels={**XYZ, "channel": CHANNELS},
+    ),
+    RawSchema(
+        "errormotion.raw.spindle_drift/1",
+        "beam detection",
+        "step",
+        (
+            Row(
+                "distance",
+                ("channel", "profile", "step"),
+                "m",
+                *READING,
+                "mean reading at rest; NaN = none",
+                missing=True,
+            ),
+            *_STEPPED_SPHERE,
+            Row(
+                "distance_noise",
+                (),
+                "m",
+                *NOISE,
+                "standard deviation of one value of `distance`",
+                required=False,
+            ),
+        ),
+        sizes={**DIRECTION, "channel": 5},
+        labels={**XYZ, "channel": CHANNELS},
+    ),
+)

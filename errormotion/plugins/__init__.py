@@ -1,0 +1,77 @@
+"""Plugins: what an instrument, a method and a kind of dataset are, and the registry that finds them.
+
+A plugin is a plain class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods`` or
+``errormotion.datasets`` of any distribution. The built-in ones come through the same door.
+"""
+
+from errormotion.plugins.contracts import (
+    ERRORS_SCHEMA,
+    Bench,
+    Contact,
+    DatasetInfo,
+    FigureOfMerit,
+    Identity,
+    Instrument,
+    InstrumentInfo,
+    Method,
+    MethodInfo,
+    Needs,
+    PluginSettings,
+    Samples,
+    Status,
+    Step,
+    Touch,
+)
+from errormotion.plugins.kind_registry import contract
+from errormotion.plugins.lazy import lazy, load_object
+from errormotion.plugins.readings import Environment, FrameGeometry, Measurement, Profiles, Scan
+from errormotion.plugins.registry import (
+    GROUPS,
+    Group,
+    Plugin,
+    available,
+    get,
+    loaded,
+    owner_of_method,
+    owner_of_schema,
+    refresh,
+)
+from errormotion.plugins.subjects import InstrumentSubject, MethodSubject
+
+__all__ = [
+    "ERRORS_SCHEMA",
+    "GROUPS",
+    "Bench",
+    "Contact",
+    "DatasetInfo",
+    "Environment",
+    "FigureOfMerit",
+    "FrameGeometry",
+    "Group",
+    "Identity",
+    "Instrument",
+    "InstrumentInfo",
+    "InstrumentSubject",
+    "Measurement",
+    "Method",
+    "MethodInfo",
+    "MethodSubject",
+    "Needs",
+    "Plugin",
+    "PluginSettings",
+    "Profiles",
+    "Samples",
+    "Scan",
+    "Status",
+    "Step",
+    "Touch",
+    "available",
+    "contract",
+    "get",
+    "lazy",
+    "load_object",
+    "loaded",
+    "owner_of_method",
+    "owner_of_schema",
+    "refresh",
+]

@@ -1,0 +1,38 @@
+"""Attributes of a plugin class that are imported when they are first used."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from errormotion.errors import PluginError
+
+
+def load_object(path: str) -> Any:
+    """Return the object that ``module:name`` names.
+
+    Raises
+    ------
+    PluginError
+        The text does not have this form, the module does not exist, or it has no such name.
+    """
+    module, colon, name = path.partition(":")
+    if not colon:
+        raise PluginError(f"expected 'module:name', found '{path}'")
+    try:
+        return getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise PluginError(f"'{path}' does not load: {error}") from error
+
+
+class lazy:  # noqa: N801 - reads like `property` and `cached_property`
+    """A class attribute that is imported when it is first used: ``chapters = lazy("my_lab.report:chapters")``.
+
+    A function is returned as it is, without an instance as its first argument.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __get__(self, instance: object, owner: type | None = None) -> Any:
+        return load_object(self.path)

@@ -1,0 +1,197 @@
+"""The registry: finds plugins through the entry points of all distributions.
+
+The built-in plugins come through the same door. The entry points are read once, a plugin is loaded when it is first
+used, and a broken plugin stays in the list together with its error.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import Distribution, EntryPoint, distributions
+from typing import Any, Literal
+
+from errormotion.errors import PluginError
+from errormotion.plugins import kind_registry
+from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInfo
+
+Group = Literal["instruments", "methods", "datasets"]
+GROUPS: tuple[Group, ...] = ("instruments", "methods", "datasets")
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One entry of the registry: the class, or why it could not be loaded."""
+
+    id: str
+    group: Group
+    entry_point: EntryPoint
+    cls: Any = None
+    error: str = ""
+    traceback: str = ""
+
+    @property
+    def distribution(self) -> str:
+        """Name and version of the distribution that brought the plugin."""
+        return _name_and_version(self.entry_point.dist)
+
+
+#: What the registry asks of a class before it hands it out; the conformance kit asks for the rest.
+_REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo], tuple[str, ...]]] = {
+    "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
+    "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
+    "datasets": (DatasetInfo, ()),
+}
+
+
+def _name_and_version(dist: Distribution | None) -> str:
+    try:
+        return f"{dist.name} {dist.version}" if dist is not None else "unknown"
+    except (AttributeError, KeyError, OSError, TypeError):  # a distribution without readable metadata
+        return "unknown"
+
+
+@cache
+def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
+    """Read the entry points of every distribution.
+
+    Where a distribution's list cannot be read, an entry point without a value stands for it.
+    """
+    found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
+    seen: set[str] = set()
+    for dist in distributions():
+        name = _name_and_version(dist).partition(" ")[0]
+        if name in seen:  # an older copy further down the path
+            continue
+        if name != "unknown":
+            seen.add(name)
+        try:
+            points = tuple(dist.entry_points)
+        except Exception:  # noqa: BLE001 - a list of whatever form harms nobody else
+            text = dist.read_text("entry_points.txt") or ""
+            points = tuple(EntryPoint(name, "", f"errormotion.{group}") for group in GROUPS if group in text)
+        for group in GROUPS:
+            found[group].extend(point for point in points if point.group == f"errormotion.{group}")
+    return {group: tuple(points) for group, points in found.items()}
+
+
+@cache
+def _loaded(group: Group, point: EntryPoint) -> Plugin:
+    kind, required = _REQUIRED[group]
+    try:
+        if not point.value:
+            raise PluginError("entry_points.txt cannot be read; expected sections with lines 'id = module:Class'")
+        cls = point.load()
+        info = getattr(cls, "info", None)
+        if not isinstance(info, kind):
+            raise PluginError(f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}")
+        if missing := [name for name in required if not hasattr(cls, name)]:
+            raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
+        if info.id != point.name:
+            raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{info.id}'")
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
+        return Plugin(
+            point.name,
+            group,
+            point,
+            error=f"{type(error).__name__}: {error}",
+            traceback=traceback.format_exc(),
+        )
+    return Plugin(point.name, group, point, cls)
+
+
+def available(group: Group) -> list[Plugin]:
+    """Return every plugin of a group, broken ones and rival claims to one id included, sorted by id."""
+    points = sorted(_found()[group], key=lambda point: point.name)
+    claims = Counter(point.name for point in points)
+    return [
+        _loaded(group, point)
+        if claims[point.name] == 1
+        else Plugin(point.name, group, point, error=_rivals(group, point.name))
+        for point in points
+    ]
+
+
+def _rivals(group: Group, plugin_id: str) -> str:
+    sources = ", ".join(_name_and_version(point.dist) for point in _found()[group] if point.name == plugin_id)
+    return f"Several distributions claim the {group.rstrip('s')} '{plugin_id}': {sources}. Remove all but one."
+
+
+def get(group: Group, plugin_id: str) -> Any:
+    """Return a plugin's class.
+
+    Raises
+    ------
+    PluginError
+        Unknown id (the nearest known ones are named), two distributions claiming one id, or a plugin that does not
+        load.
+    """
+    points = [point for point in _found()[group] if point.name == plugin_id]
+    what = group.rstrip("s")
+    if not points:
+        names = sorted({point.name for point in _found()[group]})
+        near = get_close_matches(plugin_id, names, n=1)
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        raise PluginError(f"No {what} plugin '{plugin_id}'; there are: {', '.join(names) or 'none'}.{hint}")
+    if len(points) > 1:
+        raise PluginError(_rivals(group, plugin_id))
+    plugin = _loaded(group, points[0])
+    if plugin.error:
+        raise PluginError(f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}")
+    return plugin.cls
+
+
+def loaded(*groups: Group) -> Iterator[Any]:
+    """Yield the class of every plugin of some groups that loads."""
+    for group in groups:
+        for plugin in available(group):
+            if plugin.cls is not None:
+                yield plugin.cls
+
+
+def owner_of_schema(schema: str) -> Any:
+    """Return the plugin class whose datasets have this schema; None where no plugin claims it.
+
+    A schema ``errormotion.raw.NAME/1`` is looked for in the plugin NAME first.
+    """
+    name = schema.removeprefix("errormotion.").removeprefix("raw.").partition("/")[0]
+    for cls in _named_first(name, ("methods", "datasets")):
+        if schema in _schemas_of(cls):
+            return cls
+    return None
+
+
+def owner_of_method(method: str) -> Any:
+    """Return the plugin class that makes error datasets with this attribute ``method``; None where there is none."""
+    for cls in _named_first(method, ("methods", "datasets")):
+        if method == cls.info.id or method in getattr(cls.info, "methods", ()):
+            return cls
+    return None
+
+
+def _named_first(name: str, groups: tuple[Group, ...]) -> Iterator[Any]:
+    """Yield the plugins of one name, then all others; so that the usual case loads one plugin."""
+    for group in groups:
+        if sum(point.name == name for point in _found()[group]) == 1:
+            plugin = _loaded(group, next(point for point in _found()[group] if point.name == name))
+            if plugin.cls is not None:
+                yield plugin.cls
+    yield from loaded(*groups)
+
+
+def _schemas_of(cls: Any) -> set[str]:
+    own = set(getattr(cls.info, "schemas", ()))
+    if hasattr(cls, "needs"):
+        own.add(cls.needs.raw_schema)
+    return own | {table.id for table in getattr(cls, "raw_schemas", ())}
+
+
+def refresh() -> None:
+    """Forget what was found: entry points are read again at the next call."""
+    _found.cache_clear()
+    _loaded.cache_clear()
+    kind_registry.refresh()
