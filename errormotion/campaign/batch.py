@@ -30,6 +30,7 @@ from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
+from errormotion.datasets.hashing import has_hash
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import PluginSettings
@@ -399,12 +400,10 @@ def _identify_or_raise(task: Task) -> bool:
     plain = provenance.plain(settings.model_dump(mode="json"))
     path = Path(task.out)
     with reading(task.raw), datasets.load(task.raw) as dataset:
-        mark = {
-            "raw": datasets.hash_dataset(dataset),
-            "settings": settings_hash(plain, task.method_id, task.method_version),
-        }
+        settings_mark = settings_hash(plain, task.method_id, task.method_version)
         if path.exists():
-            if datasets.load(path).attrs.get(MARK) == json.dumps(mark):
+            found = json.loads(datasets.load(path).attrs.get(MARK, "{}"))
+            if found.get("settings") == settings_mark and has_hash(dataset, str(found.get("raw"))):
                 return True
             raise DatasetError(
                 f"{path}: exists already, from other raw data, other settings or another version of the method, and "
@@ -412,6 +411,7 @@ def _identify_or_raise(task: Task) -> bool:
             )
         with _turn if _one_thread_at_a_time() else nullcontext():
             errors = method().identify(dataset, settings)
+        mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)
     with _local_locks():
         datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), path)

@@ -21,6 +21,7 @@ from errormotion.twin.kinds import machine_kind
 from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import Sensing
+from errormotion.twin.stage_sensor import StageSensor
 from errormotion.twin.state import ThermalState, seeded_state
 
 #: the spindle reaches full speed in this time, s
@@ -32,7 +33,7 @@ _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "prob
 _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(ProbeMeasurements):
+class VirtualMachine(StageSensor, ProbeMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same

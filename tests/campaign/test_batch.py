@@ -1,5 +1,6 @@
 """Many runs give the same errors wherever they are identified; what breaks, breaks alone."""
 
+import json
 import os
 import subprocess
 import sys
@@ -158,6 +159,17 @@ def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, 
     outcomes = identify()
     assert [outcome.stepped_over for outcome in outcomes] == [True, True, False, False, False]
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
+
+
+def test_result_of_an_earlier_version_is_recognised_by_the_hash_it_carries(
+    raws: list[Path], identify: Identify, tmp_path: Path
+) -> None:
+    (outcome,) = identify(raws[:1])
+    errors = datasets.load(outcome.errors)
+    with datasets.load(raws[0]) as raw:
+        mark = json.loads(errors.attrs[batch.MARK]) | {"raw": datasets.hash_dataset(raw, "sha256")}
+    datasets.save(errors.assign_attrs({batch.MARK: json.dumps(mark)}), outcome.errors, overwrite=True)
+    assert [each.stepped_over for each in identify(raws[:1])] == [True]
 
 
 def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:

@@ -124,7 +124,5 @@ def _temperature(raw, radius, shape, notes):
     coefficient = float(raw["expansion"])
     return coefficient * radius * excess, {
         "expansion coefficient of the bar": radius * excess * _scalar(raw, "expansion_uncertainty", 0.0),
-        "temperature of the bar": np.full(
-            shape, coefficient * radius * _scalar(raw, "temperature_uncertainty", 0.0)
-        ),
+        "temperature of the bar": np.full(shape, coefficient * radius * _scalar(raw, "temperature_uncertainty", 0.0)),
     }

@@ -98,9 +98,7 @@ def average(circles, residual, model, settings, notes):
         u = np.where(count > 0, noise / np.sqrt(count), np.nan).reshape(2, places)
     value = mean(r).reshape(2, places) + model
     check_gaps(count.reshape(2, places), settings)
-    return Sectors(
-        value, u, count.reshape(2, places), shared, noise, slope if spread else np.nan, drift_u
-    )
+    return Sectors(value, u, count.reshape(2, places), shared, noise, slope if spread else np.nan, drift_u)
 
 
 def _determined(since, time, spread):
@@ -166,7 +164,9 @@ def first_model(circles, deviation, decay):
 
 def sector_design(circles, settings):
     """Return the means over sectors of circle and parameters, (2, place, 3 + 9)."""
-    angle = np.broadcast_to(sector_angles(settings.places), (2, settings.places, sector_angles(settings.places).shape[1]))
+    angle = np.broadcast_to(
+        sector_angles(settings.places), (2, settings.places, sector_angles(settings.places).shape[1])
+    )
     sense = np.array([1.0, -1.0])[:, None, None]
     path = basis(angle, np.broadcast_to(sense, angle.shape), circles.radius, circles.feed, settings.spike_decay)
     return np.concatenate([circle(angle), path], axis=-1).mean(axis=2)
