@@ -269,6 +269,9 @@ class Method(Protocol):
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
+    ``doctor`` : mapping of str to function
+        Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
+
     ``programs`` and ``motions`` get the settings of the bench's instruments by kind.
     """
 

@@ -275,6 +275,6 @@ def test_threads_take_turns_where_numba_is_not_safe(raws: list[Path], tmp_path: 
         check=False,
     )
     assert "one run at a time" in done.stderr
-    assert "4 identified, 0 there already, 1 failed" in done.stdout
+    assert "4 identified, 0 existed already, 1 failed" in done.stdout
     assert f"failed: {raws[2]}: is truncated" in done.stdout
     assert done.returncode == 1

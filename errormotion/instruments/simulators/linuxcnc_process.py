@@ -57,6 +57,19 @@ def installed() -> str:
     return f"LinuxCNC {done.stdout.strip()}"
 
 
+def for_doctor() -> str:
+    """Return which LinuxCNC is installed; only its simulation needs one, so none is no failure, a broken one is."""
+    if shutil.which("linuxcnc") is None:
+        return f"not installed; needed for sim://.../linuxcnc only: {why_not()}"
+    if reason := why_not():
+        raise InstrumentError(reason)
+    return f"{installed()}, for sim://.../linuxcnc"
+
+
+DOCTOR = {"LinuxCNC": for_doctor}
+"""Checks for ``errormotion doctor``."""
+
+
 class LinuxCNCProcess:
     """A LinuxCNC that runs from the files of a folder.
 

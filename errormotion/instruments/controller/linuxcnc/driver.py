@@ -13,7 +13,7 @@ from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSettings
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, lazy
 
 
 class LinuxCNC(Driver):
@@ -42,6 +42,7 @@ class LinuxCNC(Driver):
         simulator="errormotion.instruments.simulators.linuxcnc:SimulatedLinuxCNC",
     )
     Settings: ClassVar[type[LinuxCNCSettings]] = LinuxCNCSettings
+    doctor = lazy("errormotion.instruments.simulators.linuxcnc_process:DOCTOR")
     settings: LinuxCNCSettings
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:

@@ -1,4 +1,4 @@
-"""``errormotion plan``: what to expect of a campaign's tests before anything is measured."""
+"""``errormotion plan``: the uncertainty to expect of the tests of a campaign."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.files import load_campaign
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.summary import SHOWN, notes_of
+from errormotion.cli.summary import FIELD_UNITS, notes_of
 from errormotion.datasets.folders import looking_beside
 from errormotion.errors import BenchError
 
 
 def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) -> None:
-    """Print the largest uncertainty to expect of every freedom, and what the method notes, test by test.
+    """Print the largest uncertainty to expect of every freedom, and the notes of the method, test by test.
 
     Raises
     ------
@@ -36,14 +36,14 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
         planned = [(entry, entry.method().plan(entry.settings)) for entry in chosen]
     if out is not None:
         datasets.save(planned[0][1], out)
-    told = [
+    plans = [
         {"test": entry.name, "method": entry.method.info.id, "expected": _expected(ds), "notes": notes_of(ds)}
         for entry, ds in planned
     ]
     if as_json:
-        show_json({"ok": True, "plans": told, "out": str(out) if out else None})
+        show_json({"ok": True, "plans": plans, "out": str(out) if out else None})
         return
-    for part in told:
+    for part in plans:
         show(f"\n{part['test']} ({part['method']}):")
         rows = [[row["name"], f"{row['expanded_uncertainty']:.3g}", row["unit"]] for row in part["expected"]]
         show(table(["", "U (k=2)", ""], rows))
@@ -52,13 +52,13 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
 
 
 def _expected(errors: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the expanded uncertainty (k = 2) of every freedom that is seen, the largest there is in the dataset."""
+    """Return the expanded uncertainty (k = 2) of every known freedom, the largest in the dataset."""
     variances = np.diagonal(errors["covariance"].transpose(..., "dof", "dof_").values, axis1=-2, axis2=-1)
     found = []
     for k, name in enumerate(errors["dof"].values):
         seen = variances[..., k][np.isfinite(variances[..., k])]
         if seen.size:
-            factor, unit = SHOWN[errors[str(name)].attrs["units"]]
+            factor, unit = FIELD_UNITS[errors[str(name)].attrs["units"]]
             largest = 2.0 * float(np.sqrt(seen.max())) * factor
             found.append({"name": str(name), "expanded_uncertainty": largest, "unit": unit})
     return found

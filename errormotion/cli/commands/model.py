@@ -54,7 +54,7 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
     show(table(["error", "removed/%", "interval 95 %: +-", "unit"], rows))
 
 
-def foresee(model: Path, data: Path, out: Path, as_json: bool) -> None:
+def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
     """Predict the errors of temperatures and working parameters, and write them.
 
     Raises
@@ -77,7 +77,7 @@ def foresee(model: Path, data: Path, out: Path, as_json: bool) -> None:
         show(f"  note: {note}")
 
 
-def examine(model: Path, errors: Path, report: Path | None, as_json: bool) -> None:
+def check_model(model: Path, errors: Path, report: Path | None, as_json: bool) -> None:
     """Compare what the model predicts of a campaign with what was measured in it.
 
     Raises

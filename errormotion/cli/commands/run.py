@@ -13,13 +13,13 @@ from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.guard import USAGE
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
-from errormotion.cli.summary import last_values, notes_of
+from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
 
 
 def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
-    """Run or resume a campaign and print what came of it."""
+    """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
         typer.echo("Give a campaign file, or --resume to go on with the newest unfinished one.", err=True)
         raise typer.Exit(USAGE)
@@ -60,7 +60,7 @@ def report_of_run(folder: Path) -> Path:
 
 
 def describe(folder: RunFolder) -> dict[str, Any]:
-    """Return what a program wants to know of a run."""
+    """Return the state and the results of a run, for a program."""
     data = folder.data
     errors = folder.errors
     result = datasets.load(errors) if errors else None
@@ -74,13 +74,13 @@ def describe(folder: RunFolder) -> dict[str, Any]:
         "errors": str(errors) if errors else None,
         "report": str(folder.path / data["report"]) if data["report"] else None,
         "report_error": report_error(folder),
-        "results": last_values(result) if result is not None else [],
+        "results": [as_printed(figure) for figure in figures_of(result)] if result is not None else [],
         "notes": notes_of(result) if result is not None else [],
     }
 
 
 def report_error(folder: RunFolder) -> str | None:
-    """Return why the last report was not written; None if it was, or none was wanted."""
+    """Return the reason why the last report could not be written; None where it was written or not requested."""
     reports = [step for step in folder.data["steps"] if step["step"] == "report"]
     return str(reports[-1]["reason"]) if reports and reports[-1]["outcome"] == "failed" else None
 
@@ -89,15 +89,10 @@ def _lines(folder: RunFolder) -> list[str]:
     found = describe(folder)
     lines = [f"report  {found['report']}"] if found["report"] else []
     if found["report_error"]:
-        lines.append(f"no report: {found['report_error']}; when that is mended: errormotion report {folder.path}")
+        lines.append(f"no report: {found['report_error']}; after the correction: errormotion report {folder.path}")
     lines.append(f"errors  {found['errors']}")
     if found["results"]:
-        end = found["results"][0]["time_min"]
-        rows = [
-            [r["name"], f"{r['value']:.2f}", f"{r['expanded_uncertainty']:.2f}", r["unit"]] for r in found["results"]
-        ]
-        lines.append(f"after {end:.1f} min:")
-        lines += table(["", "error", "U (k=2)", ""], rows).splitlines()
+        lines += figure_table(found["results"]).splitlines()
     samples = found["samples"] or {}
     lost = {"dropped": samples.get("dropped", 0)} | (samples.get("invalid") or {})
     if any(lost.values()):
@@ -106,5 +101,5 @@ def _lines(folder: RunFolder) -> list[str]:
 
 
 def _agree(message: str) -> None:
-    """Take it as done, and leave a trace."""
-    typer.echo(f"taken as done (--yes): {message}", err=True)
+    """Assume that the request is done, and print it."""
+    typer.echo(f"assumed done (--yes): {message}", err=True)

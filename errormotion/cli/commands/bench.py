@@ -13,13 +13,13 @@ from errormotion.campaign.files import load_bench
 from errormotion.cli.output import show, show_json, table
 
 MOST_NUMBERS = 12
-"""Longer readings are summed up on the screen."""
+"""Readings with more numbers are printed as a summary."""
 
 log = logging.getLogger(__name__)
 
 
 def probe(file: Path, as_json: bool) -> bool:
-    """Open, identify and read every instrument of a bench; return whether all answered."""
+    """Open, identify and read every instrument of a bench; return whether all of them answered."""
     bench = OpenBench(load_bench(file))
     found: list[dict[str, Any]] = []
     try:
@@ -30,7 +30,7 @@ def probe(file: Path, as_json: bool) -> bool:
                 try:
                     record["reading"] = _plain(answer.driver.read())
                 except Exception as error:
-                    log.exception("instrument %s does not read", answer.instrument.name)
+                    log.exception("instrument %s: the reading failed", answer.instrument.name)
                     record["error"] = f"{type(error).__name__}: {error}"
             found.append(record)
     finally:

@@ -11,14 +11,14 @@ from errormotion.errors import BenchError
 
 
 def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
-    """Write the programs of one test, or of every test whose method has some; never over a file that is there.
+    """Write the programs of one test, or of every test whose method has some; existing files are not replaced.
 
-    With several such tests each gets a folder of its own in ``out``.
+    With several such tests, each has its own folder in ``out``.
 
     Raises
     ------
     BenchError
-        No such test, a method without programs, or a file that is there already. Nothing was written then.
+        No such test, a method without programs, or a file that exists. Nothing is written then.
     """
     plan = load_campaign(campaign)
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
@@ -26,34 +26,36 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
         raise BenchError(
             f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
         )
-    having = [entry for entry in chosen if hasattr(entry.method, "programs")]
-    if not having:
+    with_programs = [entry for entry in chosen if hasattr(entry.method, "programs")]
+    if not with_programs:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
         raise BenchError(f"{campaign}: {names} has no NC programs: nothing to write for {test or 'any of its tests'}.")
     files: list[tuple[str, Path, str]] = []
-    for entry in having:
-        folder = out / entry.name if len(having) > 1 else out
+    for entry in with_programs:
+        folder = out / entry.name if len(with_programs) > 1 else out
         texts = entry.method().programs(entry.settings, plan.bench.chosen(entry.instruments).settings_by_kind)
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
-    if there := [str(path) for _, path, _ in files if path.exists()]:
-        raise BenchError(f"{there[0]} is there already: choose another folder, or take it away. Nothing was written.")
+    if existing := [str(path) for _, path, _ in files if path.exists()]:
+        raise BenchError(
+            f"{existing[0]} exists already: choose another folder, or remove the file. Nothing was written."
+        )
     for _, path, text in files:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="ascii", newline="\r\n") as file:
             file.write(text)
-    _tell(files, as_json)
+    _show(files, as_json)
 
 
-def _tell(files: list[tuple[str, Path, str]], as_json: bool) -> None:
+def _show(files: list[tuple[str, Path, str]], as_json: bool) -> None:
     rows: list[dict[str, Any]] = [
-        {"test": name, "file": str(path), "lines": len(text.splitlines()), "says": _comments(text)}
+        {"test": name, "file": str(path), "lines": len(text.splitlines()), "comments": _comments(text)}
         for name, path, text in files
     ]
     if as_json:
         show_json({"ok": True, "programs": rows})
         return
-    shown = [[row["test"], row["file"], str(row["lines"]), "; ".join(row["says"])] for row in rows]
-    show(table(["test", "file", "lines", "what it does"], shown))
+    shown = [[row["test"], row["file"], str(row["lines"]), "; ".join(row["comments"])] for row in rows]
+    show(table(["test", "file", "lines", "comments"], shown))
 
 
 def _comments(text: str) -> list[str]:

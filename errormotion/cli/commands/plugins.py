@@ -1,4 +1,4 @@
-"""``errormotion plugins list|show|check``."""
+"""``errormotion plugins list|show|check|new``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def list_plugins(as_json: bool) -> None:
                     "group": group,
                     "id": plugin.id,
                     "kind": getattr(info, "kind", ""),
-                    "status": info.status if info else "broken",
+                    "status": getattr(info, "status", "") if info else "broken",
                     "version": info.version if info else "",
                     "distribution": plugin.distribution,
                     "summary": info.summary if info else "",
@@ -36,27 +36,27 @@ def list_plugins(as_json: bool) -> None:
         show_json({"plugins": found})
         return
     rows = [[p["group"], p["id"], p["kind"], p["status"], p["distribution"], p["error"] or p["summary"]] for p in found]
-    show(table(["group", "id", "kind", "status", "from", "what it is"], rows))
+    show(table(["group", "id", "kind", "status", "from", "summary"], rows))
 
 
 def show_plugin(plugin_id: str, as_json: bool) -> None:
-    """Print what a plugin says of itself, with its settings."""
+    """Print the description of a plugin and its settings."""
     group = group_of(plugin_id)
     cls = plugins.get(group, plugin_id)
-    schema = cls.Settings.model_json_schema()
+    settings = getattr(cls, "Settings", None)
     if as_json:
+        schema = settings.model_json_schema() if settings else {}
         show_json({"group": group, "info": asdict(cls.info), "settings": schema})
         return
     for key, value in asdict(cls.info).items():
         if value not in (None, "", ()):
             show(f"{key:>10}  {', '.join(value) if isinstance(value, tuple) else value}")
-    if group == "methods":
+    if hasattr(cls, "needs"):
         show(f"{'needs':>10}  {', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}")
-    rows = []
-    for name, field in cls.Settings.model_fields.items():
-        rows.append([name, _default(field), str(field.description or "")])
+    fields = settings.model_fields if settings else {}
+    rows = [[name, _default(field), str(field.description or "")] for name, field in fields.items()]
     show()
-    show(table(["setting", "default (SI)", "meaning"], rows) if rows else "It has no settings.")
+    show(table(["setting", "default (SI)", "meaning"], rows) if rows else "This plugin has no settings.")
 
 
 def _default(field: FieldInfo) -> str:
@@ -85,12 +85,12 @@ def check_plugin(plugin_id: str, address: str | None, as_json: bool) -> bool:
 
 
 def group_of(plugin_id: str) -> plugins.Group:
-    """Return the group in which an id is; PluginError names the nearest ids of both."""
+    """Return the group of an id; PluginError names the nearest ids of all groups."""
     found = [group for group in plugins.GROUPS if plugin_id in {plugin.id for plugin in plugins.available(group)}]
     if len(found) == 1:
         return found[0]
     if found:
-        raise PluginError(f"'{plugin_id}' is an instrument and a method; rename one of the two plugins")
+        raise PluginError(f"'{plugin_id}' is a plugin of the groups {' and '.join(found)}; rename one of them")
     from errormotion.datasets.tomlfile import nearest
 
     names = [plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)]

@@ -1,4 +1,4 @@
-"""``errormotion doctor``: whether this machine has what errormotion needs."""
+"""``errormotion doctor``: whether this computer has what errormotion needs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from importlib.metadata import requires, version
 from pathlib import Path
 
 from errormotion.cli.guard import log_file
-from errormotion.errors import InstrumentError
+from errormotion.errors import ErrormotionError
 
 LEAST_DISK = 2 * 2**30
 """Bytes; four hours of five packed channels at 20 kHz take about 1 GB."""
@@ -21,7 +21,7 @@ LEAST_DISK = 2 * 2**30
 
 @dataclass(frozen=True)
 class Finding:
-    """What one look found."""
+    """Result of one check."""
 
     name: str
     ok: bool
@@ -29,32 +29,38 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at everything; a look that fails is a finding, too."""
-    looks: list[tuple[str, Callable[[], str]]] = [
+    """Return the result of every check; a check that fails is a result, too."""
+    checks: list[tuple[str, Callable[[], str]]] = [
         ("python", _python),
         ("packages", _packages),
         ("compiled kernels", _kernels),
         ("plugins", _plugins),
         ("simulators", _loopback),
         ("serial ports", _serial),
-        ("LinuxCNC", _linuxcnc),
+        *_checks_of_plugins(),
         ("disk here", _disk),
         ("temporary folder", _temporary),
         ("log file", _log),
     ]
     findings = []
-    for name, look in looks:
+    for name, check in checks:
         try:
-            findings.append(Finding(name, True, look()))
-        except Exception as error:  # noqa: BLE001 - each look is on its own, and its failure is the answer
+            findings.append(Finding(name, True, check()))
+        except Exception as error:  # noqa: BLE001 - the failure of a check is its result
             findings.append(
-                Finding(name, False, f"{error}" if isinstance(error, _Trouble) else f"{type(error).__name__}: {error}")
+                Finding(
+                    name,
+                    False,
+                    f"{error}"
+                    if isinstance(error, _FailedError | ErrormotionError)
+                    else f"{type(error).__name__}: {error}",
+                )
             )
     return findings
 
 
-class _Trouble(Exception):  # noqa: N818 - a finding, not an error of the program
-    """What is wrong, in words that say what to do."""
+class _FailedError(Exception):
+    """What is wrong, and what to do."""
 
 
 def _python() -> str:
@@ -71,7 +77,7 @@ def _packages() -> str:
         except ImportError as error:
             missing.append(f"{name} ({error})")
     if missing:
-        raise _Trouble(f"cannot import {', '.join(missing)}; install errormotion again into this environment")
+        raise _FailedError(f"cannot import {', '.join(missing)}; install errormotion again in this environment")
     return f"errormotion {version('errormotion')}, {len(requires('errormotion') or [])} requirements, all import"
 
 
@@ -80,7 +86,7 @@ def _kernels() -> str:
     import numpy as np
 
     if numba.njit(lambda x: x.sum())(np.ones(3)) != 3.0:
-        raise _Trouble("numba computes 1 + 1 + 1 wrongly; install numba and llvmlite again")
+        raise _FailedError("numba computes a wrong sum; install numba and llvmlite again")
     return f"numba {numba.__version__}, {numba.get_num_threads()} threads"
 
 
@@ -90,45 +96,47 @@ def _plugins() -> str:
     found = {group: plugins.available(group) for group in plugins.GROUPS}
     broken = [f"{plugin.id}: {plugin.error}" for each in found.values() for plugin in each if plugin.error]
     if broken:
-        raise _Trouble("; ".join(broken))
+        raise _FailedError("; ".join(broken))
     return ", ".join(f"{len(each)} {group}" for group, each in found.items())
 
 
 def _loopback() -> str:
+    """Open the first instrument whose simulator answers, over a real connection."""
     from errormotion import plugins
 
-    driver = plugins.get("instruments", "optoncdt")("sim://cframe/doctor?seed=0", None)
-    with driver:
-        identity = driver.identify()
-    return f"a simulated {identity.model} answers over the wire"
+    found: list[str] = []
+    for cls in plugins.loaded("instruments"):
+        if not cls.info.simulator:
+            continue
+        try:
+            with cls("sim://cframe/doctor?seed=0", None) as driver:
+                return f"a simulated {driver.identify().model} answers over the wire"
+        except ErrormotionError as error:
+            found.append(f"{cls.info.id}: {error}")
+    raise _FailedError("; ".join(found) or "no instrument has a simulator")
+
+
+def _checks_of_plugins() -> list[tuple[str, Callable[[], str]]]:
+    """Return the checks that plugins bring: the attribute ``doctor``, name to function."""
+    from errormotion import plugins
+
+    return [check for cls in plugins.loaded("instruments", "methods") for check in getattr(cls, "doctor", {}).items()]
 
 
 def _serial() -> str:
     ports = [str(path) for pattern in ("ttyUSB*", "ttyACM*") for path in sorted(Path("/dev").glob(pattern))]
     closed = [port for port in ports if not os.access(port, os.R_OK | os.W_OK)]
     if closed:
-        raise _Trouble(f"no permission for {', '.join(closed)}; join the group that owns them (often 'dialout')")
+        raise _FailedError(f"no permission for {', '.join(closed)}; join the group that owns them (often 'dialout')")
     return ", ".join(ports) or "no USB serial adapter plugged in"
-
-
-def _linuxcnc() -> str:
-    """LinuxCNC is wanted by nobody but those who simulate one, so its absence is no trouble; a broken one is."""
-    from errormotion.instruments.simulators.linuxcnc_process import installed, why_not
-
-    if shutil.which("linuxcnc") is None:
-        return f"none here, and so no sim://.../linuxcnc: {why_not()}"
-    if reason := why_not():
-        raise _Trouble(reason)
-    try:
-        return f"{installed()}, for sim://.../linuxcnc"
-    except InstrumentError as error:
-        raise _Trouble(str(error)) from None
 
 
 def _disk() -> str:
     free = shutil.disk_usage(Path.cwd()).free
     if free < LEAST_DISK:
-        raise _Trouble(f"{free / 2**30:.1f} GiB free in {Path.cwd()}; a long record wants {LEAST_DISK / 2**30:.0f} GiB")
+        raise _FailedError(
+            f"{free / 2**30:.1f} GiB free in {Path.cwd()}; a long record needs {LEAST_DISK / 2**30:.0f} GiB"
+        )
     return f"{free / 2**30:.0f} GiB free"
 
 
