@@ -32,7 +32,7 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
     plan = load_campaign(campaign)
     found_tests: list[dict[str, Any]] = []
     for test in plan.tests:
-        steps = steps_of(test.method, test.settings, plan.bench.settings_by_kind)
+        steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
         if steps is None:
             found_tests.append({"test": test.name, "motions": None})
             continue
