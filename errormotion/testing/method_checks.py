@@ -61,8 +61,9 @@ def settings_strict(subject: MethodSubject) -> str:
 def schema(subject: MethodSubject) -> str:
     """Raw data and result follow their schemas, and the result says which method made it, from which settings."""
     raw, _ = subject.make(0)
-    if variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
-        datasets.validate(raw)
+    tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
+    if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
+        datasets.validate(raw, tables)
     expected = subject.plugin.needs.raw_schema
     require(raw.attrs["schema"] == expected, f"raw data: expected schema {expected}, found {raw.attrs.get('schema')}")
     errors = subject.identify(raw)
@@ -86,7 +87,8 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
     raw, _ = subject.make(0)
     # What is acquired may be another variant of the schema than what is handed to the kit.
     known = {str(d) for d in raw.dims}
-    known |= {d for variant in variants(method.needs.raw_schema) for row in variant.rows for d in row.dims}
+    tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
+    known |= {d for table in tables for row in table.rows for d in row.dims}
     require(dim in known, f"append_dim: expected one of {', '.join(sorted(known))}; found '{dim}'")
     require(0 < length < float("inf"), f"progress: expected a positive length, found {length}")
     return f"{length:g} along {dim}"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-SCRIPT = Path(__file__).parents[1] / "tools" / "compare_results.py"
+SCRIPT = Path(__file__).parents[2] / "tools" / "compare_results.py"
 U = 1e-6
 """Standard uncertainty of each freedom of the test dataset, m or rad."""
 
