@@ -155,8 +155,9 @@ def first_model(circles, deviation, decay):
     known = np.isfinite(deviation)
     angle, sense = circles.angle[known], circles.sense[known]
     design = np.hstack([circle(angle), basis(angle, sense, circles.radius, circles.feed, decay)])
-    scale = np.linalg.norm(design, axis=0)
-    found = np.linalg.lstsq(design / scale, deviation[known], rcond=1e-9)[0] / scale
+    normal = design.T @ design
+    scale = np.sqrt(np.diagonal(normal))
+    found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12) @ (design.T @ deviation[known] / scale) / scale
     at_readings = np.full(deviation.shape, np.nan)
     at_readings[known] = design @ found
     return at_readings, found
