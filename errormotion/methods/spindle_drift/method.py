@@ -8,7 +8,7 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.acquisition.drift import SCHEMA
+from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.identification.detection import identify_beams
 from errormotion.methods.spindle_drift.identification.drift import identify_drift
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
