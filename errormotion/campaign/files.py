@@ -29,7 +29,7 @@ class InstrumentTable(BaseModel):
     """``[instruments.NAME]``: the driver, its address, and the driver's own settings beside them."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    driver: str = Field(description='the id of an instrument plugin, such as "optoncdt"')
+    driver: str = Field(description="the id of an instrument plugin; 'errormotion plugins list' shows them")
     address: str = ""
 
 
@@ -51,7 +51,7 @@ class TestTable(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: str = Field(pattern=NAME, description="a name of letters, digits, - and _")
-    method: str = Field(description='the id of a method plugin, such as "spindle_drift"')
+    method: str = Field(description="the id of a method plugin; 'errormotion plugins list' shows them")
     inputs: dict[str, str] = {}
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}

@@ -16,8 +16,13 @@ HOMES = {
 }
 #: Text files of the package in which examples are shipped: campaigns and benches that a person may write.
 EXAMPLES = "errormotion/cli/demo/"
-#: A word that is an id of one plugin and a variable of the published schema of another: (word, folder).
-VARIABLES = {("beam_direction", "errormotion/methods/spindle_drift"), ("beam_direction", "errormotion/instruments")}
+#: Words that are ids and something else as well: variables of published datasets, and the command of a package.
+OTHER_MEANINGS = {
+    ("beam_direction", "errormotion/methods/spindle_drift/"),
+    ("beam_direction", "errormotion/instruments/"),
+    ("beam_direction", "errormotion/report/beams.py"),
+    ("thermal_model", "errormotion/cli/commands/model.py"),
+}
 
 
 def sources() -> list[Path]:
@@ -33,7 +38,7 @@ def named(path: Path, text: str) -> list[str]:
     for plugin_id, home in HOMES.items():
         if place.startswith((f"{home}/", f"{home}.")) or f"{home}.py" == place:
             continue
-        if any(word == plugin_id and place.startswith(folder) for word, folder in VARIABLES):
+        if any(word == plugin_id and place.startswith(folder) for word, folder in OTHER_MEANINGS):
             continue
         if re.search(rf"(?<![A-Za-z0-9_]){plugin_id}(?![A-Za-z0-9_])", text):
             found.append(plugin_id)
