@@ -125,9 +125,8 @@ class _Names:
                 found[row.name] = (row, None)
             else:
                 found |= {f"{row.name}_{label}": (row, k) for k, label in enumerate(self.labels[dim])}
-        return found | {
-            short: found[name] for short, name in self.aliases.items() if short not in found and name in found
-        }
+        short = {short: found[name] for short, name in self.aliases.items() if name in found}
+        return short | found
 
     def component_dim(self, row: Row) -> str | None:
         """Return the dimension of a variable that stands side by side in columns."""

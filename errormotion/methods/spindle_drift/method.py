@@ -8,10 +8,10 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.identification.detection import identify_beams
 from errormotion.methods.spindle_drift.identification.drift import identify_drift
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
