@@ -15,7 +15,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings
 from errormotion.instruments.point_lds.keyence_lk.codec import HEADS
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.keyence_lk import SimulatedKeyenceLK
+from errormotion.instruments.simulators.point_lds.keyence_lk import SimulatedKeyenceLK
 from errormotion.instruments.transports import parse_address
 from errormotion.plugins import Samples
 

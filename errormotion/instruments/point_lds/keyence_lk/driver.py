@@ -67,7 +67,7 @@ class KeyenceLK(Driver):
         kind="point_lds",
         summary="Keyence LK-G/LK-H laser displacement sensor, RS-232C in ASCII",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.keyence_lk:SimulatedKeyenceLK",
+        simulator="errormotion.instruments.simulators.point_lds.keyence_lk:SimulatedKeyenceLK",
     )
     Settings: ClassVar[type[LKSettings]] = LKSettings
     settings: LKSettings
