@@ -89,7 +89,7 @@ class VirtualController(Driver):
         kind="controller",
         summary="Controller of the virtual machine: tool, spindle, touch probe, compensation, step and NC programs",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+        simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
     settings: ControllerSettings

@@ -84,7 +84,7 @@ class ControllerProbe:
         kind="touch_probe",
         summary="Touch probe that a controller moves and hears, with slow repeats and wrong triggers found",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+        simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerProbeSettings]] = ControllerProbeSettings
 

@@ -21,7 +21,7 @@ from errormotion.instruments.controller.mtconnect.codec import (
 )
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.transports.http import HttpTransport
+from errormotion.instruments.transports.http.client import HttpTransport
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 OUT_OF_RANGE = "OUT_OF_RANGE"
@@ -76,7 +76,7 @@ class MTConnect(Driver):
         kind="controller",
         summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.mtconnect:SimulatedAgent",
+        simulator="errormotion.instruments.simulators.controller.mtconnect:SimulatedAgent",
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
     settings: MTConnectSettings

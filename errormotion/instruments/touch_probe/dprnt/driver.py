@@ -52,7 +52,7 @@ class Dprnt(Driver):
         kind="touch_probe",
         summary="Contacts that the machine's own probing program prints with DPRNT, over a serial line or TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.dprnt:SimulatedPrinter",
+        simulator="errormotion.instruments.simulators.touch_probe.dprnt:SimulatedPrinter",
     )
     Settings: ClassVar[type[DprntSettings]] = DprntSettings
     settings: DprntSettings

@@ -14,7 +14,7 @@ import numpy as np
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.tracker_scene import TrackerScene, cartesian, refraction_index
+from errormotion.instruments.simulators.virtual_world.tracker_scene import TrackerScene, cartesian, refraction_index
 from errormotion.instruments.transports import Address
 
 POINTS_A_PACKET = 20

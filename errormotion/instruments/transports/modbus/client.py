@@ -20,7 +20,7 @@ from pathlib import Path
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.transports.address import MODBUS, Address, parse_address
 from errormotion.instruments.transports.base import Transport
-from errormotion.instruments.transports.modbus_codec import (
+from errormotion.instruments.transports.modbus.codec import (
     Framing,
     ModbusRefusal,
     decode_answer,

@@ -19,9 +19,9 @@ import numpy as np
 
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import parse_fault, stray_bytes
-from errormotion.instruments.simulators.virtual_world import world
+from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.http_serving import HttpServer
+from errormotion.instruments.transports.http.serving import HttpServer
 
 EPOCH = datetime(2025, 1, 1, tzinfo=UTC)
 """What the agent's clock shows at the world's time 0."""

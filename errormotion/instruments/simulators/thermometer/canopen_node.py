@@ -10,8 +10,8 @@ import numpy as np
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import Fault, parse_fault
-from errormotion.instruments.simulators.thermometers import Inputs, Unplugging
-from errormotion.instruments.simulators.virtual_world import world
+from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
+from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.thermometer.cia404 import (
     CELSIUS,
     DEVICE_TYPE,
@@ -27,7 +27,7 @@ from errormotion.instruments.thermometer.cia404 import (
     to_celsius,
 )
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.can_serving import CanopenServer, Entry, Refused
+from errormotion.instruments.transports.can.serving import CanopenServer, Entry, Refused
 
 NO_DATA = 0x08000024  # SDO abort code: no data available
 

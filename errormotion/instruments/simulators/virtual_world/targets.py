@@ -10,7 +10,7 @@ import numpy as np
 from errormotion.errors import InstrumentError
 
 if TYPE_CHECKING:
-    from errormotion.instruments.simulators.streams import Stream
+    from errormotion.instruments.simulators.virtual_world.streams import Stream
     from errormotion.twin import VirtualMachine
     from errormotion.twin.paths import Path
     from errormotion.twin.planes import Target

@@ -10,8 +10,8 @@ import numpy as np
 
 from errormotion.errors import BenchError, InstrumentError
 from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
-from errormotion.instruments.simulators.profile_sources import Clock, Lines
-from errormotion.instruments.simulators.virtual_world import VirtualWorld
+from errormotion.instruments.simulators.line_profiler.profile_sources import Clock, Lines
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address
 from errormotion.twin.paths import Path
 

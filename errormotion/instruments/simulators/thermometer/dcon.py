@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from errormotion.errors import ProtocolError
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.thermometers import Inputs, Unplugging
+from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
 from errormotion.instruments.thermometer.dcon import LINE_END, checksum, decode, encode, format_temperatures
 from errormotion.instruments.transports import Address
 

@@ -15,7 +15,7 @@ from canopen.nmt import NMT_STATES
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 from canopen.sdo.exceptions import SdoAbortedError
 
-from errormotion.instruments.transports.can import BUS_OFF
+from errormotion.instruments.transports.can.bus import BUS_OFF
 
 TYPES = {"u8": datatypes.UNSIGNED8, "u16": datatypes.UNSIGNED16, "u32": datatypes.UNSIGNED32}
 TYPES |= {"f32": datatypes.REAL32, "text": datatypes.VISIBLE_STRING}

@@ -14,8 +14,14 @@ from errormotion.instruments.line_profiler.keyence_ljx import codec, kernels
 from errormotion.instruments.line_profiler.keyence_ljx.codec import INTENSITY, LENGTH, SMALLEST_HEIGHT, StreamLayout
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
-from errormotion.instruments.simulators.gantry_profiles import GantryProfiles
-from errormotion.instruments.simulators.profile_sources import Feed, FreeRunning, Lines, ProfileSource, make_source
+from errormotion.instruments.simulators.line_profiler.gantry_profiles import GantryProfiles
+from errormotion.instruments.simulators.line_profiler.profile_sources import (
+    Feed,
+    FreeRunning,
+    Lines,
+    ProfileSource,
+    make_source,
+)
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import TcpServer
 

@@ -14,7 +14,7 @@ from pymodbus.framer import FramerType
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from errormotion.instruments.transports.modbus_codec import Framing
+from errormotion.instruments.transports.modbus.codec import Framing
 
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 CHUNK = 4096

@@ -15,7 +15,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.transports import Address
 
 if TYPE_CHECKING:
-    from errormotion.instruments.simulators.virtual_world import VirtualWorld
+    from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 Array = np.ndarray[Any, Any]
 

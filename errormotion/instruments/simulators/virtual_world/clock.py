@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.streams import Stream, TriggeredStream
+from errormotion.instruments.simulators.virtual_world.streams import Stream, TriggeredStream
 
 Array = np.ndarray[Any, Any]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.instruments.simulators.nc_program import interpret, title
-from errormotion.instruments.simulators.world_clock import SampleClock
+from errormotion.instruments.simulators.virtual_world.clock import SampleClock
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 

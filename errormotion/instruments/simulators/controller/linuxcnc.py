@@ -23,10 +23,10 @@ import numpy as np
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.controller.linuxcnc import BRIDGE
+from errormotion.instruments.simulators.controller.linuxcnc_config import PINS, hal_text, ini_text, pin_values
+from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.linuxcnc_config import PINS, hal_text, ini_text, pin_values
-from errormotion.instruments.simulators.linuxcnc_process import LinuxCNCProcess
-from errormotion.instruments.simulators.virtual_world import VirtualWorld
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address, Transport, open_transport
 
 LINGER = 10.0  # s

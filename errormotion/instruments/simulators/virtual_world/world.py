@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.streams import Carried, Device, Stream
-from errormotion.instruments.simulators.targets import TargetStand
-from errormotion.instruments.simulators.world_motion import LEAD_IN, Motion
+from errormotion.instruments.simulators.virtual_world.motion import LEAD_IN, Motion
+from errormotion.instruments.simulators.virtual_world.streams import Carried, Device, Stream
+from errormotion.instruments.simulators.virtual_world.targets import TargetStand
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 

@@ -8,12 +8,12 @@ from pydantic import ValidationError
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.thermometers import Inputs, Unplugging
+from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings, encode_number
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.modbus import framing_of
-from errormotion.instruments.transports.modbus_codec import crc16
-from errormotion.instruments.transports.modbus_serving import ModbusServer
+from errormotion.instruments.transports.modbus.client import framing_of
+from errormotion.instruments.transports.modbus.codec import crc16
+from errormotion.instruments.transports.modbus.serving import ModbusServer
 
 FAILURE = 4  # Modbus exception: server device failure
 _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order", "scale", "offset", "open_from")

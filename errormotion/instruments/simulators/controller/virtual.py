@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from errormotion.errors import ErrormotionError
 from errormotion.instruments.simulators.device import SimulatedDevice
-from errormotion.instruments.simulators.virtual_world import LEAD_IN
+from errormotion.instruments.simulators.virtual_world.world import LEAD_IN
 from errormotion.instruments.transports import Address
 from errormotion.twin import Event
 
