@@ -26,6 +26,6 @@ def subjects():
             settings={"samples": 540, "places": 60},
             optional=OPTIONAL,
             measured=("length",),
-            seeds=250,
+            seeds=120,
         ),
     )
