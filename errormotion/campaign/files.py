@@ -40,7 +40,7 @@ class BenchTable(BaseModel):
     schema_: Literal["errormotion.bench/1"] = Field(alias="schema", description='"errormotion.bench/1"')
     name: str
     machine: str
-    instruments: dict[str, InstrumentTable] = Field(min_length=1)
+    instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
 
 

@@ -31,14 +31,14 @@ class Ballbar:
     conformance = lazy("ballbar_test.conformance:subjects")
     figures = staticmethod(figures_of)
 
-    def acquire(self, bench, settings, *, inputs, done=None):
+    def acquire(self, bench, settings, *, inputs, done=None):  # noqa: ARG002 - part of the protocol
         """Refuse: readings of a ballbar come from the software of its maker, as a CSV file."""
         raise MethodError(
             "ballbar does not acquire. Record with the software of the ballbar, write the readings to a CSV file of "
             f"schema {SCHEMA}, and use 'errormotion identify FILE'."
         )
 
-    def append_dim(self, settings):
+    def append_dim(self, settings):  # noqa: ARG002 - part of the protocol
         """Return ``run``."""
         return "run"
 
@@ -53,7 +53,7 @@ class Ballbar:
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"ballbar reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        validate(checked)
+        validate(checked, RAW_SCHEMAS)
         return identify(checked, settings or Settings(), self.info.id, self.info.version)
 
     def plan(self, settings=None):
