@@ -19,6 +19,7 @@ import numba
 import numpy as np
 from scipy.optimize import least_squares
 
+from errormotion.methods.spindle_drift import simulation
 from errormotion.methods.spindle_drift.identification.averaging import slices, window_sums
 from errormotion.methods.spindle_drift.identification.bar import fit_axis
 
@@ -117,7 +118,7 @@ def write_record(path: Path, hours: float) -> None:
 
     machine = VirtualMachine("cframe", seed=3)
     machine.start([Event(0.0, 15000.0)])
-    skeleton = machine.raw_spindle_drift(np.array([0.0, 1.0]), seed=0).drop_vars(["temperature", "spindle_speed"])
+    skeleton = simulation.raw_drift(machine, np.array([0.0, 1.0]), seed=0).drop_vars(["temperature", "spindle_speed"])
     samples = round(hours * 3600 * RATE)
     piece = 30 * RATE
     skeleton = (

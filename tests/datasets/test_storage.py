@@ -16,6 +16,7 @@ from errormotion import datasets
 from errormotion.datasets import load, save, validate
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import VirtualMachine
 
 both = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
@@ -252,7 +253,7 @@ def test_what_is_no_dataset_is_told(tmp_path) -> None:
 
 
 def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
-    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift([0.0, 10.0], seed=0)
+    raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), [0.0, 10.0], seed=0)
     raw.drop_vars(["temperature", "spindle_speed", "sensor"]).to_netcdf(tmp_path / "raw.nc", engine="scipy")
     with load(tmp_path / "raw.nc") as found:
         validate(found)
@@ -260,7 +261,7 @@ def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
 
 
 def test_a_chunk_that_is_cut_off_shows_while_it_is_read(tmp_path) -> None:
-    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift(np.arange(5000.0), seed=0)
+    raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), np.arange(5000.0), seed=0)
     path = save(raw, tmp_path / "raw.zarr")
     (chunk, *_) = [file for file in (path / "distance").rglob("*") if file.is_file() and file.name != "zarr.json"]
     chunk.write_bytes(chunk.read_bytes()[:20])

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.record import Record
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 

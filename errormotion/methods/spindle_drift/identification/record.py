@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from errormotion.datasets.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 # Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
 _CHANCE = 3.3
