@@ -163,7 +163,7 @@ def test_data_of_another_method(probed):
     ("settings", "said"),
     [
         ({"normals_balls": ("1", "2", "3", "5")}, "normals_balls: expected names of 1, 2, 3, 4; found 5"),
-        ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected places apart; 2 and 4 would be within one another"),
+        ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected separate balls; 2 and 4 overlap"),
     ],
 )
 def test_balls_that_cannot_be_are_refused_before_anything_is_touched(settings, said):

@@ -15,8 +15,6 @@ from errormotion.methods.normal_vector.identification.rigid import knot_weights
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.freedoms import Motion
 
-    Array = Array
-
 
 def bound(
     place: Array,

@@ -12,14 +12,10 @@ grow with their number alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from errormotion.arrays import Array
-
-if TYPE_CHECKING:
-    Array = Array
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,6 @@ from errormotion.kinematics.iso import DOF
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Array = Array
-
 FEWEST = 3
 """Balls that are asked for."""
 FLAT = 1e-3

@@ -22,8 +22,6 @@ from errormotion.methods.normal_vector.identification.spheres import Centres, ce
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3

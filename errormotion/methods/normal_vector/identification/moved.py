@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.identification.freedoms import Motion
 
-    Array = Array
     Flags = NDArray[np.bool_]
 
 FALSE_ALARM = 1e-3

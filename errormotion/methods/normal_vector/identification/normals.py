@@ -12,16 +12,11 @@ negative, as in its eqs. (1) to (3).)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.normal_vector.identification.freedoms import turned
-
-if TYPE_CHECKING:
-    Array = Array
 
 STEP = 1e-6
 """Step of the derivative, m; its square over the balls' distances is far below rounding of a twist."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 FLAGS = {1: "no trip", 2: "tripped at the start", 3: "repeat differs", 4: "not made"}
 """What a touch's flag says; 0 is a good touch."""
 _AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")

@@ -28,8 +28,6 @@ from errormotion.methods.normal_vector.identification.freedoms import FLAT, Moti
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
-
 SETTLED = 1e-12
 """Change of the twist, m and rad, at which the iteration ends: far below any noise, above rounding at 4 m."""
 MOST_STEPS = 25

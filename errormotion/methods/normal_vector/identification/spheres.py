@@ -12,8 +12,6 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.rigid import Observations
 
-    Array = Array
-
 STEPS = 12
 FLAT = 1e-6
 
