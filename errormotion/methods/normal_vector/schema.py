@@ -53,7 +53,7 @@ RAW_SCHEMAS = (
                 ("time", "ball", "touch", "direction"),
                 "m",
                 *POSITION,
-                "centre of the tip at each contact, as the machine says; NaN = no good touch",
+                "commanded centre of the tip at each contact; NaN = no good touch",
                 missing=True,
             ),
             Row("tip_radius", (), "m", 1e-4, 0.05, "radius of the probe's tip"),

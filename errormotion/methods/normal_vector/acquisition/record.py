@@ -123,7 +123,7 @@ class Record:
         if insufficient:
             raise InstrumentError(
                 f"The cold cycle has too few good touches of {'; '.join(insufficient)}; expected {FEWEST_TOUCHES} or "
-                "more of each, since it is the reference of all others. Check the positions of the balls in the settings."
+                "more of each, since it is the reference of all others. Check the positions of the balls (settings)."
             )
 
     def dataset(
