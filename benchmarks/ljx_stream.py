@@ -44,14 +44,12 @@ def play(ports: Connection, layout: StreamLayout, rate: float) -> None:
     commands, data = (door.accept()[0] for door in doors)
     profiles = make_profiles(layout)
     sums = profiles[:, -1] - profiles[:, codec.TRIGGER_WORD]
-    while frame := commands.recv(64):
-        opcode = codec.parse_request(frame)[0]
-        commands.sendall(codec.reply(codec.layout_data(layout) if opcode == codec.PREPARE_STREAM else bytes(64)))
+    while opcode := answer(commands, layout):
         if opcode != codec.START_STREAM:
             continue
         number, began = 0, time.perf_counter()
         commands.setblocking(False)
-        while not stopped(commands):
+        while answer(commands, layout) != codec.STOP_STREAM:
             if rate:
                 due = int((time.perf_counter() - began) * rate)
                 if due < number + BATCH:
@@ -67,13 +65,17 @@ def play(ports: Connection, layout: StreamLayout, rate: float) -> None:
         data.sendall(codec.notice(1))
 
 
-def stopped(commands: socket.socket) -> bool:
-    """Whether a request has come."""
+def answer(commands: socket.socket, layout: StreamLayout) -> int | None:
+    """Answer the next request and return its opcode; None where none has come, or the driver has closed."""
     try:
-        commands.recv(64, socket.MSG_PEEK)
+        frame = commands.recv(64)
     except BlockingIOError:
-        return False
-    return True
+        return None
+    if not frame:
+        return None
+    opcode = codec.parse_request(frame)[0]
+    commands.sendall(codec.reply(codec.layout_data(layout) if opcode == codec.PREPARE_STREAM else bytes(64)))
+    return opcode
 
 
 def make_profiles(layout: StreamLayout) -> np.ndarray:

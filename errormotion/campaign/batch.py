@@ -28,8 +28,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
+from errormotion.datasets.hashing import has_hash
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import PluginSettings
@@ -207,16 +209,6 @@ def _one_thread_at_a_time() -> bool:
 
     numba.get_num_threads()  # selects the layer
     return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
-
-
-def raw_of(path: Path) -> Path:
-    """Return the raw dataset of a path: of a run folder, its raw store."""
-    return path / "raw.zarr" if (path / "run.json").exists() else path
-
-
-def is_runs_folder(path: Path) -> bool:
-    """Return whether a path is a folder of run folders."""
-    return path.is_dir() and not (path / "run.json").exists() and any(path.glob("*/run.json"))
 
 
 def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
@@ -399,12 +391,10 @@ def _identify_or_raise(task: Task) -> bool:
     plain = provenance.plain(settings.model_dump(mode="json"))
     path = Path(task.out)
     with reading(task.raw), datasets.load(task.raw) as dataset:
-        mark = {
-            "raw": datasets.hash_dataset(dataset),
-            "settings": settings_hash(plain, task.method_id, task.method_version),
-        }
+        settings_mark = settings_hash(plain, task.method_id, task.method_version)
         if path.exists():
-            if datasets.load(path).attrs.get(MARK) == json.dumps(mark):
+            found = json.loads(datasets.load(path).attrs.get(MARK, "{}"))
+            if found.get("settings") == settings_mark and has_hash(dataset, str(found.get("raw"))):
                 return True
             raise DatasetError(
                 f"{path}: exists already, from other raw data, other settings or another version of the method, and "
@@ -412,6 +402,7 @@ def _identify_or_raise(task: Task) -> bool:
             )
         with _turn if _one_thread_at_a_time() else nullcontext():
             errors = method().identify(dataset, settings)
+        mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)
     with _local_locks():
         datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), path)

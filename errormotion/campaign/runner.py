@@ -229,7 +229,7 @@ class _Session:
                 "settings": settings,
                 "settings_hash": settings_hash(settings, info.id, info.version),
                 "inputs": {},
-                "instruments": [answer.record() for answer in self.bench.answers],
+                "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
                 "samples": {},
                 "raw": "raw.zarr",
@@ -257,7 +257,7 @@ class _Session:
         folder.save(status="finished")
 
     def _acquire(self, folder: RunFolder, test: TestPlan, inputs: Mapping[str, xr.Dataset]) -> None:
-        method = test.method()
+        method, bench = test.method(), self.bench.chosen(test.instruments)
         dim, expected = method.append_dim(test.settings), float(method.progress(test.settings))
         if (
             folder.raw.exists() and committed_length(folder.raw, dim) == 0
@@ -265,7 +265,7 @@ class _Session:
             shutil.rmtree(folder.raw)
         done = datasets.load(folder.raw) if folder.raw.exists() else None
         before = int(done.sizes[dim]) if done is not None else 0
-        folder.data["instruments"] = [answer.record() for answer in self.bench.answers]
+        folder.data["instruments"] = [answer.record() for answer in bench.answers]
         folder.step("acquire", "started", samples=before)
         folder.save()
         folder.take_reserve()
@@ -280,7 +280,7 @@ class _Session:
             with (
                 _in_order(),
                 recorder,
-                closing(_Chunks(method.acquire(self.bench, test.settings, inputs=inputs, done=done))) as chunks,
+                closing(_Chunks(method.acquire(bench, test.settings, inputs=inputs, done=done))) as chunks,
             ):
                 for chunk in chunks:
                     recorder.put(chunk)

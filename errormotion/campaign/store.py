@@ -110,7 +110,7 @@ class RawStore:
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]
             if variable.dtype.kind in "fiub":
-                encoding[name]["compressors"] = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")]
+                encoding[name]["compressors"] = [BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")]
             if variable.dtype.kind == "f":
                 encoding[name] |= {"fill_value": packings[name].get("_FillValue", np.nan)}
         part = path.with_name(path.name + ".part")

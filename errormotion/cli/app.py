@@ -1,33 +1,42 @@
-"""The commands. Each imports what it needs when it is called, so that ``--help`` answers at once."""
+"""The commands. Each imports what it needs when it is called, so that ``--help`` is fast."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from errormotion.cli.demo import CONTROLLERS
 from errormotion.cli.guard import ERROR, INVALID, USAGE, guarded
 from errormotion.cli.output import show, show_json, table
 
 app = typer.Typer(
     name="errormotion",
-    help="Measure how machine tools move wrongly.",
+    help="Measure the error motions of machine tools.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-plugins_app = typer.Typer(no_args_is_help=True, help="What instruments and methods there are.", rich_markup_mode=None)
-bench_app = typer.Typer(no_args_is_help=True, help="Check a bench file, or the bench itself.", rich_markup_mode=None)
+plugins_app = typer.Typer(
+    no_args_is_help=True, help="Instruments, methods and kinds of dataset.", rich_markup_mode=None
+)
+bench_app = typer.Typer(
+    no_args_is_help=True, help="Check a bench file, or the instruments of a bench.", rich_markup_mode=None
+)
 app.add_typer(plugins_app, name="plugins")
 app.add_typer(bench_app, name="bench")
-model_app = typer.Typer(no_args_is_help=True, help="Thermal models: errors from temperatures.", rich_markup_mode=None)
+model_app = typer.Typer(
+    no_args_is_help=True, help="Thermal models: errors predicted from temperatures.", rich_markup_mode=None
+)
 app.add_typer(model_app, name="model")
 
-Control = Literal["virtual", "linuxcnc"]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
-Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: what the campaign says.")]
+Runs = Annotated[
+    Path | None, typer.Option("--runs", help="Folder for run folders; default: the folder that the campaign names.")
+]
 
 
 def _version(value: bool) -> None:
@@ -44,7 +53,7 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Measure how machine tools move wrongly."""
+    """Measure the error motions of machine tools."""
     del version
 
 
@@ -53,52 +62,49 @@ def root(
 def demo(
     runs: Annotated[Path, typer.Option(help="Folder for the run folders.")] = Path("runs"),
     controller: Annotated[
-        Control, typer.Option(help="What controls the machine; linuxcnc: the real one, which has to be installed.")
-    ] = "virtual",
+        str,
+        typer.Option(help=f"Controller of the machine: {', '.join(CONTROLLERS)}. All but the first must be installed."),
+    ] = next(iter(CONTROLLERS)),
     json_: Json = False,
 ) -> None:
-    """Measure a virtual machine, and compare the result to the truth: spindle drift, or probing under LinuxCNC."""
-    if controller == "linuxcnc":
-        from errormotion.cli.demo import probing as probing_demonstration
-
-        probing_demonstration.run(runs, json_)
-        return
-    from errormotion.cli.demo import spindle as demonstration
-
-    demonstration.run(runs, json_)
+    """Measure a virtual machine and compare the result with the truth."""
+    if controller not in CONTROLLERS:
+        typer.echo(f"--controller {controller}: expected one of {', '.join(CONTROLLERS)}.", err=True)
+        raise typer.Exit(USAGE)
+    import_module(CONTROLLERS[controller]).run(runs, json_)
 
 
 @app.command()
 @guarded
 def run(
     campaign: Annotated[
-        Path | None, typer.Argument(help="A campaign file; with --resume it may be left out.", show_default=False)
+        Path | None, typer.Argument(help="A campaign file; optional with --resume.", show_default=False)
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished campaign.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished campaign.")] = False,
     runs: Runs = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Don't wait for the operator: all is as it is asked for.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Assume that every request to the operator is done.")] = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Tell path and duration; nothing is opened or moved.")
+        bool, typer.Option("--dry-run", help="Report path and duration only; nothing is opened or moved.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="With --dry-run: a folder for pictures of the path.")] = None,
     json_: Json = False,
 ) -> None:
-    """Make the tests of a campaign: acquire, identify, report."""
+    """Run the tests of a campaign: acquire, identify, report."""
     if dry_run:
         from errormotion.cli.commands import dry_run as dry
 
         if campaign is None:
-            typer.echo("--dry-run needs a campaign file.", err=True)
+            typer.echo("--dry-run: expected a campaign file.", err=True)
             raise typer.Exit(USAGE)
         dry.run(campaign, out, json_)
         return
     if out is not None:
-        typer.echo("--out belongs to --dry-run.", err=True)
+        typer.echo("--out is allowed with --dry-run only.", err=True)
         raise typer.Exit(USAGE)
-    from errormotion.cli.commands import running
+    from errormotion.cli.commands import run as command
 
-    running.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)
+    command.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)
 
 
 @app.command()
@@ -110,20 +116,20 @@ def identify(
     ],
     out: Annotated[Path, typer.Option(help="The NetCDF file to write; it must not exist. For several runs: a folder.")],
     method: Annotated[
-        str | None, typer.Option(help="The id of a method plugin; default: the one that the raw data name.")
+        str | None, typer.Option(help="The id of a method plugin; default: the method of the raw data.")
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Of several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
+        typer.Option(help="For several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
     ] = None,
     json_: Json = False,
 ) -> None:
-    """Turn a raw dataset into an error dataset; or many of them."""
+    """Identify the errors of one raw dataset, or of many."""
     from errormotion.cli.commands import data
 
     data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
@@ -132,27 +138,27 @@ def identify(
 @app.command()
 @guarded
 def calibrate(
-    data: Annotated[Path, typer.Argument(help="Readings of a point sensor against an interferometer: NetCDF or CSV.")],
+    data: Annotated[Path, typer.Argument(help="Readings of a sensor against a reference: NetCDF or CSV.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write, .nc; it must not exist.")],
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting.")] = None,
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     json_: Json = False,
 ) -> None:
-    """Make a calibration of a sensor's inclination error."""
-    from errormotion.cli.commands import calibrating
+    """Make a calibration from readings."""
+    from errormotion.cli.commands import calibrate as command
 
-    calibrating.run(data, out, set_ or [], settings, json_)
+    command.run(data, out, set_ or [], settings, json_)
 
 
 @app.command("import")
 @guarded
 def import_(
     log: Annotated[Path, typer.Argument(help="A log with columns: CSV or TSV.")],
-    map_: Annotated[Path, typer.Option("--map", help="A TOML file that says what the columns are.")],
+    map_: Annotated[Path, typer.Option("--map", help="A TOML file that describes the columns.")],
     out: Annotated[Path, typer.Option(help="The raw dataset to write: .nc or .zarr.")],
     json_: Json = False,
 ) -> None:
-    """Turn a log that a lab already has into a raw dataset."""
+    """Convert a log with columns into a raw dataset."""
     from errormotion.cli.commands import data
 
     data.import_log(log, map_, out, json_)
@@ -163,14 +169,14 @@ def import_(
 def monitor(
     bench: Annotated[Path, typer.Argument(help="A bench file with thermometers, a controller, or both.")],
     runs: Annotated[Path, typer.Option(help="Folder for the run folder of the log.")] = Path("runs"),
-    interval: Annotated[str, typer.Option(help="Time between two rows of the log.")] = "1 s",
-    duration: Annotated[str | None, typer.Option(help="When to end; default: at Ctrl-C.")] = None,
+    interval: Annotated[str, typer.Option(help="Interval between two rows of the log.")] = "1 s",
+    duration: Annotated[str | None, typer.Option(help="Duration of the log; default: until Ctrl-C.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each row.")] = False,
 ) -> None:
-    """Show all temperatures and working parameters live, and log them."""
-    from errormotion.cli.commands import monitoring
+    """Show temperatures and working parameters live, and log them."""
+    from errormotion.cli.commands import monitor as command
 
-    monitoring.run(bench, runs, interval, duration, json_)
+    command.run(bench, runs, interval, duration, json_)
 
 
 @app.command()
@@ -181,24 +187,24 @@ def plan(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="A file for the plan of one test.")] = None,
     json_: Json = False,
 ) -> None:
-    """Say what uncertainty to expect of the tests of a campaign, and how to make it smaller."""
-    from errormotion.cli.commands import planning
+    """Report the uncertainty to expect of the tests of a campaign, and how to reduce it."""
+    from errormotion.cli.commands import plan as command
 
-    planning.expect(campaign, test, out, json_)
+    command.expect(campaign, test, out, json_)
 
 
 @app.command()
 @guarded
 def program(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
-    out: Annotated[Path, typer.Option(help="The folder for the programs; no file in it is replaced.")],
+    out: Annotated[Path, typer.Option(help="The folder for the programs; existing files are not replaced.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test that has programs.")] = None,
     json_: Json = False,
 ) -> None:
-    """Write the NC programs with which a machine makes the tests of a campaign."""
-    from errormotion.cli.commands import programs
+    """Write the NC programs of the tests of a campaign."""
+    from errormotion.cli.commands import program as command
 
-    programs.write(campaign, test, out, json_)
+    command.write(campaign, test, out, json_)
 
 
 @app.command()
@@ -208,7 +214,7 @@ def report(
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
     json_: Json = False,
 ) -> None:
-    """Write the report of a run anew."""
+    """Write the report of a run."""
     from errormotion.cli.commands import data
 
     data.report(run, out, json_)
@@ -220,14 +226,15 @@ def validate(
     file: Annotated[Path, typer.Argument(help="A dataset (.nc, .zarr), a run folder, a bench or a campaign file.")],
     json_: Json = False,
 ) -> None:
-    """Check that a file follows its schema, and tell every violation."""
+    """Check that a file follows its schema, and list every violation."""
     from errormotion.cli.commands import data
 
     mistakes = data.validate(file)
     if json_:
         show_json({"ok": not mistakes, "file": str(file), "violations": mistakes})
     else:
-        show("\n  - ".join([f"{file}: {len(mistakes)} violations", *mistakes]) if mistakes else f"{file}: good")
+        count = f"{len(mistakes)} violation" + ("s" if len(mistakes) != 1 else "")
+        show("\n  - ".join([f"{file}: {count}", *mistakes]) if mistakes else f"{file}: valid")
     if mistakes:
         raise typer.Exit(INVALID)
 
@@ -235,10 +242,10 @@ def validate(
 @app.command()
 @guarded
 def doctor(json_: Json = False) -> None:
-    """Check that this machine has what errormotion needs."""
-    from errormotion.cli.commands import examination
+    """Check that this computer has what errormotion needs."""
+    from errormotion.cli.commands import doctor as command
 
-    findings = examination.examine()
+    findings = command.examine()
     if json_:
         show_json({"ok": all(f.ok for f in findings), "findings": [f.__dict__ for f in findings]})
     else:
@@ -251,32 +258,46 @@ def doctor(json_: Json = False) -> None:
 @guarded
 def plugins_list(json_: Json = False) -> None:
     """List all plugins, those that do not load included."""
-    from errormotion.cli.commands import plugging
+    from errormotion.cli.commands import plugins as command
 
-    plugging.list_plugins(json_)
+    command.list_plugins(json_)
 
 
 @plugins_app.command("show")
 @guarded
 def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: Json = False) -> None:
-    """Show what a plugin says of itself, and its settings."""
-    from errormotion.cli.commands import plugging
+    """Show the description of a plugin and its settings."""
+    from errormotion.cli.commands import plugins as command
 
-    plugging.show_plugin(plugin, json_)
+    command.show_plugin(plugin, json_)
 
 
 @plugins_app.command("check")
 @guarded
 def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
-    address: Annotated[str | None, typer.Option(help="Where a real instrument is; default: its simulator.")] = None,
+    address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
-    from errormotion.cli.commands import plugging
+    from errormotion.cli.commands import plugins as command
 
-    if not plugging.check_plugin(plugin, address, json_):
+    if not command.check_plugin(plugin, address, json_):
         raise typer.Exit(INVALID)
+
+
+@plugins_app.command("new")
+@guarded
+def plugins_new(
+    what: Annotated[Literal["instrument", "method"], typer.Argument(help="instrument or method.")],
+    name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
+    json_: Json = False,
+) -> None:
+    """Write a new distribution with a plugin that passes the conformance kit."""
+    from errormotion.cli.commands import new as command
+
+    command.new(what, name, out, json_)
 
 
 @bench_app.command("validate")
@@ -301,17 +322,17 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
             {"ok": True, "file": str(file), "name": plan.name, "machine": plan.machine, "instruments": instruments}
         )
     else:
-        show(f"{file}: good. Bench '{plan.name}', machine '{plan.machine}'.")
+        show(f"{file}: valid. Bench '{plan.name}', machine '{plan.machine}'.")
         show(table(["instrument", "driver", "kind", "address"], rows))
 
 
 @bench_app.command("probe")
 @guarded
 def bench_probe(file: Annotated[Path, typer.Argument(help="A bench file.")], json_: Json = False) -> None:
-    """Open every instrument, ask who it is, and read it once."""
-    from errormotion.cli.commands import probing
+    """Open, identify and read every instrument once."""
+    from errormotion.cli.commands import bench as command
 
-    if not probing.probe(file, json_):
+    if not command.probe(file, json_):
         raise typer.Exit(ERROR)
 
 
@@ -324,10 +345,10 @@ def model_fit(
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     json_: Json = False,
 ) -> None:
-    """Make a thermal model of the errors of warm-ups."""
-    from errormotion.cli.commands import modelling
+    """Fit a thermal model to the errors of warm-ups."""
+    from errormotion.cli.commands import model as command
 
-    modelling.make(campaigns, out, set_ or [], settings, json_)
+    command.make(campaigns, out, set_ or [], settings, json_)
 
 
 @model_app.command("predict")
@@ -339,20 +360,22 @@ def model_predict(
     json_: Json = False,
 ) -> None:
     """Predict errors from temperatures and working parameters."""
-    from errormotion.cli.commands import modelling
+    from errormotion.cli.commands import model as command
 
-    modelling.foresee(model, data, out, json_)
+    command.predict(model, data, out, json_)
 
 
 @model_app.command("check")
 @guarded
 def model_check(
     model: Annotated[Path, typer.Argument(help="A thermal model.")],
-    errors: Annotated[Path, typer.Argument(help="Measured errors that it was not made of: NetCDF or a run folder.")],
-    report: Annotated[Path | None, typer.Option(help="Write a page that shows the comparison, .html.")] = None,
+    errors: Annotated[
+        Path, typer.Argument(help="Measured errors that the model was not fitted to: NetCDF or a run folder.")
+    ],
+    report: Annotated[Path | None, typer.Option(help="Write a report of the comparison, .html.")] = None,
     json_: Json = False,
 ) -> None:
-    """Compare what a model predicts with what was measured."""
-    from errormotion.cli.commands import modelling
+    """Compare the prediction of a model with measured errors."""
+    from errormotion.cli.commands import model as command
 
-    modelling.examine(model, errors, report, json_)
+    command.check_model(model, errors, report, json_)

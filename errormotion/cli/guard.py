@@ -1,4 +1,4 @@
-"""What a command does when something goes wrong: one message for a person, the traceback into a log, an exit code."""
+"""Errors of commands: one message for a person, the traceback in a log, an exit code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ P = ParamSpec("P")
 
 
 def guarded(function: Callable[P, None]) -> Callable[P, None]:
-    """Turn what a command raises into a message and an exit code; its option ``json_`` decides how it is said."""
+    """Turn an exception of a command into a message and an exit code, as text or JSON."""
 
     @functools.wraps(function)
     def command(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -45,21 +45,21 @@ def _run(function: Callable[..., None], args: Any, kwargs: Any) -> None:
     except KeyboardInterrupt as error:
         fail(f"Interrupted. {error}".strip(), error, INTERRUPTED, as_json)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone: nothing to tell it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has closed the pipe
         raise typer.Exit(ERROR) from None
     except ErrormotionError as error:
         fail(str(error), error, ERROR, as_json)
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         fail(f"{name}{error.strerror or error}", error, ERROR, as_json)
-    except Exception as error:  # noqa: BLE001 - the last place where it can be told to a person
-        text = f"Something went wrong that should not have: {type(error).__name__}: {error}\n"
+    except Exception as error:  # noqa: BLE001 - the last handler
+        text = f"Internal error: {type(error).__name__}: {error}\n"
         text += f"The traceback is in {log_file()}."
         fail(text, error, INTERNAL, as_json)
 
 
 def fail(message: str, error: BaseException, code: int, as_json: bool) -> None:
-    """Say what went wrong on stderr (and as JSON on stdout), log the traceback, and exit."""
+    """Print the message on stderr (and as JSON on stdout), log the traceback, and exit."""
     logging.getLogger("errormotion.cli").error("%s", message, exc_info=error)
     if as_json:
         output.show_json({"ok": False, "error": {"type": type(error).__name__, "message": message, "exit_code": code}})
@@ -76,7 +76,7 @@ def log_file() -> Path:
 
 @contextmanager
 def _log() -> Iterator[None]:
-    """Send warnings and errors to the log file, 1 MB and one older file at most, and keep them off the terminal."""
+    """Send warnings and errors to the log file, 1 MB and one older file at most, and not to the terminal."""
     path = log_file()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def _log() -> Iterator[None]:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Obey a request to end (SIGTERM) as Ctrl-C is obeyed: in order."""
+    """Treat a request to end (SIGTERM) like Ctrl-C."""
     before = signal.signal(signal.SIGTERM, _stop)
     try:
         yield

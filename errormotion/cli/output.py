@@ -1,4 +1,4 @@
-"""What commands print: plain text in columns for a person, JSON for a program."""
+"""Output of commands: text in columns for a person, JSON for a program."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import typer
 
 LEAST_WIDTH = 20
-"""Characters; a narrower last column is not worth breaking."""
+"""Characters; a narrower last column is not wrapped."""
 
 
 def show(text: str = "") -> None:
@@ -22,12 +22,12 @@ def show(text: str = "") -> None:
 
 
 def show_json(value: Any) -> None:
-    """Print one JSON document; numbers that are none become null."""
+    """Print one JSON document; NaN and infinite numbers become null."""
     sys.stdout.write(json.dumps(_strict(value), indent=2, ensure_ascii=False, default=str) + "\n")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return rows in columns under a head; numbers to the right. On a terminal the last column is broken to fit."""
+    """Return rows in columns under a head, numbers to the right; on a terminal the last column is wrapped."""
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     right = [bool(rows) and all(_numeric(row[k]) for row in rows) for k in range(len(head))]

@@ -1,4 +1,4 @@
-"""Progress bars with the time that remains, on a terminal; silence elsewhere."""
+"""Progress bars with the remaining time on a terminal; no output elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rich.progress import (
 
 
 class Bars:
-    """What the runner does, as bars on stderr; shows nothing where stderr is no terminal."""
+    """Progress of a campaign as bars on stderr; nothing is shown where stderr is no terminal."""
 
     def __init__(self, quiet: bool = False) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -50,34 +50,34 @@ class Bars:
         self._progress.stop()
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        """Begin a test."""
+        """Start a test."""
         self._finish()
         self._name = f"{number + 1}/{total} {name}: "
         if self._shown:
             self._progress.console.print(f"test {number + 1} of {total}, {name}: {folder}")
 
     def stage(self, name: str, total: float | None = None) -> None:
-        """Begin a part of a test."""
+        """Start a stage of a test."""
         self._finish()
         self._task = self._progress.add_task(self._name + name, total=total, note="")
 
     def advance(self, done: float) -> None:
-        """Say how much of the part is done."""
+        """Show how much of the stage is done."""
         if self._task is not None:
             self._progress.update(self._task, completed=done)
 
     @property
     def shown(self) -> bool:
-        """Whether there is a terminal that shows it."""
+        """Whether the bars are shown on a terminal."""
         return self._shown
 
     def note(self, text: str) -> None:
-        """Say what the measurement shows so far, behind the bar."""
+        """Show an intermediate result behind the bar."""
         if self._task is not None:
             self._progress.update(self._task, note=text)
 
     def ask(self, message: str) -> None:
-        """Ask the operator for something and wait for Enter."""
+        """Show a request to the operator and wait for Enter."""
         self._progress.stop()
         try:
             self._console.input(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ", markup=False)

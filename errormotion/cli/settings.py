@@ -1,4 +1,4 @@
-"""Settings of a plugin from the command line: a TOML file, and ``--set key=value`` over it."""
+"""Settings of a plugin from the command line: a TOML file, overridden by ``--set key=value``."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
     Parameters
     ----------
     model : type of PluginSettings
-        What it must be.
+        The settings class.
     file : Path, optional
         A TOML file with the settings at its top.
     assignments : sequence of str
-        ``key=value``, dotted keys for tables; the value as TOML has it, else taken as text.
+        ``key=value``, dotted keys for tables; the value in TOML, else text.
 
     Raises
     ------
     MethodError
-        Every mistake at once.
+        All mistakes at once.
     """
     data = tomlfile.read_toml(file, error=MethodError) if file else {}
     for assignment in assignments:

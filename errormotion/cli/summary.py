@@ -1,95 +1,81 @@
-"""The few numbers of an error dataset that a person looks at first."""
+"""Figures of merit and notes of an error dataset, as the command line prints them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-SHOWN = {"m": (1e6, "um"), "rad": (648000 / np.pi, "arcsec")}
+from errormotion import plugins
+from errormotion.cli.output import table
+from errormotion.plugins import FigureOfMerit
+
+FIELD_UNITS = {"m": (1e6, "um"), "rad": (648000 / np.pi, "arcsec")}
+"""Factor and name of the unit in which a quantity is printed, by its SI unit."""
+LONG = 1e-3
+"""Lengths from here on are printed in mm, m."""
 
 
-def last_values(errors: xr.Dataset) -> list[dict[str, Any]]:
-    """Return value and expanded uncertainty (k = 2) of every freedom at the end of a drift.
+def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the figures of merit: those of the plugin that made the dataset, else the last values over time.
 
-    A dataset without ``time`` has no end, and gives an empty list.
+    A plan states no errors and has none.
     """
-    if "time" not in errors.dims or errors.sizes["time"] == 0:
+    if "planned" in str(errors.attrs.get("reference", "")):
         return []
+    owner = plugins.owner_of_method(str(errors.attrs.get("method")))
+    return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
+
+
+def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return every estimate at its last known time with its expanded uncertainty; none for a dataset without time."""
     found = []
-    for k, name in enumerate(errors["dof"].values):
-        values = np.asarray(errors[str(name)].values, dtype=float)
-        seen = np.flatnonzero(np.isfinite(values))
-        if values.ndim != 1 or seen.size == 0:
+    covariance = errors.em.covariance().values
+    for k, name in enumerate(errors.em.names):
+        error = errors[name]
+        values = np.asarray(error.values, dtype=float)
+        known = np.flatnonzero(np.isfinite(values))
+        if error.dims != ("time",) or known.size == 0:
             continue
-        last = int(seen[-1])
-        factor, unit = SHOWN[errors[str(name)].attrs["units"]]
-        variance = float(errors["covariance"].values[last, k, k])
-        found.append(
-            {
-                "name": str(name),
-                "value": float(values[last]) * factor,
-                "expanded_uncertainty": 2.0 * np.sqrt(variance) * factor,
-                "unit": unit,
-                "time_min": float(errors["time"].values[last]) / 60.0,
-            }
-        )
+        last = int(known[-1])
+        minutes = float(errors["time"].values[last]) / 60.0
+        u = math.sqrt(float(covariance[last, k, k]))
+        found.append(FigureOfMerit(f"{name} after {minutes:.1f} min", float(values[last]), 2 * u, error.attrs["units"]))
     return found
 
 
+def as_printed(figure: FigureOfMerit) -> dict[str, Any]:
+    """Return a figure in the field's unit: name, value, expanded_uncertainty (k = 2), unit, limit."""
+    factor, unit = FIELD_UNITS.get(figure.unit, (1.0, figure.unit))
+    if figure.unit == "m" and abs(figure.value) >= LONG:
+        factor, unit = 1e3, "mm"
+    return {
+        "name": figure.name,
+        "value": figure.value * factor,
+        "expanded_uncertainty": figure.expanded_uncertainty * factor,
+        "unit": "" if unit == "1" else unit,
+        "limit": None if figure.limit is None else figure.limit * factor,
+    }
+
+
+def figure_table(figures: Sequence[dict[str, Any]]) -> str:
+    """Return printed figures as a table, each value to the digits of its uncertainty."""
+    rows = []
+    for figure in figures:
+        u = figure["expanded_uncertainty"]
+        digits = max(0, 1 - math.floor(math.log10(u))) if math.isfinite(u) and u > 0 else 2
+        stated = f"{u:.{digits}f}" if math.isfinite(u) else "unknown"
+        limit = "" if figure["limit"] is None else f"{figure['limit']:g}"
+        rows.append([figure["name"], f"{figure['value']:.{digits}f}", stated, figure["unit"], limit])
+    if any(row[-1] for row in rows):
+        return table(["", "value", "U (k=2)", "unit", "limit"], rows)
+    return table(["", "value", "U (k=2)", "unit"], [row[:-1] for row in rows])
+
+
 def notes_of(errors: xr.Dataset) -> list[str]:
-    """Return what is to be said of a result: figures that have no time, then what is missing, doubtful or assumed."""
-    notes = [str(note) for note in np.atleast_1d(errors.attrs.get("notes", [])) if str(note)]
-    if "planned" in str(errors.attrs.get("reference", "")):
-        return notes
-    figures = {"beam": _beams, "tool": _volume}.get(str(errors.attrs.get("component")))
-    return [*(figures(errors) if figures is not None else ()), *notes]
-
-
-def _beams(errors: xr.Dataset) -> Iterator[str]:
-    """Yield the errors of each beam's zero point and direction, and the check bar that was measured with it."""
-    if errors["covariance"].dims[:-2] == ("beam",):
-        for i, beam in enumerate(errors["beam"].values):
-            seen = [_told(errors, k, str(name), i) for k, name in enumerate(errors["dof"].values)]
-            if any(seen):
-                yield f"{beam} against nominal (U: k = 2): {', '.join(filter(None, seen))}."
-    if "bar_radius_fitted" in errors:
-        radius, u = float(errors["bar_radius_fitted"]), float(errors["bar_radius_u"])
-        used = errors["bar_residual"].values[errors["bar_left_out"].values == 0]
-        yield (
-            f"Check bar: radius {1e3 * radius:.4f} mm (U = {2e3 * u:.4f} mm, k = 2), residual "
-            f"{1e6 * np.sqrt(np.nanmean(used**2)):.2f} um rms."
-        )
-
-
-def _told(errors: xr.Dataset, k: int, name: str, beam: int) -> str:
-    value, variance = float(errors[name].values[beam]), float(errors["covariance"].values[beam, k, k])
-    if not np.isfinite(value):
-        return ""
-    factor, unit = SHOWN[errors[name].attrs["units"]]
-    return f"{name} {value * factor:+.2f} {unit} (U = {2 * np.sqrt(variance) * factor:.2f})"
-
-
-def _volume(errors: xr.Dataset) -> Iterator[str]:
-    """Yield the largest and the root mean square volumetric error over targets."""
-    if errors["EX"].dims != ("target",) or errors["covariance"].dims[:-2] != ("target",):
-        return
-    e = np.stack([errors[name].values for name in ("EX", "EY", "EZ")], axis=-1)
-    C = errors["covariance"].values[:, :3, :3]
-    size = np.linalg.norm(e, axis=1)
-    known = np.isfinite(size) & (size > 0)
-    if not known.any():
-        return
-    e, C, size = e[known], C[known], size[known]
-    variance = np.einsum("ti,tij,tj->t", e, C, e) / size**2
-    worst, rms = int(np.argmax(size)), float(np.sqrt(np.mean(size**2)))
-    name = errors["target"].values[known][worst] if "target" in errors.coords else np.flatnonzero(known)[worst] + 1
-    # However errors of targets go together, U of the rms is no more than this, to first order.
-    spread = float(np.mean(size * np.sqrt(variance))) / rms
-    yield (
-        f"Volumetric error over {len(size)} targets: largest {1e6 * size[worst]:.2f} um at target {name} "
-        f"(U = {2e6 * np.sqrt(variance[worst]):.2f} um, k = 2), root mean square {1e6 * rms:.2f} um "
-        f"(U at most {2e6 * spread:.2f} um)."
-    )
+    """Return the notes of a result: what is missing, doubtful or assumed."""
+    notes = errors.attrs.get("notes", [])
+    return [str(note) for note in np.atleast_1d(notes) if str(note)]

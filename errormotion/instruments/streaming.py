@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -51,6 +52,14 @@ class Decoder(Protocol):
 
     def __call__(self, data: bytes) -> Chunk:
         """Return the samples that the next bytes complete."""
+
+
+def count_reasons(reasons: Array, names: Sequence[str], prefix: str = "") -> dict[str, int]:
+    """Return how many samples have no value, by the name of the reason; code 0 stands for a value."""
+    if not reasons.any():
+        return {}
+    counts = np.bincount(reasons, minlength=len(names))
+    return {prefix + names[code]: int(count) for code, count in enumerate(counts) if code and count}
 
 
 class Reader:

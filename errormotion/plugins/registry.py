@@ -16,6 +16,7 @@ from importlib.metadata import Distribution, EntryPoint, distributions
 from typing import Any, Literal
 
 from errormotion.errors import PluginError
+from errormotion.plugins import kind_registry
 from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInfo
 
 Group = Literal["instruments", "methods", "datasets"]
@@ -193,3 +194,4 @@ def refresh() -> None:
     """Forget what was found: entry points are read again at the next call."""
     _found.cache_clear()
     _loaded.cache_clear()
+    kind_registry.refresh()

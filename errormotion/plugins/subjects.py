@@ -13,16 +13,8 @@ from urllib.parse import urlsplit, urlunsplit
 
 import xarray as xr
 
+from errormotion.plugins import kind_registry
 from errormotion.plugins.lazy import load_object
-
-#: Bounds of a believable reading in SI units, by kind of instrument. Their job is to catch mm taken for m.
-PLAUSIBLE: Mapping[str, tuple[float, float]] = {
-    "point_lds": (-0.05, 0.5),
-    "spindle_frame": (-0.05, 0.5),
-    "line_profiler": (-0.5, 0.5),
-    "thermometer": (-60.0, 400.0),
-    "laser_tracker": (-160.0, 160.0),
-}
 
 #: How a variable of a raw dataset moves with the frame: see ``MethodSubject.raw_vectors``.
 Vector = Literal["pose", "point", "direction", "x", "y", "z", "covariance"]
@@ -66,7 +58,7 @@ class InstrumentSubject:
         Fault that leaves samples out (asked for with ``fault_at=10``, from the tenth on), and fault that cuts the
         frames into pieces.
     plausible : (float, float), optional
-        Lowest and highest believable reading in SI units; default by kind from ``PLAUSIBLE``. None: no bounds.
+        Lowest and highest plausible reading in SI units; default: those of its kind. None: no bounds.
     blocks : int
         How many blocks of a stream the kit looks at.
     time_limit : float
@@ -115,8 +107,8 @@ class InstrumentSubject:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Lowest and highest believable reading."""
-        return self.plausible or PLAUSIBLE.get(self.plugin.info.kind)
+        """Lowest and highest plausible reading."""
+        return self.plausible or kind_registry.plausible(self.plugin.info.kind)
 
     @property
     def streams(self) -> bool:

@@ -23,6 +23,7 @@ from errormotion.plugins import (
     PluginSettings,
     Samples,
     Status,
+    kind_registry,
     load_object,
 )
 from errormotion.testing.kit import Checks, require
@@ -40,7 +41,11 @@ def _no_faults(subject: InstrumentSubject) -> str:
 
 
 def _no_bounds(subject: InstrumentSubject) -> str:
-    return "" if subject.bounds else f"nothing is known of believable readings of a '{subject.plugin.info.kind}'"
+    return "" if subject.bounds else f"no plausible readings are stated for the kind '{subject.plugin.info.kind}'"
+
+
+def _no_contract(subject: InstrumentSubject) -> str:
+    return "" if kind_registry.kind(subject.plugin.info.kind) else f"no kind '{subject.plugin.info.kind}' is registered"
 
 
 def _no_splitting(subject: InstrumentSubject) -> str:
@@ -70,6 +75,15 @@ def info_complete(subject: InstrumentSubject) -> str:
     if info.simulator is not None:
         load_object(info.simulator)
     return f"{info.id} ({info.kind}), {info.status}"
+
+
+@INSTRUMENT_CHECKS.add(why_not=_no_contract)
+def kind_contract(subject: InstrumentSubject) -> str:
+    """The driver has every member that the contract of its kind demands, and each takes the contract's arguments."""
+    kind = subject.plugin.info.kind
+    found = kind_registry.deviations(subject.build(), kind_registry.kind(kind))
+    require(not found, f"{kind}: {'; '.join(found)}")
+    return f"{kind}: {len(kind_registry.members(kind_registry.kind(kind)))} members"
 
 
 @INSTRUMENT_CHECKS.add()
@@ -185,7 +199,7 @@ def readings(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_bounds)
 def plausible_magnitudes(subject: InstrumentSubject) -> str:
-    """Readings and samples are in SI units: finite ones lie within believable bounds."""
+    """Readings and samples are in SI units: finite ones lie within plausible bounds."""
     low, high = subject.bounds or (-math.inf, math.inf)
     with subject.build() as instrument:
         values = np.array(numbers(instrument.read()))

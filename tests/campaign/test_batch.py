@@ -1,5 +1,6 @@
 """Many runs give the same errors wherever they are identified; what breaks, breaks alone."""
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from errormotion.campaign import batch, runner
 from errormotion.campaign.batch import Outcome, identify_runs
 from errormotion.campaign.files import CampaignPlan
 from errormotion.errors import PluginError, RunError
+from errormotion.methods.spindle_drift import simulation
 from errormotion.plugins import PluginSettings
 from errormotion.twin import Event, VirtualMachine
 
@@ -34,7 +36,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
     t = np.arange(0.25, 60.0, 0.5)
-    good = [datasets.save(machine.raw_spindle_drift(t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
+    good = [datasets.save(simulation.raw_drift(machine, t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
     cut = folder / "cut.nc"
     cut.write_bytes(good[0].read_bytes()[:5000])
     return [*good[:2], cut, *good[2:]]
@@ -159,6 +161,17 @@ def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, 
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
 
 
+def test_result_of_an_earlier_version_is_recognised_by_the_hash_it_carries(
+    raws: list[Path], identify: Identify, tmp_path: Path
+) -> None:
+    (outcome,) = identify(raws[:1])
+    errors = datasets.load(outcome.errors)
+    with datasets.load(raws[0]) as raw:
+        mark = json.loads(errors.attrs[batch.MARK]) | {"raw": datasets.hash_dataset(raw, "sha256")}
+    datasets.save(errors.assign_attrs({batch.MARK: json.dumps(mark)}), outcome.errors, overwrite=True)
+    assert [each.stepped_over for each in identify(raws[:1])] == [True]
+
+
 def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     (first,) = identify(raws[:1])
     assert first.errors is not None
@@ -275,6 +288,6 @@ def test_threads_take_turns_where_numba_is_not_safe(raws: list[Path], tmp_path: 
         check=False,
     )
     assert "one run at a time" in done.stderr
-    assert "4 identified, 0 there already, 1 failed" in done.stdout
+    assert "4 identified, 0 existed already, 1 failed" in done.stdout
     assert f"failed: {raws[2]}: is truncated" in done.stdout
     assert done.returncode == 1

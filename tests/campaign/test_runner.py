@@ -203,3 +203,19 @@ def test_broken_run_json_is_told_and_harms_no_other_run(plan: Plan, tmp_path: Pa
         RunFolder.open(first.path)
     assert [folder.data["test"] for folder in list_runs(tmp_path / "runs")] == ["b"]
     assert load_campaign(write('name = "a"')).name == "Ramps"
+
+
+def test_each_test_measures_with_the_instrument_that_it_chooses_and_records_it_alone(plan: Plan) -> None:
+    second = '[instruments.other]\ndriver = "counter"\naddress = "sim://other"\nrate = "2 kHz"\n'
+    folders = runner.run(
+        plan(
+            'name = "a"\ninstruments = {counter = "other"}',
+            'name = "b"\ninstruments = {counter = "counter"}',
+            bench=second,
+        )
+    )
+    for folder, name, rate in zip(folders, ("other", "counter"), (2000.0, 1000.0), strict=True):
+        assert [entry["name"] for entry in folder.data["instruments"]] == [name]
+        with datasets.load(folder.raw) as raw:
+            assert raw.attrs["sample_rate"] == rate
+            assert [entry["name"] for entry in json.loads(raw.attrs["instruments"])] == [name]

@@ -1,5 +1,7 @@
 """The raw store holds what was appended, whatever write was the last."""
 
+import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +76,14 @@ def test_sensor_steps_are_stored_as_integers_and_times_not_at_all(tmp_path: Path
         assert raw.attrs["sample_rate"] == RATE
         assert raw.attrs["time_start"] == 0.0
         np.testing.assert_allclose(raw["time"].values, np.arange(100) / RATE)
+
+
+def test_texts_have_a_type_with_a_specification(tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        fill(tmp_path / "raw.zarr", [100, 28], expected=100)
+    assert not found
+    assert json.loads((tmp_path / "raw.zarr" / "sensor" / "zarr.json").read_text())["data_type"] == "string"
 
 
 def test_packing_that_would_lose_something_is_left_out(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_broken_plugin_is_listed_with_its_error(run: Run, answer: Answer, monkey
     from importlib.metadata import EntryPoint
 
     point = EntryPoint("broken", "nowhere_at_all:Thing", "errormotion.instruments")
-    monkeypatch.setattr(plugins, "_found", lambda: {"instruments": (point,), "methods": ()})
+    monkeypatch.setattr(plugins.registry, "_found", lambda: {"instruments": (point,), "methods": (), "datasets": ()})
     (plugin,) = answer("plugins", "list")["plugins"]
     assert plugin["status"] == "broken"
     assert "ModuleNotFoundError" in run("plugins", "list").stdout
@@ -96,7 +96,7 @@ def test_plugin_check_prints_each_check_and_fails_with_the_plugin(
 def test_identify_writes_errors_once(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
     found = answer("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", "--set", "average=2 s")
     assert found["component"] == "spindle"
-    assert {result["name"] for result in found["results"]} == {"EX", "EY", "EZ", "EA", "EB"}
+    assert {result["name"].split()[0] for result in found["results"]} == {"EX", "EY", "EZ", "EA", "EB"}
     errors = datasets.load(tmp_path / "errors.nc")
     assert json.loads(errors.attrs["provenance"])["settings"]["average"] == 2.0
     again = run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc", code=1)
@@ -109,7 +109,7 @@ def test_identify_takes_many_runs_and_tells_those_that_fail(
     (tmp_path / "cut.nc").write_bytes(raw.read_bytes()[:5000])
     command = ("identify", "raw.nc", "cut.nc", "--method", "spindle_drift", "--out", "results", "--scheduler", "sync")
     text = run(*command, code=1).stdout
-    assert text.startswith("results: 1 identified, 0 there already, 1 failed\n  failed: cut.nc: is truncated")
+    assert text.startswith("results: 1 identified, 0 existed already, 1 failed\n  failed: cut.nc: is truncated")
     found = answer(*command, code=1)
     assert found["ok"] is False
     assert found["scheduler"] == "sync"
@@ -182,7 +182,7 @@ def test_mistake_of_ours_has_its_own_exit_code_and_names_the_log(
 
 def test_validate_tells_every_violation(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
     assert answer("validate", raw)["ok"] is True
-    assert "raw.nc: good" in run("validate", raw).stdout
+    assert "raw.nc: valid" in run("validate", raw).stdout
     with datasets.load(raw) as good:
         bad = good.load().drop_vars(["bar_radius", "level"])
     datasets.save(bad, tmp_path / "bad.nc")
@@ -222,7 +222,7 @@ def test_import_says_what_it_made(run: Run, answer: Answer, tmp_path: Path) -> N
 def test_doctor_finds_this_machine_well_and_says_what_is_not(
     run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from errormotion.cli.commands import examination
+    from errormotion.cli.commands import doctor as examination
 
     monkeypatch.setattr(examination, "LEAST_DISK", 0)
     assert answer("doctor")["ok"] is True

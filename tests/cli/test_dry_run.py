@@ -32,7 +32,7 @@ def test_path_duration_and_limits_are_told_and_drawn(folder: Path) -> None:
     assert not (folder / "runs").exists()
     again = CliRunner().invoke(app, ["run", "virtual_probing/monday.toml", "--dry-run", "--out", "pictures"])
     assert again.exit_code == 1
-    assert "is there already" in again.stderr
+    assert "exists already" in again.stderr
 
 
 def test_a_program_reads_the_same(folder: Path) -> None:
@@ -44,7 +44,7 @@ def test_a_program_reads_the_same(folder: Path) -> None:
 
 def test_a_method_that_does_not_say_what_moves_is_told(folder: Path) -> None:
     result = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run"])
-    assert "beam: the method does not say what moves" in result.stdout
+    assert "beam: the method does not report its motions" in result.stdout
 
 
 @pytest.mark.parametrize("arguments", [["--dry-run"], ["virtual_beam/campaign.toml", "--out", "x"]])

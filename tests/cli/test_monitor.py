@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from errormotion.campaign.monitor.watch import Snapshot
 from errormotion.cli.app import app
-from errormotion.cli.commands.monitoring import Screen, bars, clock
+from errormotion.cli.commands.monitor import Screen, bars, clock
 
 BENCH = """\
 schema = "errormotion.bench/1"

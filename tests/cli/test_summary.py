@@ -1,59 +1,64 @@
-"""The figures that a person sees first of beams and volumes."""
+"""The figures and notes that a person sees first of a result."""
 
-import re
+import math
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.cli.summary import notes_of
+from errormotion import plugins
+from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
 from errormotion.methods.beam_direction import BeamDirection, Settings
-from errormotion.twin import VirtualMachine
+from errormotion.plugins import FigureOfMerit
 
 
-@pytest.fixture(scope="module")
-def beam() -> xr.Dataset:
-    planes = [(np.radians(20.0), np.radians(b)) for b in (0, 90, 180, 270)]
-    raw = VirtualMachine("cframe", seed=3).raw_beam_direction(planes, seed=3, inclination_error=False)
-    return BeamDirection().identify(raw)
+@pytest.fixture
+def result() -> xr.Dataset:
+    values = {"EX": [0.0, 2e-6], "EY": [0.0, np.nan]}
+    errors = {name: ("time", np.array(v), {"units": "m"}) for name, v in values.items()}
+    covariance = np.tile(np.diag([1e-14, 1e-14]), (2, 1, 1))
+    return xr.Dataset(
+        {**errors, "covariance": (("time", "dof", "dof_"), covariance)},
+        {"time": [0.0, 90.0], "dof": ["EX", "EY"]},
+        {"method": "unknown", "reference": "cold", "notes": ["one sensor is missing"]},
+    )
 
 
-def test_a_beam_is_told_with_its_expanded_uncertainty(beam: xr.Dataset) -> None:
-    told = notes_of(beam)[0]
-    assert told.startswith("beam against nominal (U: k = 2): EX ")
-    found = re.findall(r"(E.) ([-+][0-9.]+) (um|arcsec) \(U = ([0-9.]+)\)", told)
-    assert [name for name, *_ in found] == ["EX", "EY", "EZ", "EA", "EB", "EC"]
-    for k, (name, value, unit, expanded) in enumerate(found):
-        factor = 1e6 if unit == "um" else np.degrees(1) * 3600
-        assert float(value) == pytest.approx(float(beam[name][0]) * factor, abs=0.006)
-        u = np.sqrt(float(beam["covariance"][0, k, k]))
-        assert float(expanded) == pytest.approx(2 * u * factor, abs=0.006)
+def test_without_a_plugin_the_last_known_values_are_the_figures(result: xr.Dataset) -> None:
+    first, second = (as_printed(figure) for figure in figures_of(result))
+    assert first["name"] == "EX after 1.5 min"
+    assert (first["value"], first["expanded_uncertainty"], first["unit"]) == pytest.approx((2.0, 0.2, "um"))
+    assert second["name"] == "EY after 0.0 min"
 
 
-def test_what_is_not_seen_has_no_figure(beam: xr.Dataset) -> None:
-    unseen = beam.assign(EX=np.nan * beam["EX"], EY=np.nan * beam["EY"])
-    assert "EX" not in notes_of(unseen)[0]
-    assert "EZ" in notes_of(unseen)[0]
+def test_the_plugin_of_the_method_states_its_figures(result: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Foreign:
+        @staticmethod
+        def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
+            return [FigureOfMerit("G(CW)", 5e-6, 1e-6, "m", limit=8e-6)]
+
+    owners: dict[str, Any] = {"unknown": Foreign}
+    monkeypatch.setattr(plugins, "owner_of_method", owners.get)
+    shown = figure_table([as_printed(figure) for figure in figures_of(result)])
+    assert shown.splitlines()[-1].split() == ["G(CW)", "5.0", "1.0", "um", "8"]
 
 
-def test_a_plan_has_no_errors_to_tell() -> None:
+def test_values_have_the_digits_of_their_uncertainty() -> None:
+    figures = [
+        FigureOfMerit("radius", 0.0125004, 0.3e-6, "m"),
+        FigureOfMerit("tilt", 1e-5, 2e-7, "rad"),
+        FigureOfMerit("EX", 1e-6, math.nan, "m"),
+    ]
+    lines = figure_table([as_printed(figure) for figure in figures]).splitlines()
+    assert [line.split()[1:] for line in lines[-3:]] == [
+        ["12.50040", "0.00030", "mm"],
+        ["2.063", "0.041", "arcsec"],
+        ["1.00", "unknown", "um"],
+    ]
+
+
+def test_a_plan_has_notes_and_no_figures() -> None:
     planned = BeamDirection().plan(Settings())
+    assert figures_of(planned) == []
     assert notes_of(planned) == list(planned.attrs["notes"])
-
-
-def test_a_volume_is_told_by_its_largest_and_its_usual_error() -> None:
-    error = 1e-6 * np.array([[3.0, 4.0, 0.0], [0.0, 0.0, -1.0], [np.nan, 0.0, 0.0]])
-    covariance = np.tile(np.diag([1e-12, 1e-12, 4e-12, 0, 0, 0]), (3, 1, 1))
-    ds = xr.Dataset(
-        {name: ("target", error[:, k]) for k, name in enumerate(("EX", "EY", "EZ"))}
-        | {"covariance": (("target", "dof", "dof_"), covariance)},
-        {"target": ["P1", "P2", "P3"]},
-        {"component": "tool", "notes": ["one target is unknown"]},
-    )
-    figure, note = notes_of(ds)
-    # sqrt((5^2 + 1^2) / 2) = 3.61; U of the rms: 2 (5 * 1 + 1 * 2) / 2 / 3.61
-    assert figure == (
-        "Volumetric error over 2 targets: largest 5.00 um at target P1 (U = 2.00 um, k = 2), root mean square 3.61 um "
-        "(U at most 1.94 um)."
-    )
-    assert note == "one target is unknown"

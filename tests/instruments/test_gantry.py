@@ -13,10 +13,10 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.kinematics.poses import displaced
+from errormotion.plugins.readings import Profiles
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import circular_pocket, swept
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -135,7 +135,7 @@ def test_a_warm_pass_shows_the_true_error_of_each_line_at_its_own_moment() -> No
     assert 3600 < since[0] < since[-1] - 3 < 3700  # 80 mm at 25 mm/s
     assert cold.encoder.tolist() == warm.encoder.tolist()
     y, crossbeam = warm.encoder * 1e-6, machine.crossbeam
-    truth = machine.truth_crossbeam(since, y).em.twist().values[np.arange(y.size), np.arange(y.size)]
+    truth = machine.crossbeam.twist(since, y)
     carriage = np.tile(np.eye(4), (y.size, 1, 1))
     carriage[:, 1, 3] = y
     carriage = carriage @ displaced(truth).as_matrix()

@@ -13,13 +13,15 @@ from pydantic import ValidationError
 from errormotion.datasets.units import EDGE
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings, codec
-from errormotion.instruments.line_profiler.keyence_ljx.driver import STREAM
-from errormotion.instruments.line_profiler.profiles import Profiles
+from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
+from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamDecoder, StreamEndedError
+from errormotion.instruments.line_profiler.keyence_ljx.driver import QUIET_INTERVAL, STREAM
 from errormotion.instruments.simulators.faults import parse_fault
-from errormotion.instruments.simulators.keyence_ljx import SimulatedLJX
-from errormotion.instruments.simulators.profile_sources import Lines, SweptSurface
+from errormotion.instruments.simulators.line_profiler.keyence_ljx import SimulatedLJX, packed
+from errormotion.instruments.simulators.line_profiler.profile_sources import Lines, SweptSurface
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.serving import TcpServer
+from errormotion.plugins.readings import Profiles
 
 SMALL = "sim://cframe/profiler?seed=3&points=80"
 STEP = 1e-7  # m: the simulator's Z unit
@@ -433,6 +435,28 @@ def test_a_profiler_that_ends_the_stream_by_itself_is_an_instrument_error() -> N
         with pytest.raises(InstrumentError, match="has ended the stream"):
             list(stream)
         assert profiler.read().shape == (80,)
+
+
+def test_the_notice_of_the_stream_before_does_not_end_the_next_one() -> None:
+    late = f"{SMALL}&notice_delay={2 * QUIET_INTERVAL}"
+    with KeyenceLJX(late) as profiler:
+        for _ in range(2):
+            take(profiler, 1, 10)
+            assert profiler.read().shape == (80,)
+
+
+def test_only_one_notice_ahead_of_the_first_profile_is_taken_as_late() -> None:
+    layout = StreamLayout(1, 0, 8, STEP, 0.0, 1e-5)
+    profile = packed(layout, np.zeros((1, 8)), np.zeros(1, np.int64), np.zeros(1, np.int64)).tobytes()
+    stopped = codec.notice(1)
+    ends = {
+        data: StreamDecoder(layout, late_notice=True)(data).end
+        for data in (stopped + profile, stopped + stopped, profile + stopped)
+    }
+    assert ends[stopped + profile] is None
+    assert isinstance(ends[stopped + stopped], StreamEndedError)
+    assert isinstance(ends[profile + stopped], StreamEndedError)
+    assert isinstance(StreamDecoder(layout)(stopped).end, StreamEndedError)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ import pytest
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_emscon import EmSconSettings, LeicaEmScon
-from errormotion.instruments.laser_tracker.measurement import BeamBrokenError, Environment
-from errormotion.instruments.simulators.tracker_scene import refraction_index
+from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError
+from errormotion.instruments.simulators.virtual_world.tracker_scene import refraction_index
+from errormotion.plugins.readings import Environment
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 ADDRESS = "sim://cframe/tracker?seed=3"

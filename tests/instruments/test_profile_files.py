@@ -14,7 +14,8 @@ from pydantic import ValidationError
 from errormotion.datasets.units import EDGE
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles, ProfileFileSettings
-from errormotion.instruments.line_profiler.profile_files.readers import Scan, height_map
+from errormotion.instruments.line_profiler.profile_files.readers import height_map
+from errormotion.plugins.readings import Scan
 
 X = -0.5e-3 + 12.5e-6 * np.arange(40)
 Y = 70e-6 * np.arange(25)

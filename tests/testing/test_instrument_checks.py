@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import socket
 import threading
 import time
@@ -33,6 +34,7 @@ class Sound:
 
     info = InstrumentInfo("sound", "point_lds", "A sensor that exists in this test only", "simulated_only")
     Settings = Settings
+    measuring_range, mid_range = (0.0, 2e-3), 1e-3
 
     def __init__(self, address, settings=None, *, record=None):
         self.address, self.settings, self.record = address, settings or Settings(), record
@@ -92,7 +94,7 @@ class Sound:
     def read(self):
         return self.value(self.line().split()[1])
 
-    def stream(self):
+    def stream(self, block=None):
         first = None
         while True:
             values, invalid, dropped = [], 0, 0
@@ -134,6 +136,30 @@ class TestSound(InstrumentConformance):
 
 class SaysNothingOfItself(Sound):
     info = replace(Sound.info, summary="")
+
+
+class NamesNoMidRange(Sound):
+    mid_range = None
+
+
+class MeasuresItsRange(Sound):
+    def measuring_range(self):
+        return 0.0, 2e-3
+
+
+class ReadsByNumber(Sound):
+    def read(self, channel=None, *, unit):
+        return super().read()
+
+
+class StreamsWithoutBlocks(Sound):
+    def stream(self, chunk=None):
+        return super().stream()
+
+
+class FillsWithoutStart(Sound):
+    def fill(self, values, reasons):
+        values[:], reasons[:] = 1e-3, 0
 
 
 class SwallowsUnknownSettings(Sound):
@@ -249,6 +275,8 @@ class LeavesASocket(Sound):
 
 BROKEN = [
     ("info_complete", SaysNothingOfItself),
+    *(("kind_contract", plugin) for plugin in (NamesNoMidRange, MeasuresItsRange, StreamsWithoutBlocks)),
+    ("kind_contract", FillsWithoutStart),
     ("settings_strict", SwallowsUnknownSettings),
     ("identify", HidesItsSerialNumber),
     ("identify", PassesAsReal),
@@ -286,6 +314,36 @@ def test_a_broken_instrument_fails_exactly_its_check(check, plugin):
     assert failed.keys() == {check}
 
 
+@pytest.mark.parametrize(
+    ("plugin", "message"),
+    [
+        (NamesNoMidRange, "point_lds: 'mid_range' is missing"),
+        (MeasuresItsRange, "'measuring_range' is a method, expected an attribute or property"),
+        (ReadsByNumber, r"expected read\(\) -> 'float', found read\(channel=None, \*, unit\)"),
+        (
+            StreamsWithoutBlocks,
+            r"expected stream\(block: 'int \| None' = None\).*, found stream\(chunk=None\) \(Streaming\)",
+        ),
+        (FillsWithoutStart, r"'lost' is missing \(Synchronised\)"),
+    ],
+)
+def test_a_deviation_from_the_contract_is_stated_with_its_member(plugin, message):
+    check = next(check for check in INSTRUMENT_CHECKS if check.name == "kind_contract")
+    result = run_check(check, replace(SOUND, plugin=plugin))
+    assert not result.ok
+    assert re.search(message, result.message)
+
+
+def test_a_kind_that_nobody_registered_has_no_contract_and_no_bounds():
+    class Other(Sound):
+        info = replace(Sound.info, kind="other_kind")
+
+    results = {result.name: result for result in run_checks(replace(SOUND, plugin=Other))}
+    assert results["kind_contract"].skipped
+    assert "no kind 'other_kind' is registered" in results["kind_contract"].message
+    assert results["plausible_magnitudes"].skipped
+
+
 def test_every_check_has_a_plugin_that_fails_it():
     assert {check for check, _ in BROKEN} == {check.name for check in INSTRUMENT_CHECKS}
 
@@ -307,7 +365,9 @@ def test_a_check_that_hangs_fails_at_its_time_limit():
 
 
 def test_checks_without_a_stream_do_not_apply_to_a_driver_without_one():
-    ReadsOnly = type("ReadsOnly", (), {k: v for k, v in vars(Sound).items() if k != "stream"})
+    ReadsOnly = type(
+        "ReadsOnly", (), {k: v for k, v in vars(Sound).items() if k not in ("stream", "__dict__", "__weakref__")}
+    )
     results = run_checks(InstrumentSubject(ReadsOnly, "sim://bench/sound", faults=()))
     assert [result.message for result in results if not result.ok] == []
     skipped = {result.name for result in results if result.skipped}

@@ -1,4 +1,4 @@
-"""The plugin ``monitor``: logs of temperatures and working parameters."""
+"""The plugin ``monitor_log``: logs of temperatures and working parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class MonitorLog:
     """The log of a monitor."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
-        id="monitor",
+        id="monitor_log",
         summary="Log of temperatures and working parameters of a machine",
         schemas=tuple(table.id for table in RAW_SCHEMAS),
     )

@@ -1,20 +1,20 @@
-"""``errormotion identify``, ``import``, ``report`` and ``validate``: what is done with data on disk."""
+"""``errormotion identify``, ``import``, ``report`` and ``validate``: commands on stored data."""
 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from errormotion import datasets, plugins
+from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
-from errormotion.cli.summary import last_values, notes_of
+from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 
@@ -33,16 +33,16 @@ def identify(
     as_json: bool,
 ) -> None:
     """Identify one raw dataset into a file, or several into a folder."""
-    from errormotion.campaign import batch
-
-    several = len(raws) > 1 or scheduler or workers or batch.is_runs_folder(raws[0])
+    several = len(raws) > 1 or scheduler or workers or is_runs_folder(raws[0])
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
-        _identify_one(batch.raw_of(raws[0]), method_id, settings, out, as_json)
+        _identify_one(raw_of(raws[0]), method_id, settings, out, as_json)
         return
+    from errormotion.campaign import batch
+
     scheduler, note = batch.choose_scheduler(scheduler)
     if note:
         typer.echo(note, err=True)
@@ -50,31 +50,26 @@ def identify(
         outcomes = batch.identify_runs(
             raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
         )
-    _tell(outcomes, out, scheduler, as_json)
+    _show_outcomes(outcomes, out, scheduler, as_json)
 
 
 def _method_of(raw: Path) -> str:
-    """Return the id of the method that a raw dataset is for."""
-    from errormotion.campaign import batch
-
-    if batch.is_runs_folder(raw):
-        raise DatasetError(f"{raw}: is a folder of runs; say which method's with --method")
-    path = batch.raw_of(raw)
+    """Return the id of the method that identifies a raw dataset."""
+    if is_runs_folder(raw):
+        raise DatasetError(f"{raw}: is a folder of runs; name the method with --method")
+    path = raw_of(raw)
     with reading(path), datasets.load(path) as dataset:
         schema = str(dataset.attrs.get("schema", "none"))
-    match = re.fullmatch(r"errormotion\.raw\.(\w+)/\d+", schema)
-    if match is None:
-        raise DatasetError(f"{path}: expected a raw dataset, whose schema tells the method; found schema {schema}")
-    if match[1] == "inclination":
-        raise DatasetError(
-            f"{path}: holds readings for a calibration of a sensor's inclination error; turn them into one with "
-            "'errormotion calibrate'"
-        )
-    return match[1]
+    owner = plugins.owner_of_schema(schema)
+    if owner is None or not hasattr(owner, "identify"):
+        raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}")
+    if schema in getattr(owner, "calibrations", {}):
+        raise DatasetError(f"{path}: holds readings of a calibration; use 'errormotion calibrate'")
+    return str(owner.info.id)
 
 
-def _tell(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
-    """Print what became of many runs; one that failed decides the exit code."""
+def _show_outcomes(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
+    """Print the outcome of each run; the exit code is that of a failure if one failed."""
     failed = [outcome for outcome in outcomes if outcome.reason]
     if as_json:
         keys = ("raw", "errors", "reason", "seconds", "stepped_over")
@@ -83,7 +78,7 @@ def _tell(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> 
     else:
         stepped_over = sum(outcome.stepped_over for outcome in outcomes)
         made = len(outcomes) - len(failed) - stepped_over
-        show(f"{out}: {made} identified, {stepped_over} there already, {len(failed)} failed")
+        show(f"{out}: {made} identified, {stepped_over} existed already, {len(failed)} failed")
         for outcome in failed:
             name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
             show(f"  failed: {name}{outcome.reason}")
@@ -101,17 +96,14 @@ def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: 
         errors = method().identify(dataset, settings)
     datasets.validate(errors)
     datasets.save(errors, out)
-    results, notes = last_values(errors), notes_of(errors)
+    results, notes = [as_printed(figure) for figure in figures_of(errors)], notes_of(errors)
     if as_json:
         answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
         show_json({"ok": True, **answer})
         return
     show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
-    for result in results:
-        show(
-            f"  {result['name']} after {result['time_min']:.1f} min: {result['value']:+.2f} {result['unit']} "
-            f"(U = {result['expanded_uncertainty']:.2f}, k = 2)"
-        )
+    if results:
+        show(figure_table(results))
     for note in notes:
         show(f"  note: {note}")
 

@@ -1,4 +1,4 @@
-"""``errormotion run --dry-run``: where a campaign would send the machine and for how long, and nothing moves."""
+"""``errormotion run --dry-run``: path and duration of a campaign; nothing moves."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
     Raises
     ------
     BenchError
-        The campaign cannot be read, or would leave the limits of its bench.
+        The campaign cannot be read, or leaves the limits of its bench.
     """
     plan = load_campaign(campaign)
-    told: list[dict[str, Any]] = []
+    found_tests: list[dict[str, Any]] = []
     for test in plan.tests:
-        steps = steps_of(test.method, test.settings, plan.bench.settings_by_kind)
+        steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
         if steps is None:
-            told.append({"test": test.name, "motions": None})
+            found_tests.append({"test": test.name, "motions": None})
             continue
         found = extent(steps)
         picture = None if out is None else _picture(plan, test.name, steps, out)
-        told.append(
+        found_tests.append(
             {"test": test.name, "motions": found.__dict__, "picture": None if picture is None else str(picture)}
         )
         if not as_json:
@@ -46,16 +46,16 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
             if picture is not None:
                 show(f"  drawn in {picture}")
     if as_json:
-        show_json({"ok": True, "tests": told})
+        show_json({"ok": True, "tests": found_tests})
         return
-    for entry in told:
+    for entry in found_tests:
         if entry["motions"] is None:
-            show(f"{entry['test']}: the method does not say what moves")
+            show(f"{entry['test']}: the method does not report its motions")
     show("Nothing has moved.")
 
 
 def _text(name: str, found: Extent, limits: Limits) -> str:
-    """Return what a test asks of the machine, beside its limits."""
+    """Return the motions of a test compared with the limits."""
     rows = []
     for k, axis in enumerate(AXES):
         span = getattr(limits, axis)
@@ -79,7 +79,7 @@ def _picture(plan: CampaignPlan, name: str, steps: list[Step], out: Path) -> Pat
     """Draw the path from above and from the front, and the spindle speed over time; return the file."""
     path = out / f"{name}-dry-run.png"
     if path.exists():
-        raise BenchError(f"{path} is there already: choose another folder, or take it away.")
+        raise BenchError(f"{path} exists already: choose another folder, or remove the file.")
     out.mkdir(parents=True, exist_ok=True)
     from matplotlib.figure import Figure
 

@@ -1,1 +1,4 @@
-"""The shipped demonstrations: campaigns on the virtual machine, and their results beside the truth."""
+"""The shipped demonstrations: campaigns on the virtual machine, and their results compared with the truth."""
+
+CONTROLLERS = {"virtual": "errormotion.cli.demo.spindle", "linuxcnc": "errormotion.cli.demo.probing"}
+"""Module of the demonstration for each controller; the first one needs nothing installed."""

@@ -1,4 +1,4 @@
-"""``errormotion demo``: the shipped campaign on a virtual machine, and its result beside the truth."""
+"""``errormotion demo``: the shipped campaign on a virtual machine, and its result compared with the truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from errormotion import datasets
 from errormotion.arrays import Array
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
-from errormotion.cli.commands.running import describe, work
+from errormotion.cli.commands.run import describe, work
 from errormotion.cli.output import show, show_json, table
 from errormotion.instruments.transports import parse_address
 from errormotion.kinematics.twists import move
@@ -29,7 +29,7 @@ AROUND_A_STEP = 10.0
 
 @dataclass(frozen=True)
 class Number:
-    """One number that matters: measured, how well it is known (k = 2), and the truth; both None for an error itself."""
+    """One result: measured value, expanded uncertainty (k = 2), truth; the last two None for an error itself."""
 
     name: str
     measured: float
@@ -39,7 +39,7 @@ class Number:
 
 
 def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
-    """Run the campaign, and print where the report is and the numbers that matter."""
+    """Run the campaign, and print its results beside the truth, and the path of the report."""
     began = time.monotonic()
     plan = load_campaign(campaign)
     beams, drift = work(plan, runs=runs, quiet=as_json)
@@ -68,7 +68,7 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
 
 
 def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Number]:
-    """Return the numbers that matter beside the truth of the same virtual machine."""
+    """Return the results with the truth of the same virtual machine."""
     machine = virtual_machine(plan)
     with datasets.load(drift.errors or drift.path) as errors:
         numbers = [*_drift_numbers(machine, errors, plan.tests[1].settings.schedule), *_ranges(machine, errors)]
@@ -78,7 +78,7 @@ def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Numb
 
 
 def virtual_machine(plan: CampaignPlan) -> VirtualMachine:
-    """Return the machine that the bench's simulators ask, under the schedule of the drift test."""
+    """Return the machine that the simulators of the bench measure, under the schedule of the drift test."""
     place = parse_address(plan.bench.instruments[0].address)
     machine = VirtualMachine(place.host, seed=int(place.number("seed", 0)))
     machine.start([Event(e.at, e.spindle_speed, e.compensation) for e in plan.tests[1].settings.schedule])
@@ -156,7 +156,7 @@ def _truth(machine: VirtualMachine, errors: xr.Dataset, point: Any) -> Array:
 
 
 def _beam_numbers(machine: VirtualMachine, found: xr.Dataset) -> list[Number]:
-    """Return by how much the beams are off, and by how much the nominal ones would have been: root mean squares."""
+    """Return the deviations of the detected and of the nominal beams from the true ones, root mean squares."""
     frame = machine.frame
     numbers = []
     for what, origin, direction in (

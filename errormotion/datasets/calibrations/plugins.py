@@ -22,7 +22,7 @@ class PretravelMapDataset:
     """Pre-travel map of a touch probe."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
-        id="pretravel_map",
+        id="pretravel_calibration",
         summary="Pre-travel of a touch probe by direction",
         schemas=("errormotion.calibration.pretravel/1",),
     )

@@ -1,12 +1,11 @@
 """Five point sensors around a bar in the spindle (ISO 230-3), on one clock.
 
-X1 and Y1 look at the level L1 of the bar, X2 and Y2 at L2, Z at its end face. The first channel of a stream is the
-master of the others: they are started first, and it last, so that sample 0 is the same instant for all.
+X1 and Y1 measure the level L1 of the bar, X2 and Y2 the level L2, Z its end face. Sensors of one driver that can be
+synchronised sample on their own clock, others are read together on the clock of this computer: see `sampling`.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -17,21 +16,21 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.point_lds.optoncdt.codec import LOST, OFFSET, OVERRUN, SCALE
-from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT, count_reasons
+from errormotion.instruments.point_lds.optoncdt.driver import BLOCK_SECONDS, OptoNCDT
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings, SensorSettings
-from errormotion.instruments.spindle_frame.geometry import FrameGeometry
+from errormotion.instruments.spindle_frame import sampling
+from errormotion.instruments.spindle_frame.geometry import frame_geometry
 from errormotion.instruments.spindle_frame.settings import CHANNELS, FrameSettings
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.recording import read_index, write_index
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 
 WARM_UP = 2 * 3600.0
-"""Seconds until a sensor has settled after it was switched on: 10.5 um in 2 h (Geiselhart et al. 2025)."""
+"""Time until a sensor is stable after it was switched on, s: it drifts by 10.5 um (Geiselhart et al. 2025)."""
 
 
 class FiveSensorFrame:
-    """Five optoNCDT sensors X1 X2 Y1 Y2 Z in a frame around a bar.
+    """Five point sensors X1 X2 Y1 Y2 Z in a frame around a bar.
 
     Parameters
     ----------
@@ -46,7 +45,7 @@ class FiveSensorFrame:
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="five_sensor_frame",
         kind="spindle_frame",
-        summary="Five optoNCDT sensors X1 X2 Y1 Y2 Z around a bar in the spindle, on one clock",
+        summary="Five point sensors X1 X2 Y1 Y2 Z around a bar in the spindle, on one clock",
         status="simulated_only",
         simulator=OptoNCDT.info.simulator,
     )
@@ -56,9 +55,9 @@ class FiveSensorFrame:
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
         self.address = address
         self.settings = FrameSettings() if settings is None else settings
-        self.geometry = FrameGeometry.of(self.settings)
+        self.geometry = frame_geometry(self.settings)
         self._record = record
-        self._sensors: dict[str, OptoNCDT] = {}
+        self._sensors: dict[str, Any] = {}
         self._streaming = False
 
     @property
@@ -68,31 +67,30 @@ class FiveSensorFrame:
 
     @property
     def encoding(self) -> dict[str, Any]:
-        """How distances are kept without loss: the 16-bit numbers that came over the wire."""
-        return {
-            "dtype": "uint16",
-            "scale_factor": SCALE * self.settings.range,
-            "add_offset": -OFFSET * self.settings.range,
-            "_FillValue": 65535,
-        }
+        """Encoding that stores samples without loss, where all sensors have the same one; else empty."""
+        found = [dict(getattr(sensor, "encoding", {})) for sensor in self._open_sensors().values()]
+        return found[0] if all(each == found[0] for each in found) else {}
 
     @property
     def addresses(self) -> dict[str, str]:
         """URL of each sensor."""
-        if self.settings.addresses:
-            return dict(self.settings.addresses)
+        stated = self.settings.addresses or {name: each["address"] for name, each in self.settings.sensors.items()}
+        if self.address.startswith("replay://"):
+            return {
+                name: f"replay://{path}" for name, path in read_index(Path(parse_address(self.address).path)).items()
+            }
+        if stated:
+            return dict(stated)
         if not self.address:
             raise InstrumentError(
                 "The five_sensor_frame needs 'addresses' in its settings, one URL for each of " + ", ".join(CHANNELS)
             )
-        place = parse_address(self.address)
-        if place.scheme == "sim":
-            return {name: place.with_path(name) for name in CHANNELS}
-        if place.scheme == "replay":
-            return {name: f"replay://{path}" for name, path in read_index(Path(place.path)).items()}
+        frame = parse_address(self.address)
+        if frame.scheme == "sim":
+            return {name: frame.with_path(name) for name in CHANNELS}
         raise InstrumentError(
-            f"'{self.address}' is the address of one device, but five sensors are connected: give 'addresses' in the "
-            "settings, one URL for each of " + ", ".join(CHANNELS)
+            f"'{self.address}' is the address of one device; expected 'addresses' in the settings, one URL for each of "
+            + ", ".join(CHANNELS)
         )
 
     # ------------------------------------------------------------------ opening and closing
@@ -103,17 +101,18 @@ class FiveSensorFrame:
         Raises
         ------
         InstrumentError
-            Names the channel that is not there.
+            A channel does not answer; names it.
         """
         if self._sensors:
             return
         records = {} if self._record is None else write_index(self._record, CHANNELS)
-        settings = OptoSettings(**{name: getattr(self.settings, name) for name in SensorSettings.model_fields})
-        sensors: dict[str, OptoNCDT] = {}
+        sensors: dict[str, Any] = {}
         try:
             for name, address in self.addresses.items():
-                sensor = sensors[name] = OptoNCDT(address, settings, record=records.get(name))
-                sensor.name = name
+                driver, settings = self._choice(name, self.settings)
+                sensor = sensors[name] = driver(address, settings, record=records.get(name))
+                if self.settings.synchronised:
+                    sensor.name = name
                 try:
                     sensor.open()
                 except InstrumentError as error:
@@ -128,7 +127,8 @@ class FiveSensorFrame:
     def close(self) -> None:
         """Disconnect all sensors and end every thread; idempotent."""
         sensors, self._sensors = self._sensors, {}
-        _stop(list(sensors.values()))
+        if self.settings.synchronised:
+            sampling.stop(list(sensors.values()))
         errors: list[InstrumentError] = []
         for sensor in sensors.values():
             try:
@@ -154,37 +154,35 @@ class FiveSensorFrame:
     # ------------------------------------------------------------------ asking
 
     def identify(self) -> Identity:
-        """Ask all sensors who they are."""
+        """Ask all sensors for their identity."""
         parts = {name: sensor.identify() for name, sensor in self._open_sensors().items()}
         return Identity(
-            manufacturer="Micro-Epsilon",
+            manufacturer=", ".join(sorted({part.manufacturer for part in parts.values()})),
             model="five_sensor_frame with " + ", ".join(sorted({part.model for part in parts.values()})),
             serial_number=", ".join(f"{name} {part.serial_number}" for name, part in parts.items()),
             firmware=", ".join(sorted({part.firmware for part in parts.values()})),
             simulated=any(part.simulated for part in parts.values()),
             details={
                 "address": self.address or ", ".join(self.addresses.values()),
+                "synchronised": self.settings.synchronised,
                 "channels": {name: dict(part.details) for name, part in parts.items()},
             },
         )
 
     def configure(self, settings: FrameSettings) -> None:
         """Send other settings to all sensors; their addresses stay."""
-        single = OptoSettings(**{name: getattr(settings, name) for name in SensorSettings.model_fields})
-        for sensor in self._open_sensors().values():
-            sensor.configure(single)
+        for name, sensor in self._open_sensors().items():
+            sensor.configure(self._choice(name, settings)[1])
         self.settings = settings
-        self.geometry = FrameGeometry.of(settings)
+        self.geometry = frame_geometry(settings)
 
     @property
     def warm(self) -> bool:
-        """Whether all sensors have been on for two hours, by their own account or by ``powered_since``.
-
-        False where nobody knows.
-        """
+        """Whether all sensors have been on for two hours, as they state or by ``powered_since``; False if unknown."""
         since = self.settings.powered_since
         known = 0.0 if since is None else (datetime.now(UTC) - since).total_seconds()
-        return all(max(known, sensor.on_for()) >= WARM_UP for sensor in self._open_sensors().values())
+        stated = [each.on_for() if hasattr(each, "on_for") else 0.0 for each in self._open_sensors().values()]
+        return all(max(known, seconds) >= WARM_UP for seconds in stated)
 
     # ------------------------------------------------------------------ measuring
 
@@ -207,7 +205,7 @@ class FiveSensorFrame:
         Yields
         ------
         Samples
-            ``values`` (channel, block) in m. Sample 0 is the same instant for all. Reasons of missing values begin
+            ``values`` (channel, block) in m. Sample 0 is the same instant for all. Reasons of missing values start
             with the channel; ``dropped`` counts the instants at which any channel lost its sample.
 
         Raises
@@ -224,47 +222,23 @@ class FiveSensorFrame:
         if self._streaming:
             raise InstrumentError("The frame is streaming already; leave that stream first")
         size = block or max(1, round(BLOCK_SECONDS * self.rate))
-        return self._blocks([sensors[name] for name in names], size)
+        return self._stream({name: sensors[name] for name in names}, size)
 
-    def _blocks(self, sensors: list[OptoNCDT], size: int) -> Iterator[Samples]:
-        master, *slaves = sensors
-        first = 0
+    def _stream(self, sensors: dict[str, Any], size: int) -> Iterator[Samples]:
+        blocks = sampling.synchronised if self.settings.synchronised else sampling.polled
+        self._streaming = True
         try:
-            self._streaming = True
-            for slave in slaves:
-                slave.start(size, "SLAVE")
-            master.start(size, "MASTER" if slaves else "NONE")
-            while True:
-                values = np.empty((len(sensors), size))
-                reasons = np.empty((len(sensors), size), dtype=np.uint8)
-                for row, sensor in enumerate(sensors):
-                    sensor.fill(values[row], reasons[row])
-                yield self._samples(sensors, values, reasons, first)
-                first += size
+            yield from blocks(sensors, size, self.rate)
         finally:
             self._streaming = False
-            _stop(sensors)
 
-    def _samples(
-        self, sensors: list[OptoNCDT], values: np.ndarray[Any, Any], reasons: np.ndarray[Any, Any], first: int
-    ) -> Samples:
-        dropped, invalid = 0, {}
-        if reasons.any():
-            dropped = int(np.isin(reasons, (LOST, OVERRUN)).any(axis=0).sum())
-            for sensor, why in zip(sensors, reasons, strict=True):
-                invalid.update(count_reasons(why, f"{sensor.name} ")[1])
-        return Samples(values, first, self.rate, max(sensor.host_time for sensor in sensors), dropped, invalid)
+    def _choice(self, name: str, settings: FrameSettings) -> tuple[Any, Any]:
+        """Return the driver of a channel and its settings."""
+        if settings.sensors:
+            return settings.sensor(name)
+        return OptoNCDT, OptoSettings(**{key: getattr(settings, key) for key in SensorSettings.model_fields})
 
-    def _open_sensors(self) -> dict[str, OptoNCDT]:
+    def _open_sensors(self) -> dict[str, Any]:
         if not self._sensors:
             raise InstrumentError("The five_sensor_frame is not open: use it in a 'with' block, or call open() first")
         return self._sensors
-
-
-def _stop(sensors: list[OptoNCDT]) -> None:
-    """Stop the master first, then its slaves, while nobody is held back by a full queue."""
-    for sensor in sensors:
-        sensor.drain()
-    end = time.monotonic() + 1.0
-    for sensor in sensors:
-        sensor.stop(max(end - time.monotonic(), 0.05))

@@ -1,16 +1,24 @@
-"""Settings of the five-sensor frame: where the sensors are connected, and how they stand around the bar."""
+"""Settings of the five-sensor frame: its sensors, their addresses, and their positions around the bar."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from errormotion import plugins
+from errormotion.datasets import tomlfile
 from errormotion.datasets.units import Expansion, Length, Temperature
+from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.point_lds.optoncdt.settings import SensorSettings
+from errormotion.instruments.transports import parse_address
 
+KIND = "point_lds"
+HIGHEST_POLLING_RATE = 1e3
+"""Of sensors that are read one by one, Hz."""
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 Vector = tuple[float, float, float]
 Place = tuple[Length, Length, Length]
@@ -34,7 +42,15 @@ NOMINAL_DIRECTION: dict[str, Vector] = {
 
 
 class FrameSettings(SensorSettings):
-    """Settings of the frame; those of its sensors are the same for all five."""
+    """Settings of the frame.
+
+    Without ``sensors`` the channels are five optoNCDT sensors, all with the settings that the frame shares with them.
+    """
+
+    sensors: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="driver, address and settings of each sensor; default: five optoncdt",
+    )
 
     addresses: dict[str, str] = Field(
         default_factory=dict, description="URL of each sensor; default: made from the frame's own address"
@@ -56,7 +72,7 @@ class FrameSettings(SensorSettings):
         default=None, description="when the sensors were switched on, for sensors that do not tell; with time zone"
     )
 
-    @field_validator("addresses", "origin", "direction")
+    @field_validator("addresses", "sensors", "origin", "direction")
     @classmethod
     def _known_channels(cls, value: dict[str, object]) -> dict[str, object]:
         wrong = ", ".join(sorted(set(value) - set(CHANNELS)))
@@ -68,6 +84,56 @@ class FrameSettings(SensorSettings):
                 + (f"; missing: {missing}" if missing else "")
             )
         return value
+
+    @field_validator("sensors")
+    @classmethod
+    def _known_sensors(cls, value: dict[str, dict[str, Any]], info: ValidationInfo) -> dict[str, dict[str, Any]]:
+        """Check the settings of each driver, and keep them in SI units."""
+        edge = bool((info.context or {}).get("edge"))
+        checked, mistakes = {}, []
+        for name, table in value.items():
+            try:
+                driver = _driver(table)
+            except PluginError as error:
+                mistakes.append(f"{name}.driver: {error}")
+                continue
+            try:
+                parse_address(str(table.get("address", "")))
+            except InstrumentError as error:
+                mistakes.append(f"{name}.address: {error}")
+            settings, found = tomlfile.check(_own(table), driver.Settings, prefix=(name,), edge=edge)
+            mistakes += found
+            if settings is not None:
+                own = settings.model_dump(mode="json", exclude_unset=True)
+                checked[name] = {"driver": table["driver"], "address": table.get("address", ""), **own}
+        if mistakes:
+            raise ValueError("; ".join(mistakes))
+        return checked
+
+    def sensor(self, name: str) -> tuple[Any, Any]:
+        """Return the driver of a channel's sensor and its settings, where ``sensors`` states them."""
+        driver = _driver(self.sensors[name])
+        return driver, driver.Settings(**_own(self.sensors[name]))
+
+    def _check_model(self) -> None:
+        """Check the shared settings against the sensors' model; those of ``sensors`` have been checked."""
+        if not self.sensors:
+            super()._check_model()
+        elif self.addresses:
+            raise ValueError(
+                "expected the address of each sensor in its own table 'sensors'; found 'addresses' as well"
+            )
+        elif not self.synchronised and self.rate > HIGHEST_POLLING_RATE:
+            raise ValueError(
+                f"rate: these sensors are read one by one, at {HIGHEST_POLLING_RATE:g} Hz at most; "
+                f"found {self.rate:g} Hz"
+            )
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether all sensors are of one driver that samples on one clock."""
+        drivers = {table["driver"] for table in self.sensors.values()}
+        return not drivers or (len(drivers) == 1 and hasattr(plugins.get("instruments", drivers.pop()), "fill"))
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
@@ -82,3 +148,15 @@ class FrameSettings(SensorSettings):
         if self.powered_since is not None and self.powered_since.tzinfo is None:
             raise ValueError("powered_since needs a time zone, such as 2025-03-01T08:00:00+01:00")
         return self
+
+
+def _driver(table: Mapping[str, Any]) -> Any:
+    driver = plugins.get("instruments", str(table.get("driver", "")))
+    if driver.info.kind != KIND:
+        raise PluginError(f"expected an instrument of kind {KIND}; found {driver.info.kind}")
+    return driver
+
+
+def _own(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of the driver in a sensor's table."""
+    return {key: value for key, value in table.items() if key not in ("driver", "address")}

@@ -25,6 +25,7 @@ class LineGauge(Driver):
     summary = "LG7 line gauge, lines of ASCII on a serial line or TCP"
     simulator = "line_gauge.simulator:SimulatedLineGauge"
     info = InstrumentInfo("line_gauge", "point_lds", summary, "simulated_only", simulator=simulator)
+    measuring_range, mid_range = (0.0, 2e-3), 1e-3  # m
 
     def identify(self) -> Identity:
         model, serial, firmware = self._ask("ID")[0].split(",")

@@ -16,14 +16,14 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodEr
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition import moving
 from errormotion.methods.crossbeam_scan.acquisition.scans import HAND_OVER_LINES, expected_lines, record_scans
 from errormotion.methods.crossbeam_scan.acquisition.schedule import schedule
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans, interruptions
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
+from errormotion.plugins.readings import Profiles
 
 PITCH = 70e-6
 TRAVEL = {"X": (0.0, 1.0), "Y": (-1.0, 3.0), "Z": (0.0, 1.0)}

@@ -14,15 +14,10 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import Packet
 from errormotion.instruments.laser_tracker.leica_emscon.link import Event, Link, RefusedError
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
 from errormotion.instruments.laser_tracker.leica_emscon.streaming import points
-from errormotion.instruments.laser_tracker.measurement import (
-    BeamBrokenError,
-    Environment,
-    Measurement,
-    Reflector,
-    polar,
-)
+from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError, Reflector, polar
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins.readings import Environment, Measurement
 
 MILLIBAR = 100.0  # Pa
 METEO = {"manual": codec.METEO_OFF, "read": codec.METEO_READ, "refraction": codec.METEO_REFRACTION}
@@ -52,7 +47,7 @@ class LeicaEmScon(Driver):
         kind="laser_tracker",
         summary="Leica laser trackers (LT, AT901, AT4xx) behind an emScon server, TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.leica_emscon:SimulatedEmScon",
+        simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
     Settings: ClassVar[type[EmSconSettings]] = EmSconSettings
     settings: EmSconSettings

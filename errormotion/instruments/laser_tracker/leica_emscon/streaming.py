@@ -13,7 +13,7 @@ from errormotion.errors import InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
 from errormotion.instruments.laser_tracker.leica_emscon.link import Link
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
-from errormotion.instruments.laser_tracker.measurement import BeamBrokenError
+from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError
 from errormotion.plugins import Samples
 
 BLOCK_SECONDS = 0.5

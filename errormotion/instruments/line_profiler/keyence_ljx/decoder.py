@@ -35,11 +35,19 @@ class StreamDecoder:
 
     A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. Which it is:
     lost where the trigger count leaps between sound profiles, garbled where damaged bytes lie between them. After
-    damaged bytes the next place is searched at which checksum and trigger count are right.
+    damaged bytes the next position is searched at which checksum and trigger count are right.
+
+    Parameters
+    ----------
+    layout : StreamLayout
+    late_notice : bool
+        The notice that ends the stream before this one has not arrived. One notice ahead of the first profile is then
+        taken as that one and ignored.
     """
 
-    def __init__(self, layout: StreamLayout) -> None:
+    def __init__(self, layout: StreamLayout, *, late_notice: bool = False) -> None:
         self._size = layout.words
+        self._late_notice = late_notice
         self._rest = b""
         self._trigger = -1  # count to be expected next; -1: any
         self._searching = False
@@ -123,7 +131,8 @@ class StreamDecoder:
     def _notice(self) -> StreamEndedError | None:
         bits = int.from_bytes(self._rest[WORD : NOTIFY_WORDS * WORD], "little")
         self._rest = self._rest[NOTIFY_WORDS * WORD :]
-        if bits & STOPPED:
+        late, self._late_notice = self._late_notice, False
+        if bits & STOPPED and not (late and self._trigger < 0):
             return StreamEndedError(f"the profiler has ended the stream (notice {bits:08X})")
         return None
 

@@ -24,9 +24,9 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
     StreamLayout,
 )
 from errormotion.instruments.line_profiler.keyence_ljx.settings import LJXSettings
-from errormotion.instruments.line_profiler.profiles import Profiles
 from errormotion.instruments.transports import Transport
 from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins.readings import Profiles
 
 if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
@@ -38,8 +38,8 @@ QUEUE_SECONDS = 0.5
 SMALLEST_QUEUE = 64
 AT_ONCE = 64
 """Profiles unpacked at once: their packed form stays in the processor's cache."""
-QUIET = 0.3
-"""Seconds of silence after which a stopped stream is over, where no notice says so."""
+QUIET_INTERVAL = 0.3
+"""Silence after which a stopped stream is taken as ended, where no notice has come, s."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +69,14 @@ class KeyenceLJX(Driver):
         kind="line_profiler",
         summary="Keyence LJ-X8000A laser line profiler, Ethernet, commands and high-speed stream",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.keyence_ljx:SimulatedLJX",
+        simulator="errormotion.instruments.simulators.line_profiler.keyence_ljx:SimulatedLJX",
     )
     Settings: ClassVar[type[LJXSettings]] = LJXSettings
     settings: LJXSettings
     name = "keyence_ljx"
     _reader: Reader | None = None
     _lost: InstrumentError | None = None
+    _notice_pending = False  # a stream was stopped, and its notice has not arrived
 
     @property
     def rate(self) -> float:
@@ -261,7 +262,7 @@ class KeyenceLJX(Driver):
         layout = codec.parse_layout(self.command(codec.PREPARE_STREAM, bytes((codec.FROM_NEXT, 0, 0, 0))))
         unpack = HeightDecoder(layout)
         unpack.warm_up()
-        follow = StreamDecoder(layout)
+        follow = StreamDecoder(layout, late_notice=self._notice_pending)
         limit = max(SMALLEST_QUEUE, 2 * size, round(QUEUE_SECONDS * self.rate))
         lines: ManyLines = self.transport  # type: ignore[assignment]
         self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)
@@ -319,7 +320,8 @@ class KeyenceLJX(Driver):
         reader.drain()
         try:
             self.command(codec.STOP_STREAM)
-            ended = reader.finish(QUIET, self.settings.timeout)
+            ended = reader.finish(QUIET_INTERVAL, self.settings.timeout)
+            self._notice_pending = ended is None
             if ended is not None and not isinstance(ended, StreamEndedError):
                 self._lost = ended
         except InstrumentError as error:
@@ -341,9 +343,10 @@ class KeyenceLJX(Driver):
         )
 
     def _begin(self) -> None:
-        self._lost = None
+        self._lost, self._notice_pending = None, False
         try:
-            self.command(codec.STOP_STREAM)  # somebody may have left it streaming
+            self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
+            self._notice_pending = True
         except InstrumentError:
             if self._lost is not None:  # else it only says that there was nothing to stop
                 raise

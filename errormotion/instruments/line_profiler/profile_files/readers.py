@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,34 +11,13 @@ import numpy as np
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError, InstrumentError
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
+from errormotion.plugins.readings import Scan
 
 Array = np.ndarray[Any, Any]
 
 LARGEST_HEIGHT = 0.5  # m; a larger one is a mistaken unit
 FULL = 0.25
 """Share of the cells of a height map that a point cloud must fill to be one."""
-
-
-@dataclass(frozen=True)
-class Scan:
-    """A height map.
-
-    Attributes
-    ----------
-    path : Path
-        Where it came from.
-    heights : ndarray, float64, (n, point)
-        m; NaN where there is none.
-    x : ndarray, float64, (point,)
-        Where on the line the points are, m.
-    y : ndarray, float64, (n,)
-        Where along the feed the profiles are, m; increasing or decreasing.
-    """
-
-    path: Path
-    heights: Array
-    x: Array
-    y: Array
 
 
 def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:

@@ -12,14 +12,18 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.point_lds.optoncdt.codec import (
     LINE_END,
+    LOST,
+    OFFSET,
     OVERRUN,
     PROMPT,
     REASONS,
+    SCALE,
     parse_reply,
     rate_text,
     text_of,
 )
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings
+from errormotion.instruments.streaming import count_reasons
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 
@@ -53,11 +57,13 @@ class OptoNCDT(Driver):
         kind="point_lds",
         summary="Micro-Epsilon optoNCDT 1420/2300 laser triangulation sensor, RS422 or TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.optoncdt:SimulatedOptoNCDT",
+        simulator="errormotion.instruments.simulators.point_lds.optoncdt:SimulatedOptoNCDT",
     )
     Settings: ClassVar[type[OptoSettings]] = OptoSettings
     settings: OptoSettings
     name = "optoncdt"
+    reasons: tuple[str, ...] = REASONS
+    lost: tuple[int, ...] = (LOST, OVERRUN)
     _reader: Reader | None = None
     _lost: InstrumentError | None = None
 
@@ -75,6 +81,16 @@ class OptoNCDT(Driver):
     def mid_range(self) -> float:
         """The reading in the middle of the range, m."""
         return self.settings.range / 2
+
+    @property
+    def encoding(self) -> dict[str, Any]:
+        """Encoding that stores readings without loss: the 16-bit numbers of the wire."""
+        return {
+            "dtype": "uint16",
+            "scale_factor": SCALE * self.settings.range,
+            "add_offset": -OFFSET * self.settings.range,
+            "_FillValue": 65535,
+        }
 
     @property
     def stray_bytes(self) -> int:
@@ -172,7 +188,8 @@ class OptoNCDT(Driver):
             while True:
                 values, reasons = np.empty((1, size)), np.empty((1, size), dtype=np.uint8)
                 self.fill(values[0], reasons[0])
-                lost, invalid = count_reasons(reasons[0])
+                invalid = count_reasons(reasons[0], self.reasons)
+                lost = sum(invalid.get(self.reasons[code], 0) for code in self.lost)
                 yield Samples(values, first, self.rate, self.host_time, lost, invalid)
                 first += size
         finally:
@@ -269,12 +286,3 @@ class OptoNCDT(Driver):
                 f"The settings say a range of {settings.range * 1e3:g} mm; the sensor at {self.address} "
                 f"has {stated[1]} mm"
             )
-
-
-def count_reasons(reasons: Array, prefix: str = "") -> tuple[int, dict[str, int]]:
-    """Return how many samples were lost, and how many have no value for which reason."""
-    if not reasons.any():
-        return 0, {}
-    counts = np.bincount(reasons, minlength=len(REASONS))
-    invalid = {prefix + REASONS[code]: int(count) for code, count in enumerate(counts) if code and count}
-    return sum(invalid.get(prefix + reason, 0) for reason in ("lost", "overrun")), invalid

@@ -31,6 +31,11 @@ class SensorSettings(PluginSettings):
 
     @model_validator(mode="after")
     def _fits_the_model(self) -> Self:
+        self._check_model()
+        return self
+
+    def _check_model(self) -> None:
+        """Check rate, range and baud rate against the model; ValueError states what it offers."""
         model = MODELS[self.model]
         if not any(math.isclose(self.rate, rate, rel_tol=1e-6) for rate in model.rates):
             known = ", ".join(f"{rate / 1000:g}" for rate in model.rates)
@@ -43,7 +48,6 @@ class SensorSettings(PluginSettings):
             raise ValueError(f"the {self.model} speaks at {known} baud; found {self.baudrate}")
         if self.baudrate is not None:
             self._check_line(self.baudrate)
-        return self
 
     @property
     def with_counter(self) -> bool:

@@ -22,6 +22,7 @@ from scipy.stats import median_abs_deviation
 
 from errormotion.arrays import Array
 from errormotion.datasets import provenance
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.pretravel import HIGHEST, PretravelMap, assemble, harmonics, terms_up_to, unit
 from errormotion.datasets.units import Length
 from errormotion.errors import FitError
@@ -47,6 +48,7 @@ class PretravelSettings(PluginSettings):
     strain: float = Field(
         default=10e-6, description="standard uncertainty of the machine's scales and squareness, m/m", ge=0
     )
+    serial_number: str = Field(default="", description="serial number of the probe; unknown if not given")
     highest: int = Field(default=5, description="highest degree of the candidates", ge=0, le=HIGHEST)
 
 
@@ -146,7 +148,10 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
             "ball_radius": settings.ball_radius,
             "tip_radius": settings.tip_radius,
         },
-        {"provenance": json.dumps(provenance.make(settings, raw, None))},
+        {
+            "provenance": json.dumps(provenance.make(settings, raw, None)),
+            **({owner.ATTRIBUTE: settings.serial_number} if settings.serial_number else {}),
+        },
     )
     return PretravelMap(dataset)
 

@@ -1,0 +1,149 @@
+"""``errormotion doctor``: whether this computer has what errormotion needs."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import requires, version
+from pathlib import Path
+
+from errormotion.cli.guard import log_file
+from errormotion.errors import ErrormotionError
+
+LEAST_DISK = 2 * 2**30
+"""Bytes; four hours of five packed channels at 20 kHz take about 1 GB."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Result of one check."""
+
+    name: str
+    ok: bool
+    message: str
+
+
+def examine() -> list[Finding]:
+    """Return the result of every check; a check that fails is a result, too."""
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("python", _python),
+        ("packages", _packages),
+        ("compiled kernels", _kernels),
+        ("plugins", _plugins),
+        ("simulators", _loopback),
+        ("serial ports", _serial),
+        *_checks_of_plugins(),
+        ("disk here", _disk),
+        ("temporary folder", _temporary),
+        ("log file", _log),
+    ]
+    findings = []
+    for name, check in checks:
+        try:
+            findings.append(Finding(name, True, check()))
+        except Exception as error:  # noqa: BLE001 - the failure of a check is its result
+            findings.append(
+                Finding(
+                    name,
+                    False,
+                    f"{error}"
+                    if isinstance(error, _FailedError | ErrormotionError)
+                    else f"{type(error).__name__}: {error}",
+                )
+            )
+    return findings
+
+
+class _FailedError(Exception):
+    """What is wrong, and what to do."""
+
+
+def _python() -> str:
+    return f"{platform.python_version()} on {platform.platform()}"
+
+
+def _packages() -> str:
+    names = {"h5netcdf", "h5py", "jinja2", "matplotlib", "numba", "numpy", "pint", "pydantic", "rich", "scipy"}
+    names |= {"serial", "xarray", "zarr"}
+    missing = []
+    for name in sorted(names):
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            missing.append(f"{name} ({error})")
+    if missing:
+        raise _FailedError(f"cannot import {', '.join(missing)}; install errormotion again in this environment")
+    return f"errormotion {version('errormotion')}, {len(requires('errormotion') or [])} requirements, all import"
+
+
+def _kernels() -> str:
+    import numba
+    import numpy as np
+
+    if numba.njit(lambda x: x.sum())(np.ones(3)) != 3.0:
+        raise _FailedError("numba computes a wrong sum; install numba and llvmlite again")
+    return f"numba {numba.__version__}, {numba.get_num_threads()} threads"
+
+
+def _plugins() -> str:
+    from errormotion import plugins
+
+    found = {group: plugins.available(group) for group in plugins.GROUPS}
+    broken = [f"{plugin.id}: {plugin.error}" for each in found.values() for plugin in each if plugin.error]
+    if broken:
+        raise _FailedError("; ".join(broken))
+    return ", ".join(f"{len(each)} {group}" for group, each in found.items())
+
+
+def _loopback() -> str:
+    """Open the first instrument whose simulator answers, over a real connection."""
+    from errormotion import plugins
+
+    found: list[str] = []
+    for cls in plugins.loaded("instruments"):
+        if not cls.info.simulator:
+            continue
+        try:
+            with cls("sim://cframe/doctor?seed=0", None) as driver:
+                return f"a simulated {driver.identify().model} answers over the wire"
+        except ErrormotionError as error:
+            found.append(f"{cls.info.id}: {error}")
+    raise _FailedError("; ".join(found) or "no instrument has a simulator")
+
+
+def _checks_of_plugins() -> list[tuple[str, Callable[[], str]]]:
+    """Return the checks that plugins bring: the attribute ``doctor``, name to function."""
+    from errormotion import plugins
+
+    return [check for cls in plugins.loaded("instruments", "methods") for check in getattr(cls, "doctor", {}).items()]
+
+
+def _serial() -> str:
+    ports = [str(path) for pattern in ("ttyUSB*", "ttyACM*") for path in sorted(Path("/dev").glob(pattern))]
+    closed = [port for port in ports if not os.access(port, os.R_OK | os.W_OK)]
+    if closed:
+        raise _FailedError(f"no permission for {', '.join(closed)}; join the group that owns them (often 'dialout')")
+    return ", ".join(ports) or "no USB serial adapter plugged in"
+
+
+def _disk() -> str:
+    free = shutil.disk_usage(Path.cwd()).free
+    if free < LEAST_DISK:
+        raise _FailedError(
+            f"{free / 2**30:.1f} GiB free in {Path.cwd()}; a long record needs {LEAST_DISK / 2**30:.0f} GiB"
+        )
+    return f"{free / 2**30:.0f} GiB free"
+
+
+def _temporary() -> str:
+    with tempfile.NamedTemporaryFile() as file:
+        return str(Path(file.name).parent)
+
+
+def _log() -> str:
+    return str(log_file())

@@ -1,0 +1,64 @@
+"""``errormotion plan``: the uncertainty to expect of the tests of a campaign."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.campaign.files import load_campaign
+from errormotion.cli.output import show, show_json, table
+from errormotion.cli.summary import FIELD_UNITS, notes_of
+from errormotion.datasets.folders import looking_beside
+from errormotion.errors import BenchError
+
+
+def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) -> None:
+    """Print the largest uncertainty to expect of every freedom, and the notes of the method, test by test.
+
+    Raises
+    ------
+    BenchError
+        No such test, or one file for the plans of several tests.
+    """
+    plan = load_campaign(campaign)
+    chosen = [entry for entry in plan.tests if test is None or entry.name == test]
+    if not chosen:
+        raise BenchError(
+            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
+        )
+    if out is not None and len(chosen) > 1:
+        raise BenchError(f"{campaign}: one file holds the plan of one test; name it with --test")
+    with looking_beside(plan.folder):
+        planned = [(entry, entry.method().plan(entry.settings)) for entry in chosen]
+    if out is not None:
+        datasets.save(planned[0][1], out)
+    plans = [
+        {"test": entry.name, "method": entry.method.info.id, "expected": _expected(ds), "notes": notes_of(ds)}
+        for entry, ds in planned
+    ]
+    if as_json:
+        show_json({"ok": True, "plans": plans, "out": str(out) if out else None})
+        return
+    for part in plans:
+        show(f"\n{part['test']} ({part['method']}):")
+        rows = [[row["name"], f"{row['expanded_uncertainty']:.3g}", row["unit"]] for row in part["expected"]]
+        show(table(["", "U (k=2)", ""], rows))
+        for note in part["notes"]:
+            show(f"note: {note}")
+
+
+def _expected(errors: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the expanded uncertainty (k = 2) of every known estimate, the largest in the dataset."""
+    variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
+    found = []
+    for k, name in enumerate(errors.em.names):
+        seen = variances[..., k][np.isfinite(variances[..., k])]
+        if seen.size:
+            factor, unit = FIELD_UNITS[errors[name].attrs["units"]]
+            largest = 2.0 * float(np.sqrt(seen.max())) * factor
+            found.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
+    return found

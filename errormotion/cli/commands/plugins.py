@@ -1,0 +1,97 @@
+"""``errormotion plugins list|show|check|new``."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import asdict
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from errormotion import plugins
+from errormotion.cli.output import show, show_json, table
+from errormotion.errors import PluginError
+
+
+def list_plugins(as_json: bool) -> None:
+    """Print every plugin of the registry."""
+    found: list[dict[str, Any]] = []
+    for group in plugins.GROUPS:
+        for plugin in plugins.available(group):
+            info = plugin.cls.info if plugin.cls else None
+            found.append(
+                {
+                    "group": group,
+                    "id": plugin.id,
+                    "kind": getattr(info, "kind", ""),
+                    "status": getattr(info, "status", "") if info else "broken",
+                    "version": info.version if info else "",
+                    "distribution": plugin.distribution,
+                    "summary": info.summary if info else "",
+                    "error": plugin.error,
+                }
+            )
+    if as_json:
+        show_json({"plugins": found})
+        return
+    rows = [[p["group"], p["id"], p["kind"], p["status"], p["distribution"], p["error"] or p["summary"]] for p in found]
+    show(table(["group", "id", "kind", "status", "from", "summary"], rows))
+
+
+def show_plugin(plugin_id: str, as_json: bool) -> None:
+    """Print the description of a plugin and its settings."""
+    group = group_of(plugin_id)
+    cls = plugins.get(group, plugin_id)
+    settings = getattr(cls, "Settings", None)
+    if as_json:
+        schema = settings.model_json_schema() if settings else {}
+        show_json({"group": group, "info": asdict(cls.info), "settings": schema})
+        return
+    for key, value in asdict(cls.info).items():
+        if value not in (None, "", ()):
+            show(f"{key:>10}  {', '.join(value) if isinstance(value, tuple) else value}")
+    if hasattr(cls, "needs"):
+        show(f"{'needs':>10}  {', '.join(cls.needs.instruments)}; raw schema {cls.needs.raw_schema}")
+    fields = settings.model_fields if settings else {}
+    rows = [[name, _default(field), str(field.description or "")] for name, field in fields.items()]
+    show()
+    show(table(["setting", "default (SI)", "meaning"], rows) if rows else "This plugin has no settings.")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    default = field.get_default(call_default_factory=True)
+    if isinstance(default, BaseModel):
+        default = default.model_dump()
+    return textwrap.shorten("-" if default is None else str(default), 30, placeholder=" ...")
+
+
+def check_plugin(plugin_id: str, address: str | None, as_json: bool) -> bool:
+    """Run the conformance kit on a plugin, print each check, and return whether all passed."""
+    from errormotion import testing
+
+    results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address)
+    good = all(result.ok for result in results)
+    if as_json:
+        show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})
+        return good
+    rows = [["-" if r.skipped else "ok" if r.ok else "FAILED", r.name, f"{r.seconds:.2f}", r.message] for r in results]
+    show(table(["", "check", "seconds", "message"], rows))
+    failed = sum(not result.ok for result in results)
+    show(f"{plugin_id}: " + ("passes" if good else f"{failed} of {len(results)} checks failed"))
+    return good
+
+
+def group_of(plugin_id: str) -> plugins.Group:
+    """Return the group of an id; PluginError names the nearest ids of all groups."""
+    found = [group for group in plugins.GROUPS if plugin_id in {plugin.id for plugin in plugins.available(group)}]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise PluginError(f"'{plugin_id}' is a plugin of the groups {' and '.join(found)}; rename one of them")
+    from errormotion.datasets.tomlfile import nearest
+
+    names = [plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)]
+    raise PluginError(f"No plugin '{plugin_id}'; {nearest(plugin_id, names)}")

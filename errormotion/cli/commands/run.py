@@ -1,0 +1,105 @@
+"""``errormotion run``: a campaign with bars, questions to the operator, and a summary at the end."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from errormotion import datasets
+from errormotion.campaign import runner
+from errormotion.campaign.files import CampaignPlan, load_campaign
+from errormotion.campaign.folder import RunFolder
+from errormotion.cli.guard import USAGE
+from errormotion.cli.output import show, show_json
+from errormotion.cli.progress import Bars
+from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+
+
+def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
+    """Run or resume a campaign and print its results."""
+    if campaign is None and not resume:
+        typer.echo("Give a campaign file, or --resume to go on with the newest unfinished one.", err=True)
+        raise typer.Exit(USAGE)
+    plan = load_campaign(campaign) if campaign else None
+    folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json)
+    if as_json:
+        show_json({"ok": True, "tests": [describe(folder) for folder in folders]})
+        return
+    for folder in folders:
+        show(f"\n{folder.data['test']} ({folder.data['method']['id']}): {folder.data['status']} in {folder.path}")
+        for line in _lines(folder):
+            show(f"  {line}")
+
+
+def work(
+    plan: CampaignPlan | None,
+    *,
+    resume: bool = False,
+    runs: Path | None = None,
+    yes: bool = False,
+    with_report: bool = True,
+    quiet: bool = False,
+) -> list[RunFolder]:
+    """Run or resume a campaign with progress bars on a terminal; without a plan, the newest unfinished one."""
+    with Bars(quiet) as bars:
+        ask = _agree if yes else bars.ask if sys.stdin.isatty() and sys.stderr.isatty() else None
+        report = report_of_run if with_report else None
+        if resume or plan is None:
+            return runner.resume(plan, runs=runs, progress=bars, ask=ask, report=report)
+        return runner.run(plan, runs=runs, progress=bars, ask=ask, report=report)
+
+
+def report_of_run(folder: Path) -> Path:
+    """Write the report of a run folder."""
+    from errormotion.report import write_run_report
+
+    return write_run_report(folder)
+
+
+def describe(folder: RunFolder) -> dict[str, Any]:
+    """Return the state and the results of a run, for a program."""
+    data = folder.data
+    errors = folder.errors
+    result = datasets.load(errors) if errors else None
+    return {
+        "test": data["test"],
+        "method": data["method"]["id"],
+        "status": data["status"],
+        "folder": str(folder.path),
+        "samples": data["samples"],
+        "raw": str(folder.raw),
+        "errors": str(errors) if errors else None,
+        "report": str(folder.path / data["report"]) if data["report"] else None,
+        "report_error": report_error(folder),
+        "results": [as_printed(figure) for figure in figures_of(result)] if result is not None else [],
+        "notes": notes_of(result) if result is not None else [],
+    }
+
+
+def report_error(folder: RunFolder) -> str | None:
+    """Return the reason why the last report could not be written; None where it was written or not requested."""
+    reports = [step for step in folder.data["steps"] if step["step"] == "report"]
+    return str(reports[-1]["reason"]) if reports and reports[-1]["outcome"] == "failed" else None
+
+
+def _lines(folder: RunFolder) -> list[str]:
+    found = describe(folder)
+    lines = [f"report  {found['report']}"] if found["report"] else []
+    if found["report_error"]:
+        lines.append(f"no report: {found['report_error']}; after the correction: errormotion report {folder.path}")
+    lines.append(f"errors  {found['errors']}")
+    if found["results"]:
+        lines += figure_table(found["results"]).splitlines()
+    samples = found["samples"] or {}
+    lost = {"dropped": samples.get("dropped", 0)} | (samples.get("invalid") or {})
+    if any(lost.values()):
+        lines.append("lost samples: " + ", ".join(f"{count} {reason}" for reason, count in lost.items() if count))
+    return lines + [f"note: {note}" for note in found["notes"]]
+
+
+def _agree(message: str) -> None:
+    """Assume that the request is done, and print it."""
+    typer.echo(f"assumed done (--yes): {message}", err=True)

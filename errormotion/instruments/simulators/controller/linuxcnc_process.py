@@ -1,0 +1,276 @@
+"""LinuxCNC itself, started without hardware and ended with everything that it has started.
+
+A computer has room for one LinuxCNC: its realtime memory has a fixed name. So a file is locked while one of ours runs
+(its processes hold the lock, and nobody else), a second start waits for that, and a LinuxCNC that is not ours, which
+may be running a machine, is never touched.
+"""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import json
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from errormotion.errors import InstrumentError
+
+PACKAGE = "linuxcnc-uspace"
+PYTHON = "/usr/bin/python3"
+LOCK = Path("/tmp/errormotion-linuxcnc.lock")
+THEIR_LOCK = Path("/tmp/linuxcnc.lock")
+FOLDER = "errormotion-linuxcnc-"
+SIGN = "processes"
+"""File in its folder that all of its processes, and they alone, hold open."""
+PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
+PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
+MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
+"""Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
+START = 15.0  # s
+END = 10.0  # s
+
+
+def why_not() -> str:
+    """Return why no LinuxCNC can be started here; empty where it can."""
+    if shutil.which("linuxcnc") is None:
+        return f"LinuxCNC is not installed on this computer; on Debian: apt install {PACKAGE}"
+    if not NML.exists():
+        return f"{NML} is missing; install {PACKAGE} again"
+    return ""
+
+
+def installed() -> str:
+    """Return the name and version of the LinuxCNC here; InstrumentError where its Python module does not load."""
+    done = subprocess.run(
+        [PYTHON, "-c", "import hal, linuxcnc; print(linuxcnc.version)"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise InstrumentError(f"LinuxCNC's module for {PYTHON} does not load: {done.stderr.strip()[-300:]}")
+    return f"LinuxCNC {done.stdout.strip()}"
+
+
+def for_doctor() -> str:
+    """Return which LinuxCNC is installed; only its simulation needs one, so none is no failure, a broken one is."""
+    if shutil.which("linuxcnc") is None:
+        return f"not installed; needed for sim://.../linuxcnc only: {why_not()}"
+    if reason := why_not():
+        raise InstrumentError(reason)
+    return f"{installed()}, for sim://.../linuxcnc"
+
+
+DOCTOR = {"LinuxCNC": for_doctor}
+"""Checks for ``errormotion doctor``."""
+
+
+class LinuxCNCProcess:
+    """A LinuxCNC that runs from the files of a folder.
+
+    Parameters
+    ----------
+    files : mapping of str to str
+        Files of the folder: name to text; ``linuxcnc.ini`` among them. ``{folder}`` in them is the folder.
+    bridge : Path
+        The display.
+    wait : float
+        How long another one of ours is waited for, s.
+
+    Attributes
+    ----------
+    port : int
+        Of the bridge, on 127.0.0.1.
+
+    Raises
+    ------
+    InstrumentError
+        Not installed; another one runs, and does not end in time; it does not start: with the end of what it said.
+    """
+
+    def __init__(self, files: dict[str, str], bridge: Path, *, wait: float = 60.0) -> None:
+        if reason := why_not():
+            raise InstrumentError(reason)
+        lock = _lock(wait)
+        try:
+            _refuse_beside_another()
+            for left in Path(tempfile.gettempdir()).glob(f"{FOLDER}*"):  # of one whose process was killed
+                shutil.rmtree(left, ignore_errors=True)
+            self.folder = Path(tempfile.mkdtemp(prefix=FOLDER))
+            try:
+                self._write(files, bridge)
+                self._child = self._start(lock)
+            except BaseException:
+                shutil.rmtree(self.folder, ignore_errors=True)
+                raise
+        finally:
+            os.close(lock)  # its processes hold it now
+        atexit.register(self.end)
+        try:
+            self.port, self._bridge = self._await()
+        except BaseException:
+            self.end()
+            raise
+
+    @property
+    def running(self) -> bool:
+        """Whether it still runs."""
+        return self._child.poll() is None
+
+    def end(self) -> None:
+        """End LinuxCNC and whatever it has started; idempotent."""
+        atexit.unregister(self.end)
+        if self.running:
+            with suppress(ProcessLookupError, AttributeError):
+                os.kill(self._bridge, signal.SIGTERM)  # LinuxCNC ends with its display
+            with suppress(subprocess.TimeoutExpired):
+                self._child.wait(END)
+        self._kill_the_rest()
+        self._child.wait()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    # ------------------------------------------------------------------ start
+
+    def _write(self, files: dict[str, str], bridge: Path) -> None:
+        for name, text in files.items():
+            (self.folder / name).write_text(text.replace("{folder}", str(self.folder)))
+        (self.folder / "linuxcnc.tbl").touch()
+        (self.folder / "linuxcnc.var").touch()
+        nml = NML.read_text().replace(" TCP=5005", "")  # nobody from outside
+        (self.folder / "linuxcnc.nml").write_text(nml)
+        shutil.copy(bridge, self.folder / "bridge.py")
+        (self.folder / "bridge.py").chmod(0o755)
+        user = _user()
+        if user is not None:
+            for path in (self.folder, *self.folder.iterdir()):
+                os.chown(path, user.pw_uid, user.pw_gid)
+
+    def _start(self, lock: int) -> subprocess.Popen[bytes]:
+        user = _user()
+        environment = {"HOME": str(self.folder), "PATH": PATH, "LC_ALL": "C.UTF-8"}
+        with (self.folder / "log.txt").open("wb") as log, (self.folder / SIGN).open("wb") as sign:
+            return subprocess.Popen(
+                ["linuxcnc", "-r", str(self.folder / "linuxcnc.ini")],
+                cwd=self.folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                pass_fds=(lock, sign.fileno()),
+                user=user.pw_uid if user else None,
+                group=user.pw_gid if user else None,
+                extra_groups=[] if user else None,
+            )
+
+    def _await(self) -> tuple[int, int]:
+        until = time.monotonic() + START
+        file = self.folder / "bridge.json"
+        while not file.exists():
+            if not self.running or time.monotonic() > until:
+                why = "ended at once" if not self.running else f"did not start within {START:g} s"
+                log = (self.folder / "log.txt").read_text(errors="replace")
+                raise InstrumentError(f"LinuxCNC {why}; the end of what it said:\n{log[-2000:]}")
+            time.sleep(0.02)
+        told = json.loads(file.read_text())
+        return int(told["port"]), int(told["pid"])
+
+    # ------------------------------------------------------------------ end
+
+    def _kill_the_rest(self) -> None:
+        if self._child.poll() is None or _parts(self.folder):
+            user = _user()
+            with suppress(
+                OSError, subprocess.TimeoutExpired
+            ):  # its realtime process belongs to root: it has to be asked
+                subprocess.run(
+                    ["rtapi_app", "exit"],
+                    env={"HOME": str(self.folder), "PATH": PATH},
+                    capture_output=True,
+                    timeout=END,
+                    check=False,
+                    user=user.pw_uid if user else None,
+                    group=user.pw_gid if user else None,
+                )
+            _kill(_parts(self.folder))
+
+
+def _user() -> pwd.struct_passwd | None:
+    """Return who LinuxCNC runs as: it refuses root, so then nobody; else whoever asks (None)."""
+    return pwd.getpwnam("nobody") if os.geteuid() == 0 else None
+
+
+def _parts(of: Path | None = None) -> dict[int, str]:
+    """Return the processes of simulated LinuxCNCs, or of that in a folder, by name: they hold a file of its folder.
+
+    What belongs to another user cannot be seen.
+    """
+    begin = f"{of or Path(tempfile.gettempdir()) / FOLDER}"
+    found = {}
+    for pid, (name, _) in _processes().items():
+        with suppress(OSError):
+            links = [os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()]
+            if any(link.startswith(begin) and Path(link.removesuffix(" (deleted)")).name == SIGN for link in links):
+                found[pid] = name
+    return found
+
+
+def _kill(processes: dict[int, str]) -> None:
+    """End processes at once, and remove what they leave."""
+    for pid in processes:
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(pid, signal.SIGKILL)
+    for key in MEMORY if processes else ():
+        subprocess.run(["ipcrm", "-M", key], capture_output=True, check=False)
+
+
+def _lock(wait: float) -> int:
+    """Return the locked file; InstrumentError while another LinuxCNC of ours runs for too long."""
+    until, led = time.monotonic() + wait, time.monotonic()
+    with suppress(FileExistsError):
+        os.close(os.open(LOCK, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644))
+    file = os.open(LOCK, os.O_RDONLY)
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return file
+        except BlockingIOError:
+            parts = _parts()
+            if not parts or "bridge.py" in parts.values():
+                led = time.monotonic()
+            elif time.monotonic() - led > 2 * START:  # they run on without a head
+                _kill(parts)
+            if time.monotonic() < until:
+                time.sleep(0.1)
+                continue
+            os.close(file)
+            raise InstrumentError(
+                "Another simulated LinuxCNC runs on this computer, which has room for one; it did not end in time, "
+                f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address"
+            ) from None
+
+
+def _refuse_beside_another() -> None:
+    """Leave a LinuxCNC alone that is not ours: it may be running a machine."""
+    found = {name: pid for pid, (name, state) in _processes().items() if name in PROCESSES and state != "Z"}
+    if found:
+        named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
+        raise InstrumentError(f"A LinuxCNC runs on this computer that is not a simulated one of ours: {named}")
+    with suppress(OSError):
+        THEIR_LOCK.unlink()  # left by one that was killed
+
+
+def _processes() -> dict[int, tuple[str, str]]:
+    """Return name and state of every process."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with suppress(OSError):
+                head, _, tail = (entry / "stat").read_text(errors="replace").rpartition(")")
+                found[int(entry.name)] = (head.partition("(")[2], tail.split()[0])
+    return found

@@ -1,0 +1,152 @@
+"""Registry of the kinds of instrument, and the comparison of a driver with the contract of its kind.
+
+A contract is a Protocol; see `errormotion.plugins.kinds`. Distributions register contracts in the entry-point group
+``errormotion.kinds``, the built-in ones included.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from errormotion.errors import PluginError
+
+GROUP = "errormotion.kinds"
+Contract = TypeVar("Contract", bound=type)
+_STATED = ("plausible", "capabilities")
+
+
+def contract(
+    *, plausible: tuple[float, float] | None = None, capabilities: tuple[type, ...] = ()
+) -> Callable[[Contract], Contract]:
+    """Return a decorator that completes a Protocol to the contract of a kind; see the module's first lines."""
+
+    def complete(cls: Contract) -> Contract:
+        for name, value in zip(_STATED, (plausible, capabilities), strict=True):
+            setattr(cls, name, value)
+        return cls
+
+    return complete
+
+
+@cache
+def _points() -> Mapping[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def kinds() -> tuple[str, ...]:
+    """Return the names of all registered kinds."""
+    return tuple(sorted(_points()))
+
+
+def kind(name: str) -> Any:
+    """Return the contract of a kind, None where none is registered.
+
+    Raises
+    ------
+    PluginError
+        The registered object does not load, or is not a Protocol.
+    """
+    point = _points().get(name)
+    if point is None:
+        return None
+    try:
+        found = point.load()
+    except Exception as error:
+        raise PluginError(
+            f"The kind '{name}' ({point.value}) does not load: {type(error).__name__}: {error}"
+        ) from error
+    if not getattr(found, "_is_protocol", False):
+        raise PluginError(f"The kind '{name}': expected a Protocol class at {point.value}; found {found!r}")
+    return found
+
+
+def refresh() -> None:
+    """Read the entry points again at the next call."""
+    _points.cache_clear()
+
+
+def plausible(name: str) -> tuple[float, float] | None:
+    """Return the lowest and highest plausible reading of a kind in SI units, None where there are no bounds."""
+    bounds: tuple[float, float] | None = getattr(kind(name), "plausible", None)
+    return bounds
+
+
+def members(protocol: type) -> dict[str, Any]:
+    """Return the members of a Protocol: a function for a method, None for an attribute."""
+    found: dict[str, Any] = {}
+    for base in reversed(protocol.__mro__):
+        if getattr(base, "_is_protocol", False):
+            for name in (*vars(base).get("__annotations__", {}), *vars(base)):
+                value = vars(base).get(name)
+                if not name.startswith("_") and name not in _STATED:
+                    found[name] = value if inspect.isfunction(value) else None
+    return found
+
+
+def deviations(driver: Any, protocol: type) -> list[str]:
+    """Return in one sentence each how an instrument deviates from a contract; nothing is called.
+
+    Parameters
+    ----------
+    driver : Instrument
+        An object of the driver's class, not opened.
+    protocol : type
+        The contract of its kind.
+    """
+    found = _lacking(driver, protocol)
+    for capability in getattr(protocol, "capabilities", ()):
+        if _has(driver, _first(capability)):
+            found += [f"{text} ({capability.__name__})" for text in _lacking(driver, capability)]
+    return found
+
+
+def _first(capability: type) -> str:
+    found = members(capability)
+    return next((name for name, method in found.items() if method), next(iter(found)))
+
+
+def _has(driver: Any, name: str) -> bool:
+    annotated = any(name in vars(base).get("__annotations__", {}) for base in type(driver).__mro__)
+    return annotated or inspect.getattr_static(driver, name, None) is not None
+
+
+def _lacking(driver: Any, protocol: type) -> list[str]:
+    found = []
+    for name, method in members(protocol).items():
+        if not _has(driver, name):
+            found.append(f"'{name}' is missing")
+            continue
+        static = inspect.getattr_static(driver, name, None)
+        if method is None:
+            if inspect.isfunction(static):
+                found.append(f"'{name}' is a method, expected an attribute or property")
+        elif not callable(static) and not isinstance(static, staticmethod | classmethod):
+            found.append(f"'{name}' is no method, expected {name}{_shown(method)}")
+        elif not _accepts(getattr(driver, name), method):
+            found.append(f"expected {name}{_shown(method)}, found {name}{inspect.signature(getattr(driver, name))}")
+    return found
+
+
+def _shown(method: Any) -> str:
+    signature = inspect.signature(method)
+    return str(signature.replace(parameters=list(signature.parameters.values())[1:]))
+
+
+def _accepts(found: Any, method: Any) -> bool:
+    """Whether a bound method takes every call that the contract's method allows."""
+    expected = list(inspect.signature(method).parameters.values())[1:]
+    required = [each for each in expected if each.default is each.empty]
+    try:
+        signature = inspect.signature(found)
+        for called in (required, expected):
+            for by_name in (False, True):
+                named = [each for each in called if by_name or each.kind is each.KEYWORD_ONLY]
+                placed = [each for each in called if each not in named]
+                signature.bind(*placed, **{each.name: None for each in named})
+    except TypeError:
+        return False
+    return True

@@ -1,0 +1,55 @@
+"""Generic code names no plugin: what belongs to a method, an instrument or a kind of dataset stands in its folder."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+GROUPS = ("instruments", "methods", "datasets")
+ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+HOMES = {
+    plugin_id: value.partition(":")[0].rpartition(".")[0].replace(".", "/")
+    for group in GROUPS
+    for plugin_id, value in ENTRY_POINTS[f"errormotion.{group}"].items()
+}
+#: Text files of the package in which examples are shipped: campaigns and benches that a person may write.
+EXAMPLES = "errormotion/cli/demo/"
+#: Words that are ids and something else as well: variables of published datasets, the command of a package, and defaults
+#: of published settings that name another plugin.
+OTHER_MEANINGS = {
+    ("optoncdt", "errormotion/instruments/spindle_frame/"),
+    ("virtual_controller", "errormotion/instruments/touch_probe/controller_probe.py"),
+    ("beam_direction", "errormotion/methods/spindle_drift/"),
+    ("beam_direction", "errormotion/instruments/"),
+    ("beam_direction", "errormotion/report/beams.py"),
+    ("thermal_model", "errormotion/cli/commands/model.py"),
+}
+
+
+def sources() -> list[Path]:
+    return sorted(path for path in (ROOT / "errormotion").rglob("*.py"))
+
+
+def named(path: Path, text: str) -> list[str]:
+    """Return the ids that a file names although it stands outside their folders."""
+    place = path.relative_to(ROOT).as_posix()
+    if place.startswith(EXAMPLES):
+        return []
+    found = []
+    for plugin_id, home in HOMES.items():
+        # The simulators of a kind of instrument have a folder beside those of the drivers.
+        simulators = "/".join(home.split("/")[:3]).replace("instruments/", "instruments/simulators/")
+        if place.startswith((f"{home}/", f"{home}.", f"{simulators}/")):
+            continue
+        if any(word == plugin_id and place.startswith(folder) for word, folder in OTHER_MEANINGS):
+            continue
+        if re.search(rf"(?<![A-Za-z0-9_]){plugin_id}(?![A-Za-z0-9_])", text):
+            found.append(plugin_id)
+    return found
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_a_file_names_only_the_plugins_of_its_own_folder(path: Path) -> None:
+    assert named(path, path.read_text()) == []
