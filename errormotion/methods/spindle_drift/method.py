@@ -37,6 +37,7 @@ class SpindleDrift:
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
+    log_readers = lazy("errormotion.methods.spindle_drift.log_import.importer:LOG_READERS")
     figures = lazy("errormotion.methods.spindle_drift.figures:figures")
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
