@@ -73,7 +73,7 @@ class Found:
     sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
     missing: dict[str, int] = field(default_factory=dict)
 
-    def dataset(self, attrs: Mapping[str, str], names: Names) -> xr.Dataset:
+    def dataset(self, attrs: Mapping[str, str | float], names: Names) -> xr.Dataset:
         """Return the variables as one dataset."""
         coords: dict[str, object] = {
             dim: list(labels)

@@ -1,8 +1,7 @@
-"""Averages of fixed length over records of any length, at the speed of memory.
+"""Averages of fixed length over records of any length.
 
-A drift record is billions of samples that become one mean every half second. The kernels here add up in double
-precision and turn back to a window only where its sum shows that a NaN is in it; the loops around them hand out slices,
-so that a record larger than memory passes through in constant space.
+A drift record is billions of samples that become one mean every half second. It is read in slices, so that a record
+larger than memory needs constant space. Large slices are added up by `averaging_kernels`, small ones by numpy.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 import xarray as xr
 
@@ -21,70 +19,12 @@ from errormotion.errors import MethodError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Reassociation lets the compiler add in vectors; NaN keeps its meaning, since the kernels test for it.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 _SLICE_BYTES = 32 << 20
-# A last window that is shorter is left out: run-out does not average away in a part of it.
+"""Size of the slices in which a record is read."""
+_COMPILED_SIZE = 1 << 22
+"""Values from which on the compiled sums are faster, the time to load them included."""
 _LEAST_WINDOW = 0.5
-
-
-@numba.njit(cache=True, nogil=True, fastmath=_FAST)
-def _valid_sum(x: NDArray[Any], start: int, end: int, step: int) -> tuple[float, int]:  # pragma: no cover - compiled
-    """Sum and count what is not NaN."""
-    total, valid = 0.0, 0
-    for i in range(start, end, step):
-        if not np.isnan(x[i]):
-            total += np.float64(x[i])
-            valid += 1
-    return total, valid
-
-
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def _sum_rows(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
-) -> None:  # pragma: no cover - compiled
-    """Sum ``x`` (channel, sample) between consecutive ``edges``."""
-    channels, windows = sums.shape
-    for job in numba.prange(channels * windows):
-        channel, window = job // windows, job % windows
-        row = x[channel, edges[window] : edges[window + 1]]
-        total, valid = 0.0, row.size
-        for i in range(row.size):
-            total += np.float64(row[i])
-        if np.isnan(total):
-            total, valid = _valid_sum(row, 0, row.size, 1)
-        sums[channel, window] = total
-        counts[channel, window] = valid
-
-
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def _sum_columns(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
-) -> None:  # pragma: no cover - compiled
-    """Sum ``x`` (sample, channel) between consecutive ``edges``.
-
-    The samples are taken as one long row in pieces of 16 samples, so that every lane of a vector keeps its channel.
-    """
-    channels, windows = sums.shape
-    piece = 16 * channels
-    flat = x.reshape(x.size)
-    for window in numba.prange(windows):
-        total = np.zeros(piece)
-        begin, end = edges[window] * channels, edges[window + 1] * channels
-        whole = begin + (end - begin) // piece * piece
-        pieces = flat[begin:whole].reshape(-1, piece)
-        for k in range(pieces.shape[0]):
-            for i in range(piece):
-                total[i] += np.float64(pieces[k, i])
-        for i in range(end - whole):
-            total[i] += np.float64(flat[whole + i])
-        for channel in range(channels):
-            sums[channel, window] = total[channel::channels].sum()
-            counts[channel, window] = edges[window + 1] - edges[window]
-            if np.isnan(sums[channel, window]):
-                kept, valid = _valid_sum(flat, begin + channel, end, channels)
-                sums[channel, window] = kept
-                counts[channel, window] = valid
+"""Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
 def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
@@ -101,14 +41,32 @@ def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> 
     -------
     sums, counts : ndarray (channel, window)
     """
-    sums = np.empty((values.shape[0], edges.size - 1))
-    counts = np.empty(sums.shape, np.int64)
     if values.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
         values = values.astype(np.float64)
+    if values.size < _COMPILED_SIZE:
+        return _small_window_sums(values, edges)
+    from errormotion.methods.spindle_drift.identification import averaging_kernels
+
+    sums = np.empty((len(values), edges.size - 1))
+    counts = np.empty(sums.shape, np.int64)
     if values.T.flags.c_contiguous and not values.flags.c_contiguous:
-        _sum_columns(values.T, edges, sums, counts)
+        averaging_kernels.sum_columns(values.T, edges, sums, counts)
     else:
-        _sum_rows(np.ascontiguousarray(values), edges, sums, counts)
+        averaging_kernels.sum_rows(np.ascontiguousarray(values), edges, sums, counts)
+    return sums, counts
+
+
+def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    valid = ~np.isnan(values)
+    # Numpy adds contiguous rows pairwise, which keeps the rounding error small. Empty windows are not its concern.
+    filled = np.where(valid, values, 0.0).astype(np.float64, order="C")
+    full = np.flatnonzero(np.diff(edges) > 0)
+    sums, counts = np.zeros((len(values), edges.size - 1)), np.zeros((len(values), edges.size - 1), np.int64)
+    if full.size:
+        inside = slice(edges[full[0]], edges[full[-1] + 1])
+        starts = edges[full] - edges[full[0]]
+        sums[:, full] = np.add.reduceat(filled[:, inside], starts, axis=1)
+        counts[:, full] = np.add.reduceat(valid[:, inside], starts, axis=1, dtype=np.int64)
     return sums, counts
 
 
