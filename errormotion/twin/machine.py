@@ -16,10 +16,8 @@ from errormotion.twin import bar as bars
 from errormotion.twin import frame as frames
 from errormotion.twin import truth
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
-from errormotion.twin.crossbeam_rawdata import CrossbeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
-from errormotion.twin.multilateration_rawdata import TrackerMeasurements
 from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensing import Sensing
@@ -35,7 +33,7 @@ _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "prob
 _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(StageSensor, CrossbeamMeasurements, TrackerMeasurements, ProbeMeasurements):
+class VirtualMachine(StageSensor, ProbeMeasurements):
     """A machine tool that knows its own errors.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
@@ -73,9 +71,7 @@ class VirtualMachine(StageSensor, CrossbeamMeasurements, TrackerMeasurements, Pr
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
-        A point sensor on the stage and its targets: see `StageSensor`.
-        Measurements with a laser tracker: see `TrackerMeasurements`; of balls by the machine itself: see
-        `ProbeMeasurements`.
+        A point sensor on the stage and what it looks at.
     """
 
     def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:

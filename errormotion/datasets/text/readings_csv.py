@@ -1,19 +1,20 @@
 """Readings in a text file: a short header and tables with units become a raw dataset.
 
-The names are those of the raw schema, so that every schema can be written in this form::
+The names are those of the raw schema, so that every schema can be written like this::
 
-    # schema = errormotion.raw.beam_direction/1
+    # schema = errormotion.raw.NAME/1
     # nominal_direction = 0.342 0 0.940
     # distance_noise = 0.1 um
-    plane,reading [mm],x [mm],y [mm],z [mm]
+    plane,distance [mm],stage_x [mm],stage_y [mm],stage_z [mm]
     1,-2.004,100.000,50.000,20.000
     1,-1.508,101.000,50.000,20.000
     2,...
 
-A line ``# key = value unit`` holds one value, or the few values of a vector with blanks between them; other lines that
-begin with ``#`` are remarks. A column holds one variable, with its unit in brackets; a component of a vector has its
-name behind it (``stage_x [mm]``). A column without a unit is the number or name of a plane, a channel and the like;
-the last dimension, here the readings of a plane, counts itself. An empty line begins another table, with its own names.
+A line ``# key = value unit`` holds one value, or the few values of a vector separated by blanks; other lines that start
+with ``#`` are remarks. A column holds one variable, with its unit in brackets; the name of a component of a vector ends
+with the component (``stage_x [mm]``). A column without a unit is the number or name of an element of a dimension, such
+as a plane or a channel; the last dimension, here the readings of a plane, needs no column. An empty line starts another
+table, with its own names.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.text.log_reader import Complaints
 from errormotion.datasets.text.table_reader import (
     NUMBER,
-    SHORT,
     Column,
     Found,
     Names,
@@ -156,7 +156,7 @@ def _columns(
         own = f"{variable[0].name} {variable[1]}" if variable else name
         if own in seen:
             complaints.add(line, f"{shown}: comes again; column {seen[own] + 1} is '{titles[seen[own]]}'")
-        elif variable is not None and (match[2] is not None or name not in dims or name in SHORT):
+        elif variable is not None and (match[2] is not None or name not in dims or name in names.aliases):
             if match[2] is None or (not unit and variable[0].unit):
                 example = f"{name} [{variable[0].unit or '1'}]"
                 complaints.add(line, f"{shown}: expected its unit in brackets, such as '{example}'; found none")

@@ -19,8 +19,6 @@ from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
 NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-SHORT = {"reading": "distance", "x": "stage_x", "y": "stage_y", "z": "stage_z"}
-"""Short names of columns, where the schema has the long one."""
 _EMPTY = ("", "NaN", "nan")
 
 
@@ -31,6 +29,7 @@ class Names:
     rows: Mapping[str, Row]
     labels: Mapping[str, tuple[str, ...]]
     sizes: Mapping[str, int]
+    aliases: Mapping[str, str]
 
     @classmethod
     def of(cls, tables: Sequence[RawSchema], labels: Mapping[str, tuple[str, ...]] | None = None) -> Names:
@@ -41,7 +40,8 @@ class Names:
         rows = {row.name: row for raw in reversed(tables) for row in raw.rows}
         known = {dim: found for raw in tables for dim, found in raw.labels.items()}
         sizes = {dim: size for raw in tables for dim, size in raw.sizes.items()}
-        return cls(rows, {**(labels or {}), **known}, sizes)
+        aliases = {short: name for raw in tables for short, name in raw.aliases.items()}
+        return cls(rows, {**(labels or {}), **known}, sizes, aliases)
 
     def columns(self) -> dict[str, tuple[Row, int | None]]:
         """Return every possible column: its variable, and its component (None for a scalar)."""
@@ -52,7 +52,8 @@ class Names:
                 found[row.name] = (row, None)
             else:
                 found |= {f"{row.name}_{label}": (row, k) for k, label in enumerate(self.labels[dim])}
-        return found | {short: found[name] for short, name in SHORT.items() if short not in found and name in found}
+        short = {short: found[name] for short, name in self.aliases.items() if name in found}
+        return short | found
 
     def component_dim(self, row: Row) -> str | None:
         """Return the dimension of a variable whose values are in columns side by side."""

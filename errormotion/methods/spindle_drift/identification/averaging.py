@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from xarray.indexes import RangeIndex
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -27,7 +28,9 @@ _LEAST_WINDOW = 0.5
 """Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
-def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def window_sums(
+    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None
+) -> tuple[Array, NDArray[np.int64]]:
     """Return sums and numbers of the values that are not NaN, between consecutive edges.
 
     Parameters
@@ -36,6 +39,8 @@ def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> 
         In either memory order: the transposed view of a (sample, channel) array is read as it lies.
     edges : ndarray, int64, (window + 1,)
         Sample indices, not decreasing.
+    threads : int, optional
+        Number of threads of the compiled sums; default all cores.
 
     Returns
     -------
@@ -47,13 +52,7 @@ def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> 
         return _small_window_sums(values, edges)
     from errormotion.methods.spindle_drift.identification import averaging_kernels
 
-    sums = np.empty((len(values), edges.size - 1))
-    counts = np.empty(sums.shape, np.int64)
-    if values.T.flags.c_contiguous and not values.flags.c_contiguous:
-        averaging_kernels.sum_columns(values.T, edges, sums, counts)
-    else:
-        averaging_kernels.sum_rows(np.ascontiguousarray(values), edges, sums, counts)
-    return sums, counts
+    return averaging_kernels.sums(values, edges, threads)
 
 
 def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
@@ -99,7 +98,8 @@ class Averager:
     further apart than half a window, every sample is a window of its own.
     """
 
-    def __init__(self, channels: int, length: float, minimum: float = 0.5) -> None:
+    def __init__(self, channels: int, length: float, minimum: float = 0.5, threads: int | None = None) -> None:
+        self._threads = threads
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._own: bool | None = None
@@ -134,7 +134,7 @@ class Averager:
         last = int(np.floor((time[-1] - self._start) / self._length + self._slack))
         bounds = self._start + (np.arange(first + 1, last + 1) - self._slack) * self._length
         edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
-        sums, counts = window_sums(values, edges)
+        sums, counts = window_sums(values, edges, self._threads)
         samples = np.diff(edges)
         # Times are summed relative to the slice's first one: a day in seconds would cost digits.
         moments = np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0)
@@ -204,9 +204,14 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     chunk = distance.encoding.get("preferred_chunks", {}).get("time", 1)
     if chunk > 1:
         step = max(1, step // chunk) * chunk
+    positions = np.arange(min(step, samples), dtype=np.float64)
     for begin in range(0, samples, step):
         part = raw.isel(time=slice(begin, begin + step))
-        if "time" in raw.variables:
+        clock = part.xindexes.get("time")
+        if isinstance(clock, RangeIndex):  # its own values, without its integers
+            time = positions[: part.sizes["time"]] * clock.step
+            time += clock.start
+        elif "time" in raw.variables:
             time = np.asarray(part["time"].values, np.float64)
         elif "sample_rate" in raw.attrs:
             index = np.arange(begin, min(begin + step, samples))

@@ -29,7 +29,7 @@ def _valid_sum(x: NDArray[Any], start: int, end: int, step: int) -> tuple[float,
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def sum_rows(
+def _sum_rows(
     x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
 ) -> None:  # pragma: no cover - compiled
     """Sum ``x`` (channel, sample) between consecutive ``edges``."""
@@ -47,7 +47,7 @@ def sum_rows(
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def sum_columns(
+def _sum_columns(
     x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
 ) -> None:  # pragma: no cover - compiled
     """Sum ``x`` (sample, channel) between consecutive ``edges``.
@@ -74,3 +74,21 @@ def sum_columns(
                 kept, valid = _valid_sum(flat, start + channel, end, channels)
                 sums[channel, window] = kept
                 counts[channel, window] = valid
+
+
+def sums(
+    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return sums and numbers of the values that are not NaN, see `averaging.window_sums`."""
+    total = np.empty((len(values), edges.size - 1))
+    counts = np.empty(total.shape, np.int64)
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads or before)
+    try:
+        if values.T.flags.c_contiguous and not values.flags.c_contiguous:
+            _sum_columns(values.T, edges, total, counts)
+        else:
+            _sum_rows(np.ascontiguousarray(values), edges, total, counts)
+    finally:
+        numba.set_num_threads(before)
+    return total, counts
