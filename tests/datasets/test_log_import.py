@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.datasets.text.log_import import import_log
+from errormotion.datasets.importing import import_log
 from errormotion.errors import DatasetError
 from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.twin import VirtualMachine

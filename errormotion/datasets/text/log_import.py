@@ -1,9 +1,9 @@
-"""Import of logs: columns of text become a raw dataset of any schema."""
+"""Logs with a map for any raw schema: columns of text become a raw dataset."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion import plugins
 from errormotion.arrays import Array
-from errormotion.datasets.schemas import RawSchema, Row, raw_schemas, variants
-from errormotion.datasets.storage import save
+from errormotion.datasets.schemas import RawSchema, Row, variants
 from errormotion.datasets.text.csv_text import Table
 from errormotion.datasets.text.log_format import TIMESTAMP
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
@@ -31,56 +29,9 @@ from errormotion.datasets.text.table_reader import (
     unit_vectors,
     units_of,
 )
-from errormotion.datasets.tomlfile import load_model, nearest, read_toml
+from errormotion.datasets.tomlfile import load_model, nearest
 from errormotion.datasets.units import convert
-from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError
-
-LogReader = Callable[[Path, Path], xr.Dataset]
-
-
-def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwrite: bool = False) -> xr.Dataset:
-    """Turn a log into a raw dataset, and write it.
-
-    Parameters
-    ----------
-    log : str or Path
-        Text with columns. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON).
-    map_file : str or Path
-        TOML. Its key ``schema`` is a raw schema, and the map follows `LogMap`; or it is a format that a method reads
-        itself.
-    out : str or Path
-        ``.nc`` or ``.zarr``.
-    overwrite : bool
-        Replace the file at ``out``.
-
-    Raises
-    ------
-    DatasetError
-        The map or the log is wrong; all mistakes at once, each with its key or line. Nothing is written then.
-    """
-    log, map_file = Path(log), Path(map_file)
-    raw = _reader(map_file)(log, map_file).assign_attrs(log=log.name, map=map_file.name)
-    validate(raw)
-    save(raw, out, overwrite=overwrite)
-    return raw
-
-
-def _reader(map_file: Path) -> LogReader:
-    """Return the function that reads logs with a map of this schema."""
-    schema = str(read_toml(map_file).get("schema", ""))
-    if variants(schema):
-        return read_log
-    own: dict[str, LogReader] = {}
-    for cls in plugins.loaded("methods", "datasets"):
-        own |= getattr(cls, "log_readers", {})
-    if schema in own:
-        return own[schema]
-    known = {*own, *(table.id for table in raw_schemas())}
-    found = (
-        f"found '{schema}'; {nearest(schema, known)}" if schema else f"found none. Known: {', '.join(sorted(known))}"
-    )
-    raise DatasetError(f"{map_file}: schema: expected a raw schema or the schema of a map; {found}")
 
 
 def read_log(log: Path, map_file: Path) -> xr.Dataset:

@@ -113,7 +113,7 @@ class SpindleDrift:
         """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
         from errormotion.methods.spindle_drift.planning import plan
 
-        return plan(self, settings or DriftSettings())
+        return plan(settings or DriftSettings(), self.info.id, self.info.version)
 
 
 def _beam_text(chunk: xr.Dataset) -> str:

@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
-from errormotion.datasets.text.log_import import import_log
+from errormotion.datasets.importing import import_log
 from errormotion.errors import DatasetError
 
 PLACES = {

@@ -26,9 +26,10 @@ from errormotion.methods.spindle_drift.identification.record import (
     count_unknown,
     noise,
     reference_windows,
+    run_out_at_rest,
     sensors,
+    settling,
 )
-from errormotion.methods.spindle_drift.identification.turning import run_out_at_rest, settling
 from errormotion.methods.spindle_drift.identification.uncertainty import (
     Frame,
     State,

@@ -17,7 +17,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.turning import turns
+from errormotion.methods.spindle_drift.identification.record import turns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
