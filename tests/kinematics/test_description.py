@@ -72,7 +72,7 @@ def test_a_table_that_stands_still_below_all_linear_axes_leaves_their_directions
         ({"travel": TRAVEL | {"W": (0.0, 1.0)}}, "travel.W", "has no axis W"),
         ({"travel": TRAVEL | {"X": (1.0, 0.0)}}, "travel.X", "before the highest; found 1 m, 0 m"),
         ({"travel": TRAVEL | {"X": (1.0, 1.0)}}, "travel.X", "before the highest"),
-        ({"travel": TRAVEL | {"A": (np.nan, 1.0)}}, "travel.A", "found nan rad, 1 rad"),
+        ({"travel": TRAVEL | {"Y": (np.nan, 1.0)}}, "travel.Y", "found nan m, 1 m"),
         ({"positions": {"A": (0.0, 0.0, 0.0)}}, "rotary.C.position", "missing; expected a point on the line of C"),
         ({"positions": POSITIONS | {"A": (0.0, 0.0)}}, "rotary.A.position", "three finite coordinates"),
         ({"positions": POSITIONS | {"B": (0.0, 0.0, 0.0)}}, "rotary.B", "has no axis B"),
@@ -95,11 +95,8 @@ def test_a_description_that_contradicts_itself_is_refused_by_its_key(changes, ke
 def test_a_fixed_angle_between_linear_axes_would_turn_some_of_them():
     chain = "workpiece-X-C-bed-Y-Z-spindle-tool"
     travel, positions = dict.fromkeys("XYZ", (0.0, 1.0)), {"C": (0.0, 0.0, 0.0)}
-    assert MachineDescription("Any", chain, travel, positions=positions, fixed={"C": 0.0}).moving_axes == (
-        "X",
-        "Y",
-        "Z",
-    )
+    at_zero = MachineDescription("Any", chain, travel, positions=positions, fixed={"C": 0.0})
+    assert at_zero.moving_axes == ("X", "Y", "Z")
     with pytest.raises(DescriptionError, match=r"rotary\.C\.fixed: expected 0 rad.*both sides of C"):
         MachineDescription("Any", chain, travel, positions=positions, fixed={"C": 0.1})
 
