@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["DescriptionError", "MachineDescription"]
 
 Range = tuple[float, float]
-Point = tuple[float, float, float]
 
 _ROUNDING = 1e-9
 """Tolerance of comparisons with the travel, m and rad."""
@@ -49,7 +48,7 @@ class MachineDescription:
         Axis to its lowest and highest position, m or rad. A fixed axis needs none.
     spindle_axis : str
         ``X``, ``Y`` or ``Z``: the direction of the spindle's axis of rotation.
-    positions : mapping of str to (3,) tuple of float
+    positions : mapping of str to (3,) sequence of float
         Rotary axis to a point on its line, m, in machine coordinates with all axes at zero.
     fixed : mapping of str to float
         Rotary axis that stands still to its angle, rad.
@@ -64,7 +63,7 @@ class MachineDescription:
     chain: str
     travel: Mapping[str, Range]
     spindle_axis: str = "Z"
-    positions: Mapping[str, Point] = field(default_factory=dict)
+    positions: Mapping[str, Sequence[float]] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -113,11 +113,12 @@ class GeometricErrors:
         """Nominal poses of the bed in the workpiece, and of the tool in the bed, with the moving axes at zero."""
         at_zero = self.description.commands(np.zeros(len(self.description.moving_axes)))
         command = dict(zip(self.description.axes, at_zero, strict=True))
-        still = RigidTransform.identity()
-        return tuple(
-            reduce(mul, (j.motion([command[j.name]])[0] for j in self.machine.joints if j.carries_tool is side), still)
+        table, head = (
+            [joint.motion([command[joint.name]])[0] for joint in self.machine.joints if joint.carries_tool is side]
             for side in (False, True)
         )
+        still = RigidTransform.identity()
+        return reduce(mul, table, still), reduce(mul, head, still)
 
     def displacement(self, points: ArrayLike) -> Array:
         """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times as fast where all axes are linear."""

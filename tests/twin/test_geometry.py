@@ -196,8 +196,3 @@ def test_a_machine_without_one_of_the_axes_has_the_errors_of_those_it_has():
     truth = VirtualMachine(lathe, seed=1).volumetric_truth([[0.1, 0.2]])
     validate(truth)
     assert (truth.x.item(), truth.z.item()) == (0.1, 0.2)
-
-
-def test_an_unknown_kind_is_refused():
-    with pytest.raises(BenchError, match="cframe or gantry, or a description; found 'lathe'"):
-        VirtualMachine("lathe")
