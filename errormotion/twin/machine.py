@@ -16,16 +16,14 @@ from errormotion.kinematics.iso import ROTARY_AXES
 from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
 from errormotion.twin import frame as frames
-from errormotion.twin import rawdata, truth
-from errormotion.twin.beam_rawdata import BeamMeasurements
+from errormotion.twin import truth
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
-from errormotion.twin.crossbeam_rawdata import CrossbeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
-from errormotion.twin.multilateration_rawdata import TrackerMeasurements
 from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
+from errormotion.twin.sensing import Sensing
+from errormotion.twin.stage_sensor import StageSensor
 from errormotion.twin.state import ThermalState, seeded_state
 
 #: the spindle reaches full speed in this time, s
@@ -37,7 +35,7 @@ _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "prob
 _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurements, ProbeMeasurements):
+class VirtualMachine(StageSensor, ProbeMeasurements):
     """A machine tool whose true errors are known.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
@@ -80,9 +78,7 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
-        A point sensor on the stage and what it looks at: see `BeamMeasurements`, also for the measurements with them.
-        Measurements with a laser tracker: see `TrackerMeasurements`; of balls by the machine itself: see
-        `ProbeMeasurements`.
+        A point sensor on the stage and what it looks at.
     """
 
     def __init__(self, machine: str | MachineDescription = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -308,78 +304,6 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
                 f"The spindle holds a 'bar', or a 'sphere' with a StepProgram; found {tool!r}, {motion!r}."
             )
         return out
-
-    def raw_spindle_drift(
-        self,
-        t: ArrayLike,
-        *,
-        seed: int,
-        beams: str | rawdata.Beams = "true",
-        averaged: int = 10000,
-        expansion: bool = False,
-        warm_up: bool = True,
-        radius_error: bool = True,
-    ) -> xr.Dataset:
-        """Return a raw dataset of a drift measurement, each sample the mean over whole turns.
-
-        Parameters
-        ----------
-        t : (n,)
-            Times, s, increasing.
-        seed : int
-            Of the noise alone; the machine stays the same.
-        beams : {"true", "nominal"} or (origin, direction, covariance)
-            The beams that the dataset states: (channel, 3) m, (channel, 3), (channel, 6, 6) or None.
-        averaged : int
-            Samples in each mean: ``distance_noise`` is that of one sample by the root of this, and so is the noise.
-        expansion : bool
-            Whether the readings hold the expansion of the frame; without it they are as if compensated perfectly.
-        warm_up : bool
-            Whether they hold the warm-up of the sensors; nothing in a warm machine.
-        radius_error : bool
-            Whether the dataset states the certificate's radius of the bar and not the true one.
-        """
-        t = _times(t)
-        noise = float(self.frame.noise.max()) / np.sqrt(averaged)
-        readings = self.still_readings(t, expansion=expansion, warm_up=warm_up)
-        readings = readings + noise * np.random.default_rng(seed).normal(size=readings.shape)
-        readings[~((readings >= 0) & (readings <= self.frame.range))] = np.nan
-        known = {
-            "true": (self.frame.true_origin, self.frame.true_direction, None),
-            "nominal": (self.frame.nominal_origin, self.frame.nominal_direction, None),
-        }
-        if isinstance(beams, str) and beams not in known:
-            raise BenchError(f"The beams are 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
-        return rawdata.spindle_drift(
-            self.frame,
-            t,
-            readings,
-            noise,
-            known[beams] if isinstance(beams, str) else beams,
-            self.bar_radius if radius_error else self.bar.radius,
-            {
-                "temperature": (("time", "sensor"), self.temperatures(t), {"units": "degC"}),
-                "spindle_speed": ("time", self.spindle_speed(t), {"units": "1/min"}),
-            },
-            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
-        ).assign_coords(sensor=list(self.temperature_sensors))
-
-    def raw_beam_detection(self, *, seed: int) -> xr.Dataset:
-        """Return a raw dataset of a beam detection in the cold state, one mean reading per rest of the sphere.
-
-        Parameters
-        ----------
-        seed : int
-            Of positions and speckle; the machine stays the same.
-        """
-        return rawdata.beam_detection(
-            self.frame,
-            self.sphere_radius,
-            REPEATABILITY,
-            SPECKLE,
-            np.random.default_rng(seed),
-            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
-        )
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)

@@ -19,7 +19,7 @@ from errormotion.campaign.store import committed_length
 from errormotion.errors import InstrumentTimeoutError, RunError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import reset, world
-from errormotion.instruments.simulators.virtual_world import VirtualWorld
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.thermometer.registers import ModbusSettings, decode_number, encode_number
-from errormotion.instruments.transports.modbus_codec import (
+from errormotion.instruments.transports.modbus.codec import (
     ModbusRefusal,
     crc16,
     decode_answer,

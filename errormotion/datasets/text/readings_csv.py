@@ -1,19 +1,20 @@
-"""Readings that a person wrote into a text file: a short header and tables with units become a raw dataset.
+"""Readings in a text file: a short header and tables with units become a raw dataset.
 
-The names are those of the raw schema, so every schema can be written so::
+The names are those of the raw schema, so that every schema can be written like this::
 
-    # schema = errormotion.raw.beam_direction/1
+    # schema = errormotion.raw.NAME/1
     # nominal_direction = 0.342 0 0.940
     # distance_noise = 0.1 um
-    plane,reading [mm],x [mm],y [mm],z [mm]
+    plane,distance [mm],stage_x [mm],stage_y [mm],stage_z [mm]
     1,-2.004,100.000,50.000,20.000
     1,-1.508,101.000,50.000,20.000
     2,...
 
-A line ``# key = value unit`` holds one value, or the few values of a vector with blanks between them; other lines that
-begin with ``#`` are remarks. A column holds one variable, with its unit in brackets; a component of a vector has its
-name behind it (``stage_x [mm]``). A column without a unit is the number or name of a plane, a channel and the like;
-the last dimension, here the readings of a plane, counts itself. An empty line begins another table, with its own names.
+A line ``# key = value unit`` holds one value, or the few values of a vector separated by blanks; other lines that start
+with ``#`` are remarks. A column holds one variable, with its unit in brackets; the name of a component of a vector ends
+with the component (``stage_x [mm]``). A column without a unit is the number or name of an element of a dimension, such
+as a plane or a channel; the last dimension, here the readings of a plane, needs no column. An empty line starts another
+table, with its own names.
 """
 
 from __future__ import annotations
@@ -40,7 +41,6 @@ from errormotion.errors import DatasetError
 TEXTS = ("schema", "machine", "sensor", "source", "title", "start")
 """Keys of the header that are kept as attributes."""
 
-_SHORT = {"reading": "distance", "x": "stage_x", "y": "stage_y", "z": "stage_z"}
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _COLUMN = re.compile(r"([^\W\d]\w*)\s*(?:\[([^\]]*)\])?")
 _EMPTY = ("", "NaN", "nan")
@@ -103,6 +103,7 @@ class _Names:
     rows: Mapping[str, Row]
     labels: Mapping[str, tuple[str, ...]]
     sizes: Mapping[str, int]
+    aliases: Mapping[str, str]
 
     @classmethod
     def of(cls, schema: str) -> _Names | None:
@@ -112,7 +113,8 @@ class _Names:
             return None
         rows = {row.name: row for raw in reversed(known) for row in raw.rows}
         labels = {dim: found for raw in known for dim, found in raw.labels.items()}
-        return cls(rows, labels, {dim: size for raw in known for dim, size in raw.sizes.items()})
+        sizes = {dim: size for raw in known for dim, size in raw.sizes.items()}
+        return cls(rows, labels, sizes, {short: name for raw in known for short, name in raw.aliases.items()})
 
     def columns(self) -> dict[str, tuple[Row, int | None]]:
         """Return every possible column: its variable, and which component it is (None for a whole)."""
@@ -123,7 +125,8 @@ class _Names:
                 found[row.name] = (row, None)
             else:
                 found |= {f"{row.name}_{label}": (row, k) for k, label in enumerate(self.labels[dim])}
-        return found | {short: found[name] for short, name in _SHORT.items() if short not in found and name in found}
+        short = {short: found[name] for short, name in self.aliases.items() if name in found}
+        return short | found
 
     def component_dim(self, row: Row) -> str | None:
         """Return the dimension of a variable that stands side by side in columns."""
@@ -305,7 +308,7 @@ def _columns(
         own = f"{variable[0].name} {variable[1]}" if variable else name
         if own in seen:
             complaints.add(line, f"{told}: comes again; column {seen[own] + 1} is '{titles[seen[own]]}'")
-        elif variable is not None and (match[2] is not None or name not in dims or name in _SHORT):
+        elif variable is not None and (match[2] is not None or name not in dims or name in names.aliases):
             if match[2] is None or (not unit and variable[0].unit):
                 example = f"{name} [{variable[0].unit or '1'}]"
                 complaints.add(line, f"{told}: expected its unit in brackets, such as '{example}'; found none")

@@ -35,6 +35,10 @@ class BeamDirection:
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
     raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.beam_direction.report:chapters")
+    figures = lazy("errormotion.methods.beam_direction.figures:figures")
+    calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
+    simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")
+    conformance = lazy("errormotion.methods.beam_direction.conformance:subjects")
 
     def acquire(
         self,

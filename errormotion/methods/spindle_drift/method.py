@@ -8,10 +8,10 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.acquisition.drift import SCHEMA
 from errormotion.methods.spindle_drift.identification.detection import identify_beams
 from errormotion.methods.spindle_drift.identification.drift import identify_drift
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
@@ -37,6 +37,9 @@ class SpindleDrift:
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
+    figures = lazy("errormotion.methods.spindle_drift.figures:figures")
+    simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
+    conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
 
     def acquire(
         self,

@@ -109,5 +109,3 @@ def _weighted_inverse(M, u):
 
 def _outer(effects):
     return effects.T @ effects
-
-

@@ -15,7 +15,9 @@ class Settings(PluginSettings):
     """Settings of ``ballbar``: the test to plan or to simulate, and the evaluation."""
 
     # The test
-    plane: Literal["XY", "YZ", "ZX"] = Field(default="XY", description="axes of the circle; angles count from the first")
+    plane: Literal["XY", "YZ", "ZX"] = Field(
+        default="XY", description="axes of the circle; angles count from the first"
+    )
     centre: tuple[Length, Length, Length] = Field(
         default=(0.0, 0.0, 0.0), description="programmed centre of the circle, machine coordinates"
     )

@@ -11,7 +11,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, Settings, simulation
 from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 from errormotion.plugins import Contact, Identity, InstrumentInfo
@@ -454,7 +454,7 @@ def test_a_ball_that_was_not_found_cold_is_told_at_once() -> None:
 def test_each_cycle_is_told_in_a_line() -> None:
     machine = VirtualMachine("gantry", seed=5)
     machine.start([])
-    raw = machine.raw_normal_vector([0.0, 600.0], seed=1, touches=5)
+    raw = simulation.raw(machine, [0.0, 600.0], seed=1, touches=5)
     place = raw["touch"].values
     place[1] = place[0] + np.array([4e-6, -2e-6, 7e-6])
     live = LiveBalls(settings(balls=BALLS))

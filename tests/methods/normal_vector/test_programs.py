@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from errormotion.errors import MethodError
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.normal_vector import NormalVector, Settings
 from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.methods.normal_vector.acquisition.programs import CYCLE, WARM_UP, cycle_program

@@ -11,6 +11,7 @@ from scipy import stats
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, tilt_text
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
@@ -30,7 +31,6 @@ from errormotion.methods.beam_direction.identification.slopes import UNKNOWNS, P
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +67,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         settled = plain
         notes.append("No inclination compensation: the readings are taken as they are.")
     else:
+        notes += sensor.notes
         settled = settle(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
     corrected = _corrected(data, settled, sensor, settings, notes)
     origin = locate(settled.direction, settled.planes.offsets, settled.planes.covariances, data.points,
@@ -118,14 +119,14 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
 
 
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
-    """Return what the compensation has to know; None where nothing is to be compensated.
+    """Return what the compensation needs; None without a compensation.
 
     Raises
     ------
     MethodError
         The data do not say how the sensor is turned.
     DatasetError
-        No such calibration.
+        No such calibration, or one that belongs to another sensor.
     """
     if settings.compensation is None:
         return None
@@ -137,11 +138,15 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
         )
     t = np.asarray(raw["triangulation_normal"].values, np.float64)
     name = "triangulation_normal_uncertainty"
+    mid_range = float(raw["mid_range"]) if "mid_range" in raw else calibration.mid_range
+    serial, allowed = owner.serial_number(raw.attrs, "point_lds"), settings.allow_other_sensor
+    notes = calibration.require_sensor(serial, mid_range, allow_other_sensor=allowed)
     return Sensor(
         calibration,
         t / np.linalg.norm(t),
         float(raw[name]) if name in raw else settings.triangulation_normal_uncertainty,
-        float(raw["mid_range"]) if "mid_range" in raw else calibration.mid_range,
+        mid_range,
+        tuple(notes),
     )
 
 

@@ -61,7 +61,7 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
         raise MethodError(
             f"The touch probe '{probe.info.id}' has the machine moved, and a machine that is to warm up needs an "
             "instrument of kind 'controller' that turns its spindle; the bench has none. Add it; or let the machine "
-            "run a program ('errormotion program') and take a probe that reads what it prints, such as 'dprnt'."
+            "run a program ('errormotion program') and use a touch probe that reads the lines that the program prints."
         )
     record = Record(bench, settings, probe, done)
     if not moves or not (active or hasattr(control, "run_program")):

@@ -21,6 +21,7 @@ from pydantic import Field
 
 from errormotion.arrays import Array
 from errormotion.datasets import provenance
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.pretravel import HIGHEST, PretravelMap, assemble, harmonics, terms_up_to, unit
 from errormotion.datasets.units import Length
 from errormotion.errors import FitError
@@ -47,6 +48,7 @@ class PretravelSettings(PluginSettings):
     strain: float = Field(
         default=10e-6, description="by how much the machine's scales and right angles may be off, m/m, one sigma", ge=0
     )
+    serial_number: str = Field(default="", description="serial number of the probe; unknown if not given")
     highest: int = Field(default=5, description="highest degree that is tried", ge=0, le=HIGHEST)
 
 
@@ -146,7 +148,10 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
             "ball_radius": settings.ball_radius,
             "tip_radius": settings.tip_radius,
         },
-        {"provenance": json.dumps(provenance.make(settings, raw, None))},
+        {
+            "provenance": json.dumps(provenance.make(settings, raw, None)),
+            **({owner.ATTRIBUTE: settings.serial_number} if settings.serial_number else {}),
+        },
     )
     return PretravelMap(dataset)
 

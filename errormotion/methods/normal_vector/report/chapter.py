@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.crossbeam_scan.report.view import remarks
 from errormotion.methods.normal_vector.report import drawings as normal_vector_figures
 from errormotion.methods.normal_vector.report.view import (
     FLAGS,
@@ -35,6 +34,7 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
+from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
 from errormotion.report.series import events
 from errormotion.report.text import finite, fixed, integer, listed, significant

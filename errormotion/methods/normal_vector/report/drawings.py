@@ -6,13 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.methods.multilateration.report.view import enlargement
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, UNDETERMINED, WRONG, Probing
 from errormotion.report import canvas, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Figure, Text
 from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, integer, listed
-from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
+from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _ARROW = 0.22  # longest displacement drawn, share of the diagonal of the balls
 _FAINT, _SOFT = "#c3c8d0", "#6f7680"

@@ -8,12 +8,14 @@ so that a record larger than memory passes through in constant space.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 import xarray as xr
+from xarray.indexes import RangeIndex
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -110,6 +112,17 @@ def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> 
     else:
         _sum_rows(np.ascontiguousarray(values), edges, sums, counts)
     return sums, counts
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Sum in one thread: where other threads hash what was read, they leave no core to wait for at each slice."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 @dataclass(frozen=True)
@@ -246,9 +259,14 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     chunk = distance.encoding.get("preferred_chunks", {}).get("time", 1)
     if chunk > 1:
         step = max(1, step // chunk) * chunk
+    positions = np.arange(min(step, samples), dtype=np.float64)
     for begin in range(0, samples, step):
         part = raw.isel(time=slice(begin, begin + step))
-        if "time" in raw.variables:
+        clock = part.xindexes.get("time")
+        if isinstance(clock, RangeIndex):  # its own values, without its integers
+            time = positions[: part.sizes["time"]] * clock.step
+            time += clock.start
+        elif "time" in raw.variables:
             time = np.asarray(part["time"].values, np.float64)
         elif "sample_rate" in raw.attrs:
             index = np.arange(begin, min(begin + step, samples))

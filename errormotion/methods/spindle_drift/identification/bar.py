@@ -16,15 +16,10 @@ Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives our own.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numba
 import numpy as np
 
 from errormotion.arrays import Array
-
-if TYPE_CHECKING:
-    Array = Array
 
 SIDE = 4
 """Number of side channels: X1, X2, Y1, Y2 come first, Z last."""

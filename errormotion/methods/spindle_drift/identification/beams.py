@@ -26,7 +26,6 @@ from errormotion.kinematics.beams import across, turned
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
 
 UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""

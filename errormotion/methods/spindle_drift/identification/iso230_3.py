@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = Array
     Index = NDArray[np.int64]
 
 QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")

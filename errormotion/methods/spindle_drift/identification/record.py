@@ -17,9 +17,9 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from errormotion.datasets.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 # Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
 _CHANCE = 3.3
@@ -49,8 +49,8 @@ class Record:
     scatter: Array | None
 
 
-def average_record(raw: xr.Dataset, settings: Settings) -> Record:
-    """Bring a record down to means in one pass and constant memory."""
+def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -> Record:
+    """Average a record in one pass and constant memory; the hasher of ``raw`` takes part in it."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # Put in order after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
@@ -59,21 +59,28 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
-    last = -np.inf
+    last, done = -np.inf, 0
     for time, part in slices(raw):
-        if not (np.isfinite(time).all() and (np.diff(time, prepend=last) > 0).all()):
+        increasing = last < time[0] and (time[1:] > time[:-1]).all()
+        if not (increasing and np.isfinite(time[[0, -1]]).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
         last = float(time[-1])
-        readings = _with_time_last(part["distance"])
-        readings = readings if order == [0, 1, 2, 3, 4] else readings[order]
+        read: dict[str, NDArray[Any]] = {}
+        for name in ("distance", *slow):
+            values = np.asarray(part[name].values)
+            hasher.update(name, values, time=slice(done, done + time.size))
+            # The axis is moved after reading: a lazy transposition reads sample by sample.
+            read[name] = np.moveaxis(values, part[name].get_axis_num("time"), -1)
+        done += time.size
+        readings = read["distance"] if order == [0, 1, 2, 3, 4] else read["distance"][order]
         parts.append(averager.update(time, readings))
         for name in slow:
-            values = _with_time_last(part[name]).astype(np.float64)
+            values = read[name].astype(np.float64)
             slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
             if name == "spindle_speed" and scatter is None:
                 scatter = _scatter(time, readings, values, settings)
     parts.append(averager.finish())
-    means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
+    means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
 
@@ -89,11 +96,6 @@ def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, set
     if np.isnan(part).all(axis=1).any():
         return None
     return np.asarray(np.nanstd(part, axis=1, ddof=1))
-
-
-def _with_time_last(variable: xr.DataArray) -> NDArray[np.floating[Any]]:
-    """Return the values with time as the last axis; read first, since a lazy transposition reads sample by sample."""
-    return np.moveaxis(np.asarray(variable.values), variable.get_axis_num("time"), -1)
 
 
 def count_unknown(averages: Averages, notes: list[str]) -> None:

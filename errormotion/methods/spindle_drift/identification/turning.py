@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.spindle_drift.identification.record import Record
 
-    Array = Array
     Mask = NDArray[np.bool_]
 
 _SAME_SPEED = 0.02
