@@ -127,12 +127,12 @@ def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration
     raw = simulation.raw(machine, FOUR, seed=3)
     known = InclinationCalibration.load(calibration)
     told = provenance.of(identify(raw, compensation=calibration))["calibration"]
-    assert told == known.told()
+    assert told == known.reference()
     assert told["name"] == "sensor"
     changed = InclinationCalibration(known.dataset.assign(mid_range=1e-3))
     renamed = InclinationCalibration(known.dataset.assign_attrs(name="other"))
-    assert changed.told()["hash"] != told["hash"]
-    assert renamed.told()["hash"] == told["hash"]
+    assert changed.reference()["hash"] != told["hash"]
+    assert renamed.reference()["hash"] == told["hash"]
     assert "calibration" not in provenance.of(identify(raw))
 
 
