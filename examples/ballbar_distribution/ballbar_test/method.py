@@ -31,14 +31,14 @@ class Ballbar:
     conformance = lazy("ballbar_test.conformance:subjects")
     figures = staticmethod(figures_of)
 
-    def acquire(self, bench, settings, *, inputs, done=None):  # noqa: ARG002 - part of the protocol
+    def acquire(self, bench, settings, *, inputs, done=None):
         """Refuse: readings of a ballbar come from the software of its maker, as a CSV file."""
         raise MethodError(
             "ballbar does not acquire. Record with the software of the ballbar, write the readings to a CSV file of "
             f"schema {SCHEMA}, and use 'errormotion identify FILE'."
         )
 
-    def append_dim(self, settings):  # noqa: ARG002 - part of the protocol
+    def append_dim(self, settings):
         """Return ``run``."""
         return "run"
 
