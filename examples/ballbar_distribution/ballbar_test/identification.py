@@ -58,7 +58,8 @@ def plan(settings, method, version):
     words = ", ".join(f"{name} {value:.2f} um" for name, value in zip(result.NAMES, u, strict=True))
     note = (
         f"With {settings.runs} circles of {settings.samples} readings in each direction, the expanded uncertainties "
-        f"(k = 2) of a path without errors are {words}. Those of G and H are smaller where a path has distinct extremes."
+        f"(k = 2) of a path without errors are {words}. Those of G and H are smaller where a path has distinct "
+        "extremes."
     )
     return errors.assign(zero).assign_attrs(notes=[note])
 

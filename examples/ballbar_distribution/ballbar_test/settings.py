@@ -35,7 +35,8 @@ class Settings(PluginSettings):
         default=180,
         ge=36,
         multiple_of=4,
-        description="sectors of the circle over which readings are averaged; a multiple of 4, so that no sector holds a "
+        description="sectors of the circle over which readings are averaged; a multiple of 4, so that no sector holds "
+        "a "
         "reversal of an axis",
     )
     largest_gap: Angle = Field(
