@@ -155,5 +155,3 @@ def state_problem(
     if extra_prior is not None:
         precision[4 * n :] = 1.0 / np.broadcast_to(np.asarray(extra_prior, dtype=float), (len(c),)) ** 2
     return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, centre, by_target, by_station)
-
-
