@@ -66,7 +66,7 @@ def threads() -> int:
     """Return how many threads share the rows: as many as numba uses (``NUMBA_NUM_THREADS``)."""
     import numba
 
-    return int(numba.config.NUMBA_NUM_THREADS)
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined, unused-ignore]
 
 
 @compiled()
