@@ -27,10 +27,17 @@ def main() -> None:
         for k, (name, text) in enumerate(row):
             x, y = k * width + 0.06, level * (height + gap)
             box = FancyBboxPatch(
-                (x, y), width - 0.12, height, boxstyle="round,pad=0,rounding_size=0.08", fc=COLOURS[level % 2], ec="#5b7083"
+                (x, y),
+                width - 0.12,
+                height,
+                boxstyle="round,pad=0,rounding_size=0.08",
+                fc=COLOURS[level % 2],
+                ec="#5b7083",
             )
             axes.add_patch(box)
-            axes.text(x + (width - 0.12) / 2, y + 0.52, name, ha="center", va="center", fontweight="bold", fontsize=10.5)
+            axes.text(
+                x + (width - 0.12) / 2, y + 0.52, name, ha="center", va="center", fontweight="bold", fontsize=10.5
+            )
             axes.text(x + (width - 0.12) / 2, y + 0.22, text, ha="center", va="center", fontsize=8.5, color="#33424f")
     top = len(LAYERS) * (height + gap)
     axes.annotate("", (8.45, 0.1), (8.45, top - 0.3), arrowprops={"arrowstyle": "-|>", "color": "#5b7083", "lw": 1.6})

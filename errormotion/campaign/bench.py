@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -69,6 +70,7 @@ class OpenBench:
     def __init__(self, plan: BenchPlan, ask: Callable[[str], None] | None = None) -> None:
         self.plan = plan
         self.machine = plan.machine
+        self.description = plan.description
         self.answers: list[Answer] = []
         self._ask = ask
 
@@ -132,6 +134,15 @@ class OpenBench:
         """Whether every instrument is a simulated one."""
         return all(answer.identity is not None and answer.identity.simulated for answer in self.answers)
 
+    def chosen(self, choice: Mapping[str, str]) -> OpenBench:
+        """Return the open bench with one instrument of each kind in ``choice`` (kind to name), and all of others."""
+        found = copy(self)
+        kinds = [(answer, answer.instrument.driver.info.kind) for answer in self.answers]
+        found.answers = [
+            answer for answer, kind in kinds if choice.get(kind, answer.instrument.name) == answer.instrument.name
+        ]
+        return found
+
     def has_kind(self, kind: str) -> bool:
         """Whether the bench has an instrument of this kind."""
         return any(answer.instrument.driver.info.kind == kind for answer in self.answers)
@@ -150,7 +161,8 @@ class OpenBench:
         if found:
             names = ", ".join(answer.instrument.name for answer in found)
             raise BenchError(
-                f"Bench '{self.plan.name}': expected one {kind}; found {names}. Leave one in {self.plan.source}."
+                f"Bench '{self.plan.name}': expected one {kind}; found {names}. Choose one in the test: "
+                f'instruments = {{ {kind} = "{found[0].instrument.name}" }}.'
             )
         raise BenchError(
             f"Bench '{self.plan.name}': expected a {kind}; it offers {', '.join(self.plan.kinds)}. "

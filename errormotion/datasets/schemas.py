@@ -73,9 +73,8 @@ class RawSchema:
         Dimensions of fixed length.
     labels : mapping of str to tuple of str
         Labels that a dimension must have, all of them and no other.
-    ordered : bool
-        Whether a dimension without a coordinate may be taken to have its labels in their order. Dimensions with
-        a coordinate may have them in any order where this is False.
+    aliases : mapping of str to str
+        Short names of columns in text files, and the columns that they stand for.
     """
 
     id: str
@@ -84,6 +83,7 @@ class RawSchema:
     rows: tuple[Row, ...]
     sizes: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    aliases: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def title(self) -> str:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 import xarray as xr
 from pydantic import BaseModel, ConfigDict
+
+if TYPE_CHECKING:
+    from errormotion.kinematics.description import MachineDescription
 
 Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
 
@@ -249,9 +252,14 @@ class Instrument(Protocol):
 
 @runtime_checkable
 class Bench(Protocol):
-    """What a method sees of a bench: opened instruments by kind, and where and what the machine is."""
+    """A bench as a method sees it: opened instruments by kind, and the machine.
+
+    ``machine`` is the name of the machine tool; ``description`` is its chain, travel, spindle axis and rotary axes,
+    None where the bench file gives the name only.
+    """
 
     machine: str
+    description: MachineDescription | None
 
     def of_kind(self, kind: str) -> Any:
         """Return the one instrument of this kind; BenchError names what is missing."""
@@ -291,6 +299,9 @@ class Method(Protocol):
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
+    ``check_machine(settings, machine)`` : mapping of str to str
+        Which settings contradict the machine of the bench (a `MachineDescription`), by setting, with what was expected
+        and what was found; used when a campaign is read.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
 

@@ -20,6 +20,9 @@ ORIGIN = 'nominal_origin = ["50 mm", "0 mm", "-80 mm"]'
 #: The readings of the optoNCDT begin at the start of its range, 10 mm nearer than the middle, and so does its beam.
 FROM_START = 'nominal_origin = ["46.5798 mm", "0 mm", "-70.6031 mm"]'
 
+COMPENSATION = 'compensation = "lk-h050"'
+"""The calibration counts readings from the middle of the range."""
+
 
 def never(message):
     pytest.fail(f"asked the operator: {message}")
@@ -47,7 +50,11 @@ def measured(request, tmp_path_factory):
     if request.param == "keyence_lk":
         plan, truth = write(folder), simulation.truth_beam(machine)
     else:
-        plan = write(folder, [(KEYENCE, OPTO)], [(ORIGIN, FROM_START)])
+        plan = write(
+            folder,
+            [(KEYENCE, OPTO)],
+            [(ORIGIN, FROM_START), (COMPENSATION, f"{COMPENSATION}\nallow_other_sensor = true")],
+        )
         truth = simulation.truth_beam(machine, machine.point_sensor.from_start(20e-3))
     (run,) = runner.run(plan, runs=folder / "runs", ask=never)
     return run, truth

@@ -54,6 +54,20 @@ def test_kind_that_is_missing_or_there_twice_is_refused(bench: Callable[..., Ben
             table.of_kind("counter")
 
 
+def test_of_several_instruments_of_a_kind_one_is_chosen_by_name(bench: Callable[..., BenchPlan]) -> None:
+    with OpenBench(bench(SECOND + "simulated = false")) as table:
+        chosen = {name: table.chosen({"counter": name}) for name in ("counter", "other")}
+        assert {name: each.of_kind("counter").address for name, each in chosen.items()} == {
+            "counter": "sim://counter",
+            "other": "tcp://10.0.0.5:10001",
+        }
+        assert chosen["other"].all_of_kind("counter").keys() == {"other"}
+        assert table.all_of_kind("counter").keys() == {"counter", "other"}
+        assert chosen["counter"].virtual
+        assert not chosen["other"].virtual
+    assert plugins.get("instruments", "counter").opened == []
+
+
 def test_operator_is_asked_only_where_something_is_real(bench: Callable[..., BenchPlan]) -> None:
     asked: list[str] = []
     with OpenBench(bench(), asked.append) as table:

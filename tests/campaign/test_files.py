@@ -44,8 +44,8 @@ def test_all_mistakes_of_a_bench_file_are_told_at_once(tmp_path: Path) -> None:
     )
     schema, machine, driver, unknown, rate, block = complaints(path, load_bench)
     assert schema.startswith("schema: expected 'errormotion.bench/1'; found \"errormotion.bench/2\"")
-    assert machine == "machine: missing; expected a string"
-    assert driver == 'instruments.c.driver: missing; expected the id of an instrument plugin, such as "optoncdt"'
+    assert machine == "machine: missing; expected the name of the machine tool, or the table [machine]"
+    assert driver.startswith("instruments.c.driver: missing; expected the id of an instrument plugin")
     assert unknown.startswith("instruments.a.driver: No instrument plugin 'countr'")
     assert unknown.endswith("Did you mean 'counter'?")
     assert rate == "instruments.b.rate: expected a frequency with its unit, such as '20 kHz'; found 20"
@@ -80,6 +80,50 @@ def test_bench_without_the_instruments_of_a_method_is_refused_before_anything_is
     assert (
         mistake
         == f"test[0]: the method 'ramp' needs thermometer; the bench {path.parent / 'bench.toml'} offers counter"
+    )
+
+
+SECOND = '[instruments.other]\ndriver = "counter"\naddress = "sim://other"\nrate = "50 Hz"\n'
+
+
+def test_of_several_instruments_of_a_kind_a_test_chooses_one_by_name(write: Callable[..., Path]) -> None:
+    plan = load_campaign(
+        write(
+            'name = "a"\ninstruments = {counter = "other"}',
+            'name = "b"\ninstruments = {counter = "counter"}',
+            bench=SECOND,
+        )
+    )
+    rates = [plan.bench.chosen(test.instruments).settings_by_kind["counter"].rate for test in plan.tests]
+    assert rates == [50.0, 1000.0]
+
+
+def test_a_choice_that_the_bench_does_not_offer_is_refused(write: Callable[..., Path]) -> None:
+    path = write(
+        'name = "a"\ninstruments = {counter = "othr"}',
+        'name = "b"\ninstruments = {countr = "other"}',
+        'name = "c"\ninstruments = {counter = 3}',
+        bench=SECOND,
+    )
+    bench = path.parent / "bench.toml"
+    number, name, kind = complaints(path, load_campaign)
+    assert number == "test[2].instruments.counter: expected a string in quotes; found 3"
+    assert name == (
+        f"test[0].instruments.counter: expected the name of a counter on the bench {bench}; found 'othr'; "
+        "did you mean 'other'? Known here: counter, other"
+    )
+    assert kind == (
+        f"test[1].instruments.countr: expected a kind of instrument on the bench {bench}; found 'countr'; "
+        "did you mean 'counter'? Known here: counter"
+    )
+
+
+def test_several_instruments_of_a_needed_kind_without_a_choice_are_refused(write: Callable[..., Path]) -> None:
+    path = write('name = "a"', bench=SECOND)
+    (mistake,) = complaints(path, load_campaign)
+    assert mistake == (
+        f"test[0]: the method 'ramp' needs one counter; the bench {path.parent / 'bench.toml'} offers counter, other. "
+        'Choose one: instruments = { counter = "counter" }'
     )
 
 

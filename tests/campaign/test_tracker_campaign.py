@@ -12,7 +12,7 @@ from errormotion.campaign.files import load_campaign
 from errormotion.errors import RunError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.leica_emscon import SimulatedEmScon
+from errormotion.instruments.simulators.laser_tracker.leica_emscon import SimulatedEmScon
 from errormotion.methods.multilateration import Multilateration, simulation
 from errormotion.methods.multilateration.planning.layout import serpentine
 from errormotion.twin import VirtualMachine

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import Result
 
 from errormotion.cli.demo import probing as probing_demonstration
-from errormotion.instruments.simulators import linuxcnc, linuxcnc_process
+from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process
 
 if reason := linuxcnc_process.why_not():
     pytest.skip(reason, allow_module_level=True)

@@ -32,7 +32,7 @@ from errormotion.instruments.thermometer.cia404 import (
     flag_of,
     to_celsius,
 )
-from errormotion.instruments.transports.can import SdoRefusal
+from errormotion.instruments.transports.can.bus import SdoRefusal
 
 ADDRESS = "sim://cframe/can?seed=3&node=5"
 # long enough for the pauses of a garbage collection (0.3 s on a slow computer), during which no simulator answers
@@ -259,7 +259,7 @@ def test_open_and_shorted_sensors_are_nan_with_a_flag() -> None:
 
 SERVER = """
 import sys
-from errormotion.instruments.transports.can_serving import CanopenServer, Entry
+from errormotion.instruments.transports.can.serving import CanopenServer, Entry
 entries = [Entry(0x1000, "type", "u32"), Entry(0x1018, "identity", "u32", 4), Entry(0x6130, "value", "f32", 2),
            Entry(0x6131, "unit", "u32", 2), Entry(0x6150, "status", "u8", 2)]
 known = {(0x1000, 0): 404, (0x6130, 1): 20.25, (0x6130, 2): -3.5, (0x6150, 2): 2}

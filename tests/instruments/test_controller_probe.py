@@ -108,6 +108,22 @@ def lobed(lobing: float, directions: Sequence[Sequence[float]] = NORMALS) -> Pre
     )
 
 
+def test_a_map_of_another_probe_is_refused_unless_allowed(tmp_path: Path) -> None:
+    made = lobed(1e-6)
+    made.dataset.attrs["serial_number"] = "P1"
+    path = str(made.save(tmp_path / "probe.nc"))
+    with pytest.raises(DatasetError, match=r"serial number P1; the sensor in use has P2\. .*allow_other_sensor = true"):
+        ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=path, serial_number="P2")).open()
+    for allowed in ({"serial_number": "P1"}, {"serial_number": "P2", "allow_other_sensor": True}, {}):
+        assert ControllerProbeSettings(pretravel=path, **allowed).pretravel_map() is not None
+
+
+def test_a_map_without_a_serial_number_is_used_with_a_note(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = str(lobed(1e-6).save(tmp_path / "probe.nc"))
+    ControllerProbeSettings(pretravel=path, serial_number="P2").pretravel_map()
+    assert "holds no serial number" in caplog.text
+
+
 def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -> None:
     made = lobed(1e-6)
     path = made.save(tmp_path / "probe.nc")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.twin.paths import Path
 
 TRAVEL = {"X": (0.0, 4.0), "Y": (-0.9, 0.9), "Z": (0.0, 1.0)}

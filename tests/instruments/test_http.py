@@ -7,8 +7,8 @@ import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports import parse_address
-from errormotion.instruments.transports.http import HttpTransport
-from errormotion.instruments.transports.http_serving import HttpServer
+from errormotion.instruments.transports.http.client import HttpTransport
+from errormotion.instruments.transports.http.serving import HttpServer
 
 Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 MULTIPART = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x\r\n"

@@ -17,8 +17,8 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamDecoder, StreamEndedError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import QUIET_INTERVAL, STREAM
 from errormotion.instruments.simulators.faults import parse_fault
-from errormotion.instruments.simulators.keyence_ljx import SimulatedLJX, packed
-from errormotion.instruments.simulators.profile_sources import Lines, SweptSurface
+from errormotion.instruments.simulators.line_profiler.keyence_ljx import SimulatedLJX, packed
+from errormotion.instruments.simulators.line_profiler.profile_sources import Lines, SweptSurface
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.serving import TcpServer
 from errormotion.plugins.readings import Profiles

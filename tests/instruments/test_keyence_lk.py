@@ -15,7 +15,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings
 from errormotion.instruments.point_lds.keyence_lk.codec import HEADS
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.keyence_lk import SimulatedKeyenceLK
+from errormotion.instruments.simulators.point_lds.keyence_lk import SimulatedKeyenceLK
 from errormotion.instruments.transports import parse_address
 from errormotion.plugins import Samples
 
@@ -200,7 +200,7 @@ def test_it_tells_who_it_is_as_far_as_it_can() -> None:
     with KeyenceLK(f"{SIX}&wire=pty") as sensor:
         identity = sensor.identify()
     assert (identity.manufacturer, identity.model) == ("Keyence", "LK-G5000 with LK-H050")
-    assert identity.serial_number == "not told over RS-232C"
+    assert identity.serial_number == "unknown"
     assert identity.simulated
     assert identity.details["output"] == 1
 

@@ -105,7 +105,7 @@ def test_every_point_sensor_reads_the_depth_from_its_mid_range(make) -> None:
 @pytest.mark.parametrize("lift", [-3e-3, 3e-3])
 def test_the_inclination_error_goes_and_the_raw_reading_stays(make, lift: float, known) -> None:
     with make() as sensor:
-        compensated = CompensatedSensor(sensor, known)
+        compensated = CompensatedSensor(sensor, known, allow_other_sensor=True)
         depth, alpha, beta = before_a_plane(lift)
         block = next(islice(compensated.stream(alpha, beta, block=200), 1))
         one = compensated.read(alpha, beta)
@@ -123,7 +123,9 @@ def test_the_inclination_error_goes_and_the_raw_reading_stays(make, lift: float,
 def test_a_compensated_block_is_a_block_with_the_raw_one_beside(make, known) -> None:
     with make() as sensor:
         _, alpha, beta = before_a_plane(2e-3)
-        blocks = list(islice(CompensatedSensor(sensor, known).stream(alpha, beta, block=25), 2))
+        blocks = list(
+            islice(CompensatedSensor(sensor, known, allow_other_sensor=True).stream(alpha, beta, block=25), 2)
+        )
     assert [block.first for block in blocks] == [0, 25]
     for block in blocks:
         assert block.rate == sensor.rate
@@ -164,6 +166,44 @@ def test_a_calibration_is_found_by_name_and_by_path(tmp_path: Path, monkeypatch:
     assert values[0] == values[1] == values[2] != 5e-3
 
 
-def test_a_sensor_that_does_not_tell_its_mid_range_is_refused(known) -> None:
-    with pytest.raises(InstrumentError, match="which reading is the middle of its range"):
+def test_a_sensor_that_states_no_mid_range_is_refused(known) -> None:
+    with pytest.raises(InstrumentError, match="states the middle of its range"):
         CompensatedSensor(object(), known)
+
+
+def of_sensor(known: InclinationCalibration, serial: str) -> InclinationCalibration:
+    return InclinationCalibration(known.dataset.assign_attrs(serial_number=serial))
+
+
+def numbered(serial: str) -> KeyenceLK:
+    return KeyenceLK("sim://cframe/lk?seed=3&readings=5", LKSettings(serial_number=serial))
+
+
+def test_a_calibration_of_the_same_sensor_is_used_without_a_note(known) -> None:
+    with numbered("H17") as sensor:
+        assert CompensatedSensor(sensor, of_sensor(known, "H17")).notes == ()
+
+
+def test_a_calibration_of_another_serial_number_is_refused_unless_allowed(known) -> None:
+    other = of_sensor(known, "H16")
+    with numbered("H17") as sensor:
+        with pytest.raises(DatasetError, match=r"serial number H16; the sensor in use has H17\. .*allow_other_sensor"):
+            CompensatedSensor(sensor, other)
+        allowed = CompensatedSensor(sensor, other, allow_other_sensor=True)
+        assert "H16" in allowed.notes[0]
+        assert float(allowed.read(STEEP, 0.0).value) == float(
+            CompensatedSensor(sensor, of_sensor(known, "H17")).read(STEEP, 0.0).value
+        )
+
+
+def test_a_calibration_of_another_mid_range_is_refused(known) -> None:
+    serial = "4711"
+    with opto() as sensor, pytest.raises(DatasetError, match=rf"mid range is 0 mm; .*calibrated: {serial}\) is 10 mm"):
+        CompensatedSensor(sensor, of_sensor(known, serial), allow_other_sensor=False)
+
+
+def test_a_serial_number_that_is_missing_is_noted(known) -> None:
+    with numbered("H17") as sensor:
+        assert "holds no serial number" in CompensatedSensor(sensor, known).notes[0]
+    with numbered("") as sensor:
+        assert "The sensor reports no serial number" in CompensatedSensor(sensor, of_sensor(known, "H17")).notes[0]

@@ -9,7 +9,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_emscon import EmSconSettings, LeicaEmScon
 from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError
-from errormotion.instruments.simulators.tracker_scene import refraction_index
+from errormotion.instruments.simulators.virtual_world.tracker_scene import refraction_index
 from errormotion.plugins.readings import Environment
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 

@@ -14,7 +14,7 @@ import pytest
 from errormotion.errors import InstrumentError
 from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_emscon import EmSconSettings, LeicaEmScon
-from errormotion.instruments.simulators.leica_emscon import SimulatedEmScon
+from errormotion.instruments.simulators.laser_tracker.leica_emscon import SimulatedEmScon
 from errormotion.instruments.transports import parse_address
 
 pytest.importorskip("CESAPI", reason="the package CESAPI, another implementation, is not installed")

@@ -81,7 +81,7 @@ def test_a_serial_line_is_only_one() -> None:
 
 
 def test_a_simulated_device_without_such_a_line_is_refused() -> None:
-    simulator = "errormotion.instruments.simulators.dcon:SimulatedDcon"
+    simulator = "errormotion.instruments.simulators.thermometer.dcon:SimulatedDcon"
     with pytest.raises(InstrumentError, match="no line 'data'"):
         open_lines("sim://cframe/thermometer", {"data": 1}, simulator=simulator)
 

@@ -22,11 +22,11 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.modbus import SimulatedModbus
+from errormotion.instruments.simulators.thermometer.modbus import SimulatedModbus
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.instruments.thermometer.registers import ModbusSettings, encode_number
 from errormotion.instruments.transports import parse_address
-from errormotion.instruments.transports.modbus_codec import ModbusRefusal
+from errormotion.instruments.transports.modbus.codec import ModbusRefusal
 
 LOGGER = "sim://cframe/logger?seed=3&map=logger-16"
 # long enough for the pauses of a garbage collection (0.3 s on a slow computer), during which no simulator answers

@@ -9,7 +9,7 @@ import pytest
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.virtual_world import VirtualWorld
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFrame, FrameSettings
 from errormotion.twin import Event, VirtualMachine
 

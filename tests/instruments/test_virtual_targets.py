@@ -7,7 +7,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.virtual_world import VirtualWorld
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.methods.beam_direction import simulation
 from errormotion.twin.planes import Plane
 from errormotion.twin.point_sensor import PointSensor

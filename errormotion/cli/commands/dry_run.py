@@ -32,7 +32,7 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
     plan = load_campaign(campaign)
     found_tests: list[dict[str, Any]] = []
     for test in plan.tests:
-        steps = steps_of(test.method, test.settings, plan.bench.settings_by_kind)
+        steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
         if steps is None:
             found_tests.append({"test": test.name, "motions": None})
             continue
@@ -65,7 +65,7 @@ def _text(name: str, found: Extent, limits: Limits) -> str:
     speed = "-" if limits.spindle_speed is None else f"{limits.spindle_speed:.0f}"
     rows.append(["feed/(mm/min)", f"up to {found.feed * MM * MINUTE:.0f}", feed])
     rows.append(["spindle/(1/min)", f"up to {found.spindle_speed:.0f}", speed])
-    head = f"{name}: {_duration(found.seconds)}, {found.moves} moves over {found.way:.1f} m, {found.touches} touches"
+    head = f"{name}: {_duration(found.seconds)}, {found.moves} moves over {found.path:.1f} m, {found.touches} touches"
     return "\n".join([head, table(["", "planned", "limits"], rows)])
 
 

@@ -33,7 +33,7 @@ def write(campaign: Path, test: str | None, out: Path, as_json: bool) -> None:
     files: list[tuple[str, Path, str]] = []
     for entry in with_programs:
         folder = out / entry.name if len(with_programs) > 1 else out
-        texts = entry.method().programs(entry.settings, plan.bench.settings_by_kind)
+        texts = entry.method().programs(entry.settings, plan.bench.chosen(entry.instruments).settings_by_kind)
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(

@@ -26,6 +26,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.tilt_support import Hole, TiltSupport
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.folders import folders_beside
@@ -224,6 +225,33 @@ class InclinationCalibration:
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the calibration to a NetCDF file, whole or not at all."""
         return save(self.dataset, path, overwrite=overwrite)
+
+    @property
+    def serial_number(self) -> str:
+        """Serial number of the calibrated sensor; empty where the file does not hold it."""
+        return owner.serial_number(self.dataset.attrs, "point_lds")
+
+    def require_sensor(self, serial_number: str, mid_range: float, *, allow_other_sensor: bool = False) -> list[str]:
+        """Return notes on the use with a sensor; see `owner.compare`.
+
+        Parameters
+        ----------
+        serial_number : str
+            Of the sensor that measures; empty where unknown.
+        mid_range : float
+            Of its readings, m.
+        allow_other_sensor : bool
+            Whether another sensor is noted instead of refused.
+
+        Raises
+        ------
+        DatasetError
+            The calibration belongs to a sensor with another serial number or another mid range.
+        """
+        mid_ranges = self.mid_range, mid_range
+        return owner.compare(
+            self.name, self.serial_number, serial_number, mid_ranges=mid_ranges, allow_other_sensor=allow_other_sensor
+        )
 
     @property
     def order(self) -> int:

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset
@@ -103,6 +104,11 @@ class PretravelMap:
                 return cls(dataset.load())
             except DatasetError as error:
                 raise DatasetError(f"{path}: the map breaks its schema ({SCHEMA}):", error.violations) from error
+
+    @property
+    def serial_number(self) -> str:
+        """Serial number of the calibrated probe; empty where the file does not hold it."""
+        return owner.serial_number(self.dataset.attrs, "touch_probe")
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the map to a NetCDF file, whole or not at all."""

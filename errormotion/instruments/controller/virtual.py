@@ -16,7 +16,7 @@ from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 
 LINE_END = b"\n"
 
@@ -89,11 +89,18 @@ class VirtualController(Driver):
         kind="controller",
         summary="Controller of the virtual machine: tool, spindle, touch probe, compensation, step and NC programs",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+        simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
     settings: ControllerSettings
     _number = 0
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of the machine show when it moves, not when it is read.
+        harmless = ("split", "alarm", "estop", "no_trip", "tripped")
+        return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
     def identify(self) -> Identity:
         """Ask the controller who it is."""

@@ -1,39 +1,26 @@
-"""Readings of a point sensor with its inclination error taken off, the raw ones beside them."""
+"""Readings of a point sensor compensated for its inclination error, with the raw readings."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.datasets.calibrations.owner import known
 from errormotion.errors import InstrumentError
 from errormotion.plugins import Samples
 
 if TYPE_CHECKING:
     from errormotion.datasets.calibrations.inclination import Compensated, InclinationCalibration
+    from errormotion.plugins.kinds import PointLDS
 
 Array = np.ndarray[Any, Any]
 
-
-class PointSensor(Protocol):
-    """What every driver of the kind ``point_lds`` offers beyond an instrument."""
-
-    @property
-    def measuring_range(self) -> tuple[float, float]:
-        """Lowest and highest reading, m."""
-
-    @property
-    def mid_range(self) -> float:
-        """The reading in the middle of the range, m: there the tilt of a surface does nothing."""
-
-    def read(self) -> float:
-        """Return one reading now, m along the beam, more for what is further away; NaN where there is none."""
-
-    def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of readings."""
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,37 +43,54 @@ class CompensatedSamples(Samples):
 
 
 class CompensatedSensor:
-    """Any point sensor together with the calibration of its inclination error.
+    """A point sensor together with the calibration of its inclination error.
 
-    It opens and closes nothing: the sensor is used as it is.
+    The sensor is open, and is neither opened nor closed here.
 
     Parameters
     ----------
-    sensor : PointSensor
-        A driver of the kind ``point_lds``.
+    sensor : PointLDS
+        A sensor that streams, open.
     calibration : path, name or InclinationCalibration
         Looked for as `InclinationCalibration.find` does.
     extrapolate : bool
-        Whether to go beyond what was calibrated; refused else.
+        Whether tilts and depths beyond the calibrated ones are compensated; refused otherwise.
+    allow_other_sensor : bool
+        Whether a calibration of another sensor, by its serial number or mid range, is used; refused otherwise.
+
+    Attributes
+    ----------
+    notes : tuple of str
+        What could not be checked, and what was allowed.
 
     Raises
     ------
     InstrumentError
-        The sensor does not say where the middle of its range is.
+        The sensor does not state the middle of its range, or is not open.
     DatasetError
-        No such calibration.
+        No such calibration, or one that belongs to another sensor.
     """
 
     def __init__(
-        self, sensor: PointSensor, calibration: str | Path | InclinationCalibration, *, extrapolate: bool = False
+        self,
+        sensor: PointLDS,
+        calibration: str | Path | InclinationCalibration,
+        *,
+        extrapolate: bool = False,
+        allow_other_sensor: bool = False,
     ) -> None:
         if not hasattr(sensor, "mid_range"):
             raise InstrumentError(
-                f"Expected a point sensor that says which reading is the middle of its range; found {sensor!r}"
+                f"Expected a point sensor that states the middle of its range (mid_range); found {sensor!r}"
             )
         self.sensor = sensor
         self.calibration = _found(calibration)
         self.extrapolate = extrapolate
+        serial = known(sensor.identify().serial_number)
+        found = self.calibration.require_sensor(serial, sensor.mid_range, allow_other_sensor=allow_other_sensor)
+        self.notes = tuple(found)
+        for note in found:
+            log.warning(note)
 
     def read(self, inclination: float, rotation: float) -> Compensated:
         """Return one reading of a surface that lies so to the beam: ``value`` and ``raw`` (), m.
@@ -109,7 +113,7 @@ class CompensatedSensor:
 
     def stream(self, inclination: float, rotation: float, block: int | None = None) -> Iterator[CompensatedSamples]:
         """Yield blocks of readings of a surface that lies so to the beam, until the caller stops; see `read`."""
-        for samples in self.sensor.stream(block):
+        for samples in self.sensor.stream(block):  # type: ignore[attr-defined]
             known = {field.name: getattr(samples, field.name) for field in fields(Samples)}
             found = self._compensate(samples.values, inclination, rotation)
             yield CompensatedSamples(

@@ -13,19 +13,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from errormotion.instruments.simulators.virtual_world import VirtualWorld
+    from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 
 def world(machine: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
     """Return the world of a machine and seed; made when it is not there yet."""
-    from errormotion.instruments.simulators.virtual_world import world as find
+    from errormotion.instruments.simulators.virtual_world.world import world as find
 
     return find(machine, seed, warm=warm)
 
 
 def reset() -> None:
     """End all worlds of this process and their threads."""
-    from errormotion.instruments.simulators.virtual_world import reset as end_all
+    from errormotion.instruments.simulators.virtual_world.world import reset as end_all
 
     end_all()
 

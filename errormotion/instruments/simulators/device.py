@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_bytes
-from errormotion.instruments.simulators.virtual_world import world
+from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import make_server
 

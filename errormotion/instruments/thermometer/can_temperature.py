@@ -25,7 +25,7 @@ from errormotion.instruments.thermometer.cia404 import (
     to_celsius,
 )
 from errormotion.instruments.thermometer.sensors import NO_ANSWER, Thermometer, ThermometerSettings
-from errormotion.instruments.transports.can import CanNode, SdoRefusal, open_can
+from errormotion.instruments.transports.can.bus import CanNode, SdoRefusal, open_can
 from errormotion.plugins import Identity, InstrumentInfo
 
 #: SDO abort codes of an input that has no value just now: hardware error, device state, no data.
@@ -81,7 +81,7 @@ class CanTemperature(Thermometer):
         kind="thermometer",
         summary="CANopen thermometers after CiA 404: values, units and states of inputs by SDO",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.canopen_node:SimulatedCanopen",
+        simulator="errormotion.instruments.simulators.thermometer.canopen_node:SimulatedCanopen",
     )
     Settings: ClassVar[type[CanSettings]] = CanSettings
     settings: CanSettings

@@ -107,7 +107,7 @@ class DconTemperature(Thermometer):
         kind="thermometer",
         summary="Thermocouple module with the DCON protocol (ADAM-4018, I-7018), RS-485 or TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.dcon:SimulatedDcon",
+        simulator="errormotion.instruments.simulators.thermometer.dcon:SimulatedDcon",
     )
     Settings: ClassVar[type[DconSettings]] = DconSettings
     settings: DconSettings

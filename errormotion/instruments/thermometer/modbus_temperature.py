@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings
 from errormotion.instruments.thermometer.sensors import Thermometer
-from errormotion.instruments.transports.modbus import ModbusLine, open_modbus
+from errormotion.instruments.transports.modbus.client import ModbusLine, open_modbus
 from errormotion.plugins import Identity, InstrumentInfo
 
 
@@ -28,7 +28,7 @@ class ModbusTemperature(Thermometer):
         kind="thermometer",
         summary="Temperatures in Modbus registers (ADAM-6018, 16-channel loggers, any map): TCP, RTU, RTU over TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.modbus:SimulatedModbus",
+        simulator="errormotion.instruments.simulators.thermometer.modbus:SimulatedModbus",
     )
     Settings: ClassVar[type[ModbusSettings]] = ModbusSettings
     settings: ModbusSettings

@@ -26,7 +26,7 @@ from errormotion.instruments.touch_probe.touching import (
     StuckError,
     Toucher,
 )
-from errormotion.plugins import Contact, Identity, InstrumentInfo, Touch
+from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _SAME = 1e-9  # m
 _ROUNDS_AT_MOST = 1e-6  # m
@@ -84,9 +84,16 @@ class ControllerProbe:
         kind="touch_probe",
         summary="Touch probe that a controller moves and hears, with slow repeats and wrong triggers found",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.controller:SimulatedController",
+        simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerProbeSettings]] = ControllerProbeSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of the machine show when it moves, not when it is read.
+        harmless = ("split", "alarm", "estop", "no_trip", "tripped")
+        return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
     def __init__(
         self, address: str, settings: ControllerProbeSettings | None = None, *, record: Path | None = None

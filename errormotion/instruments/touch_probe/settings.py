@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,11 +11,14 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from errormotion.datasets.calibrations.owner import compare
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.folders import folders_beside
 from errormotion.datasets.units import Length
 from errormotion.errors import InstrumentError
 from errormotion.plugins import Contact, PluginSettings, Touch
+
+log = logging.getLogger(__name__)
 
 
 class ProbeSettings(PluginSettings):
@@ -25,6 +29,10 @@ class ProbeSettings(PluginSettings):
         default=None, description="standard deviation of one touch; unknown if not given", gt=0
     )
     pretravel: str = Field(default="", description="file of the pre-travel map that corrects the contacts")
+    serial_number: str = Field(default="", description="serial number of the probe; unknown if not given")
+    allow_other_sensor: bool = Field(
+        default=False, description="use the pre-travel map of a probe with another serial number"
+    )
 
     @property
     def touch_noise(self) -> float:
@@ -37,12 +45,16 @@ class ProbeSettings(PluginSettings):
         Raises
         ------
         DatasetError
-            There is no such file, or it is no map.
+            There is no such file, it is no map, or it belongs to a probe with another serial number.
         """
         if not self.pretravel:
             return None
         places = [base / self.pretravel for base in (*folders_beside(), Path.cwd())]
-        return PretravelMap.load(next((place for place in places if place.exists()), Path(self.pretravel)))
+        found = PretravelMap.load(next((place for place in places if place.exists()), Path(self.pretravel)))
+        allowed = self.allow_other_sensor
+        for note in compare(self.pretravel, found.serial_number, self.serial_number, allow_other_sensor=allowed):
+            log.warning(note)
+        return found
 
 
 def _normals(touches: Sequence[Touch]) -> list[tuple[float, ...]]:

@@ -36,6 +36,8 @@ _POINT_SENSOR = (
     Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
 )
 
+_ALIASES = {"reading": "distance", "x": "stage_x", "y": "stage_y", "z": "stage_z"}
+
 RAW_SCHEMAS = (
     RawSchema(
         SCHEMA,
@@ -79,6 +81,7 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
+        aliases=_ALIASES,
     ),
     RawSchema(
         SCHEMA,
@@ -96,6 +99,7 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
+        aliases=_ALIASES,
     ),
     RawSchema(
         INCLINATION_SCHEMA,

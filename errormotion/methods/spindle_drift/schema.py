@@ -86,6 +86,7 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
         labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
+        aliases={"reading": "distance"},
     ),
     RawSchema(
         SCHEMA,
@@ -101,6 +102,7 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5},
         labels={**XYZ, "channel": CHANNELS},
+        aliases={"reading": "distance"},
     ),
     RawSchema(
         SCHEMA,
@@ -127,5 +129,6 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5},
         labels={**XYZ, "channel": CHANNELS},
+        aliases={"reading": "distance"},
     ),
 )

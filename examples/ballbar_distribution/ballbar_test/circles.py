@@ -15,9 +15,9 @@ REFERENCE_TEMPERATURE = 20.0  # degC
 class Circles:
     """Readings in the order of ``DIRECTIONS``, (2, run, sample), SI.
 
-    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where no times
-    are known. ``expansion`` is the effect of the bar's temperature on its length (2, run), ``shared`` that of one
-    standard uncertainty of sources that all readings share: name to (2, run).
+    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where it is
+    not given. ``expansion`` is the effect of the bar's temperature on its length, (2, run), ``shared`` that of one
+    standard uncertainty of each source that all readings share.
     """
 
     length: np.ndarray
@@ -60,8 +60,8 @@ def read(raw, notes):
     length, angle = over_readings("length"), over_readings("angle")
     length[~np.isfinite(angle)] = np.nan
     time = None
-    if "time" in raw:
-        time = over_readings("time")
+    if "reading_time" in raw:
+        time = over_readings("reading_time")
         length[~np.isfinite(time)] = np.nan
     if not np.isfinite(length).any(axis=(1, 2)).all():
         raise MethodError("length: expected readings in both directions of travel; found one or both without any")
@@ -124,7 +124,5 @@ def _temperature(raw, radius, shape, notes):
     coefficient = float(raw["expansion"])
     return coefficient * radius * excess, {
         "expansion coefficient of the bar": radius * excess * _scalar(raw, "expansion_uncertainty", 0.0),
-        "temperature of the bar": np.full(
-            shape, coefficient * radius * _scalar(raw, "temperature_uncertainty", 0.0)
-        ),
+        "temperature of the bar": np.full(shape, coefficient * radius * _scalar(raw, "temperature_uncertainty", 0.0)),
     }

@@ -98,9 +98,7 @@ def average(circles, residual, model, settings, notes):
         u = np.where(count > 0, noise / np.sqrt(count), np.nan).reshape(2, places)
     value = mean(r).reshape(2, places) + model
     check_gaps(count.reshape(2, places), settings)
-    return Sectors(
-        value, u, count.reshape(2, places), shared, noise, slope if spread else np.nan, drift_u
-    )
+    return Sectors(value, u, count.reshape(2, places), shared, noise, slope if spread else np.nan, drift_u)
 
 
 def _determined(since, time, spread):
@@ -153,12 +151,13 @@ def check_gaps(count, settings):
 
 
 def first_model(circles, deviation, decay):
-    """Return the model of the path by a fit to single readings: at the readings (2, run, sample), and its parameters."""
+    """Return the model of the path by a fit to single readings: its values there, and circle with parameters, (12,)."""
     known = np.isfinite(deviation)
     angle, sense = circles.angle[known], circles.sense[known]
     design = np.hstack([circle(angle), basis(angle, sense, circles.radius, circles.feed, decay)])
-    scale = np.linalg.norm(design, axis=0)
-    found = np.linalg.lstsq(design / scale, deviation[known], rcond=1e-9)[0] / scale
+    normal = design.T @ design
+    scale = np.sqrt(np.diagonal(normal))
+    found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12) @ (design.T @ deviation[known] / scale) / scale
     at_readings = np.full(deviation.shape, np.nan)
     at_readings[known] = design @ found
     return at_readings, found
@@ -166,7 +165,9 @@ def first_model(circles, deviation, decay):
 
 def sector_design(circles, settings):
     """Return the means over sectors of circle and parameters, (2, place, 3 + 9)."""
-    angle = np.broadcast_to(sector_angles(settings.places), (2, settings.places, sector_angles(settings.places).shape[1]))
+    angle = np.broadcast_to(
+        sector_angles(settings.places), (2, settings.places, sector_angles(settings.places).shape[1])
+    )
     sense = np.array([1.0, -1.0])[:, None, None]
     path = basis(angle, np.broadcast_to(sense, angle.shape), circles.radius, circles.feed, settings.spike_decay)
     return np.concatenate([circle(angle), path], axis=-1).mean(axis=2)

@@ -5,15 +5,19 @@ calibration error, an expansion, a drift of its transducer and noise. Lengths ar
 the linear model of the evaluation.
 """
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 
-from ballbar_test import extremes
+from ballbar_test import circles, extremes, result
 from ballbar_test.path import SENSES, sector_angles, since_reversal
+from ballbar_test.schema import READINGS, SCHEMA
+from errormotion.datasets import provenance
 
-RAW = "errormotion.raw.ballbar/1"
+MISSING = 0.002
+"""Share of readings that are missing."""
 EXPANSION, EXPANSION_U, TEMPERATURE_U = 11.5e-6, 1e-6, 0.05  # 1/K, 1/K, K
 
 
@@ -71,17 +75,33 @@ def draw_machine(settings, rng):
     )
 
 
-def simulate(settings, seed, machine=None, missing=0.002):
-    """Return ``(raw, truth)`` of one seed; ``truth`` holds deviation (2, place), parameters and figures."""
+def simulate(settings, seed, machine=None):
+    """Return ``(raw, truth)`` of one seed: a raw dataset, and the true deviations as an error dataset."""
     rng = np.random.default_rng(seed)
     machine = machine or draw_machine(settings, rng)
-    raw = measure(settings, machine, rng, missing)
+    raw = measure(settings, machine, rng, missing=MISSING)
+    return raw, truth(settings, machine, seed)
+
+
+def truth(settings, machine, seed):
+    """Return the true deviations, parameters and figures as an error dataset without uncertainty."""
     deviation = machine.deviation(settings)
-    return raw, {
-        "deviation": deviation,
-        "parameters": machine.parameters,
-        "figures": extremes.evaluate(deviation),
-    }
+    parameters = machine.parameters
+    return result.build(
+        deviation,
+        np.zeros_like(deviation),
+        circles.read(raw_dataset(settings, *np.ones((3, 2, 1, 1)), np.full((2, 1), 20.0)), []),
+        shared={},
+        parameters=parameters,
+        covariance=np.zeros((len(parameters),) * 2),
+        figures=result.exact(extremes.evaluate(deviation)),
+        machine="virtual machine",
+        frame="machine",
+        reference=result.REFERENCE,
+        method="simulation",
+        method_version="1",
+        provenance=provenance.make(settings, None, None, seed=seed),
+    )
 
 
 def measure(settings, machine, rng, missing=0.0):
@@ -109,7 +129,7 @@ def measure(settings, machine, rng, missing=0.0):
 
 def raw_dataset(settings, length, angle, time, temperature):
     """Return readings and the constants of a test as a raw dataset."""
-    over = ("direction_of_travel", "run", "sample")
+    over = READINGS
     unit = np.eye(3)[["xyz".index(name.lower()) for name in settings.plane]]
 
     def number(value, units):
@@ -119,7 +139,7 @@ def raw_dataset(settings, length, angle, time, temperature):
         {
             "length": (over, length, {"units": "m"}),
             "angle": (over, angle, {"units": "rad"}),
-            "time": (over, time, {"units": "s"}),
+            "reading_time": (over, time, {"units": "s"}),
             "temperature": (over[:2], temperature, {"units": "degC"}),
             "nominal_radius": number(settings.nominal_radius, "m"),
             "feed": number(settings.feed, "m/s"),
@@ -137,5 +157,10 @@ def raw_dataset(settings, length, angle, time, temperature):
             "direction": list("xyz"),
             "axis": list(settings.plane),
         },
-        attrs={"schema": RAW, "machine": "virtual machine", "frame": "machine"},
+        attrs={
+            "schema": SCHEMA,
+            "machine": "virtual machine",
+            "frame": "machine",
+            "instruments": json.dumps([{"name": "ballbar", "kind": "ballbar", "identity": {"simulated": True}}]),
+        },
     )

@@ -1,5 +1,7 @@
 """From readings on planes to an error dataset of the beam."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -132,6 +134,33 @@ def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration
     assert changed.told()["hash"] != told["hash"]
     assert renamed.told()["hash"] == told["hash"]
     assert "calibration" not in provenance.of(identify(raw))
+
+
+def by(serial, kind="point_lds"):
+    """The attribute with which a campaign states its instruments."""
+    return {"instruments": json.dumps([{"kind": kind, "identity": {"serial_number": serial}}])}
+
+
+def test_calibration_of_another_sensor_is_refused_with_both_serial_numbers(machine, tmp_path):
+    readings = machine.raw_inclination(np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0)
+    path = str(calibrate(readings.assign_attrs(by("S1"))).save(tmp_path / "s1.nc"))
+    raw = machine.raw_beam_direction(FOUR, seed=0)
+    same = identify(raw.assign_attrs(by("S1")), compensation=path)
+    assert "serial number" not in notes(same)
+    with pytest.raises(DatasetError, match=r"'s1': .*serial number S1; the sensor in use has S2"):
+        identify(raw.assign_attrs(by("S2")), compensation=path)
+    other = identify(raw.assign_attrs(by("S2")), compensation=path, allow_other_sensor=True)
+    assert "serial number S1; the sensor in use has S2" in notes(other)
+    np.testing.assert_array_equal(other["beam_direction"], same["beam_direction"])
+    unknown = identify(raw.assign_attrs(by("T1", kind="thermometer")), compensation=path)
+    assert "The sensor reports no serial number" in notes(unknown)
+    with pytest.raises(DatasetError, match=r"its mid range is 0 mm; .* is 1 mm"):
+        identify(raw.assign_attrs(by("S1")).assign(mid_range=((), 1e-3, {"units": "m"})), compensation=path)
+
+
+def test_calibration_without_a_serial_number_is_used_with_a_note(machine, calibration):
+    raw = machine.raw_beam_direction(FOUR, seed=0).assign_attrs(by("S2"))
+    assert "'sensor' holds no serial number" in notes(identify(raw, compensation=calibration))
 
 
 def test_calibration_is_part_of_the_uncertainty(machine, calibration):

@@ -244,7 +244,12 @@ def test_the_same_readings_make_the_same_calibration_and_say_where_they_come_fro
     first, second = calibrate(raw), calibrate(raw)
     assert first.dataset.identical(second.dataset)
     assert provenance.of(first.dataset)["raw"]["hash"] == hash_dataset(raw)
-    assert provenance.of(first.dataset)["settings"] == {"order": None, "mirror": None, "offsets": "auto"}
+    assert provenance.of(first.dataset)["settings"] == {
+        "order": None,
+        "mirror": None,
+        "offsets": "auto",
+        "serial_number": "",
+    }
 
 
 def test_order_and_symmetry_may_be_given() -> None:

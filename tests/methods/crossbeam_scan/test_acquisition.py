@@ -17,7 +17,7 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles
 from errormotion.instruments.simulators import world
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition import moving
 from errormotion.methods.crossbeam_scan.acquisition.scans import HAND_OVER_LINES, expected_lines, record_scans
 from errormotion.methods.crossbeam_scan.acquisition.schedule import schedule

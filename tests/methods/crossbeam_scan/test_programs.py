@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass, warm_up_piece
 from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
 from errormotion.methods.crossbeam_scan.settings import Settings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.instruments.simulators.nc_program import interpret
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
 from errormotion.methods.crossbeam_scan.acquisition.schedule import PAUSE, scan_times, schedule
 from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings

@@ -11,9 +11,9 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.methods.multilateration import Multilateration, simulation
-from errormotion.methods.multilateration.report.view import enlargement, network, thinned
+from errormotion.methods.multilateration.report.view import network, thinned
 from errormotion.report import write_report
-from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw
+from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
 from errormotion.twin import VirtualMachine
 
 UM = 1e-6

@@ -39,10 +39,10 @@ class LinuxCNC(Driver):
         kind="controller",
         summary="Machines under LinuxCNC 2.9, through a bridge beside it: state, moves, probing, spindle, NC programs",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.linuxcnc:SimulatedLinuxCNC",
+        simulator="errormotion.instruments.simulators.controller.linuxcnc:SimulatedLinuxCNC",
     )
     Settings: ClassVar[type[LinuxCNCSettings]] = LinuxCNCSettings
-    doctor = lazy("errormotion.instruments.simulators.linuxcnc_process:DOCTOR")
+    doctor = lazy("errormotion.instruments.simulators.controller.linuxcnc_process:DOCTOR")
     settings: LinuxCNCSettings
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:

@@ -21,8 +21,8 @@ from errormotion.instruments.controller.mtconnect.codec import (
 )
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.transports.http import HttpTransport
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.instruments.transports.http.client import HttpTransport
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 OUT_OF_RANGE = "OUT_OF_RANGE"
 _MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
@@ -76,10 +76,17 @@ class MTConnect(Driver):
         kind="controller",
         summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.mtconnect:SimulatedAgent",
+        simulator="errormotion.instruments.simulators.controller.mtconnect:SimulatedAgent",
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
     settings: MTConnectSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of observations do not affect the state, in which an alarm is a word.
+        harmless = ("split", "overrun", "jump", "restart", "alarm")
+        return InstrumentSubject(cls, "sim://cframe/mtconnect", harmless=harmless)
 
     def __init__(self, address: str, settings: MTConnectSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)

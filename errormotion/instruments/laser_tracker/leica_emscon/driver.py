@@ -47,7 +47,7 @@ class LeicaEmScon(Driver):
         kind="laser_tracker",
         summary="Leica laser trackers (LT, AT901, AT4xx) behind an emScon server, TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.leica_emscon:SimulatedEmScon",
+        simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
     Settings: ClassVar[type[EmSconSettings]] = EmSconSettings
     settings: EmSconSettings

@@ -69,7 +69,7 @@ class KeyenceLJX(Driver):
         kind="line_profiler",
         summary="Keyence LJ-X8000A laser line profiler, Ethernet, commands and high-speed stream",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.keyence_ljx:SimulatedLJX",
+        simulator="errormotion.instruments.simulators.line_profiler.keyence_ljx:SimulatedLJX",
     )
     Settings: ClassVar[type[LJXSettings]] = LJXSettings
     settings: LJXSettings

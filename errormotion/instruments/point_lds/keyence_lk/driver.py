@@ -67,7 +67,7 @@ class KeyenceLK(Driver):
         kind="point_lds",
         summary="Keyence LK-G/LK-H laser displacement sensor, RS-232C in ASCII",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.keyence_lk:SimulatedKeyenceLK",
+        simulator="errormotion.instruments.simulators.point_lds.keyence_lk:SimulatedKeyenceLK",
     )
     Settings: ClassVar[type[LKSettings]] = LKSettings
     settings: LKSettings
@@ -91,13 +91,13 @@ class KeyenceLK(Driver):
         return 0.0
 
     def identify(self) -> Identity:
-        """Make sure that a controller answers; it does not tell who it is: model and head are those of the settings."""
+        """Check that a controller answers. It reports no identity: model and serial number come from the settings."""
         self._enter(MEASURING)
         settings = self.settings
         return Identity(
             manufacturer="Keyence",
             model=f"{settings.controller} with {settings.head}",
-            serial_number="not told over RS-232C",
+            serial_number=settings.serial_number or "unknown",
             simulated=self.transport.simulated,
             details={"address": self.address, **settings.model_dump(include={"output", "display", "positive"})},
         )

@@ -20,7 +20,8 @@ Unit = Literal["0.01 mm", "0.001 mm", "0.0001 mm", "0.00001 mm", "0.1 um", "0.01
 class LKSettings(PluginSettings):
     """Settings of one sensor head."""
 
-    head: Head = Field(default="LK-H050", description="sensor head; the controller does not tell")
+    head: Head = Field(default="LK-H050", description="sensor head; the controller does not report it")
+    serial_number: str = Field(default="", description="serial number of the head; the controller does not report it")
     controller: Literal["LK-G5000", "LK-G3000"] = Field(default="LK-G5000", description="generation of the controller")
     output: int = Field(default=1, description="output (OUT) of the controller that shows the head", ge=1)
     display: Unit = Field(default="0.0001 mm", description="smallest displayed unit of the controller")

@@ -57,7 +57,7 @@ class OptoNCDT(Driver):
         kind="point_lds",
         summary="Micro-Epsilon optoNCDT 1420/2300 laser triangulation sensor, RS422 or TCP",
         status="simulated_only",
-        simulator="errormotion.instruments.simulators.optoncdt:SimulatedOptoNCDT",
+        simulator="errormotion.instruments.simulators.point_lds.optoncdt:SimulatedOptoNCDT",
     )
     Settings: ClassVar[type[OptoSettings]] = OptoSettings
     settings: OptoSettings

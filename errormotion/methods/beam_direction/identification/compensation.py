@@ -87,12 +87,15 @@ class Sensor:
         Standard uncertainty of that normal's angle about the beam, rad.
     mid_range : float
         Reading at which the inclination error vanishes, m.
+    notes : tuple of str
+        What could not be checked of the calibration, and what was allowed.
     """
 
     calibration: InclinationCalibration
     triangulation_normal: Array
     normal_uncertainty: float
     mid_range: float
+    notes: tuple[str, ...] = ()
 
     def slopes(self, beam: Array, normals: Array) -> Array:
         """Return the slopes (k,) of the inclination error on planes with normals (k, 3)."""

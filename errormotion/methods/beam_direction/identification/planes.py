@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy.special import gammaincinv, ndtri
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, tilt_text
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
@@ -66,6 +67,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         settled = plain
         notes.append("No inclination compensation: the readings are taken as they are.")
     else:
+        notes += sensor.notes
         settled = settle(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
     corrected = _corrected(data, settled, sensor, settings, notes)
     origin = locate(settled.direction, settled.planes.offsets, settled.planes.covariances, data.points,
@@ -117,14 +119,14 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
 
 
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
-    """Return what the compensation has to know; None where nothing is to be compensated.
+    """Return what the compensation needs; None without a compensation.
 
     Raises
     ------
     MethodError
         The data do not say how the sensor is turned.
     DatasetError
-        No such calibration.
+        No such calibration, or one that belongs to another sensor.
     """
     if settings.compensation is None:
         return None
@@ -136,12 +138,20 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
         )
     t = np.asarray(raw["triangulation_normal"].values, np.float64)
     name = "triangulation_normal_uncertainty"
+    mid_range = float(raw["mid_range"]) if "mid_range" in raw else calibration.mid_range
+    serial, allowed = owner.serial_number(raw.attrs, "point_lds"), settings.allow_other_sensor
+    notes = calibration.require_sensor(serial, mid_range, allow_other_sensor=allowed)
     return Sensor(
         calibration,
         t / np.linalg.norm(t),
         float(raw[name]) if name in raw else settings.triangulation_normal_uncertainty,
-        float(raw["mid_range"]) if "mid_range" in raw else calibration.mid_range,
+        mid_range,
+        tuple(notes),
     )
+
+
+def _chi2_quantile(p: float, degrees: int) -> float:
+    return 2.0 * float(gammaincinv(degrees / 2, p))
 
 
 def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, notes: list[str]) -> float:
@@ -156,7 +166,7 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
         return 1.0
     chi2 = float(sum(w @ w for w in used))
     factor = 1.0
-    low, high = (float(stats.chi2.ppf(p, freedom)) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
+    low, high = (_chi2_quantile(p, freedom) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
     times = float(np.sqrt(chi2 / freedom))
     if chi2 > high:
         raised = settings.noise == "auto"
@@ -167,7 +177,7 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
         notes.append(f"The readings scatter only {times:.3g} times as much as stated; the stated noise was kept.")
     pairs = sum(float(w[1:] @ w[:-1]) for w in used) / (chi2 / sum(len(w) for w in used) or 1.0)
     count = sum(len(w) - 1 for w in used)
-    if pairs / np.sqrt(count) > stats.norm.ppf(1 - FALSE_ALARM):
+    if pairs / np.sqrt(count) > ndtri(1 - FALSE_ALARM):
         notes.append(
             f"Residuals of neighbouring readings resemble each other (correlation {pairs / count:.2f}), so the "
             "uncertainties are too small: speckle that is not stated (speckle, speckle_length), a plane that is not "
@@ -182,7 +192,7 @@ def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: 
     if freedom < 1:
         return 1.0
     chi2 = closure_chi2(found)
-    if chi2 <= stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if chi2 <= _chi2_quantile(1 - FALSE_ALARM, freedom):
         return 1.0
     times = float(np.sqrt(chi2 / freedom))
     cause = (
@@ -237,7 +247,7 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
         notes.append("No plane_point_uncertainty in the data: the known points of the planes were taken as exact.")
     if not np.isfinite(data.nominal_origin).all():
         notes.append("No nominal_origin in the data: the zero point is in beam_origin, its error is unknown.")
-    if known > 3 and origin.chi2 > stats.chi2.ppf(1 - FALSE_ALARM, known - 3):
+    if known > 3 and origin.chi2 > _chi2_quantile(1 - FALSE_ALARM, known - 3):
         worst = int(np.nanargmax(np.abs(origin.misfit)))
         notes.append(
             f"The known points of the planes contradict one another: chi-square {origin.chi2:.4g} with {known - 3} "

@@ -16,7 +16,8 @@ import pytest
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.linuxcnc import LinuxCNC, LinuxCNCSettings
-from errormotion.instruments.simulators import linuxcnc, linuxcnc_process, world
+from errormotion.instruments.simulators import world
+from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
 from errormotion.plugins import Touch
 from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS

@@ -8,9 +8,9 @@ import pytest
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.linuxcnc import BRIDGE, LinuxCNC
-from errormotion.instruments.simulators import linuxcnc_process
-from errormotion.instruments.simulators.linuxcnc_config import hal_text, ini_text, pin_values
-from errormotion.instruments.simulators.linuxcnc_process import LinuxCNCProcess
+from errormotion.instruments.simulators.controller import linuxcnc_process
+from errormotion.instruments.simulators.controller.linuxcnc_config import hal_text, ini_text, pin_values
+from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
 
 
 @pytest.fixture

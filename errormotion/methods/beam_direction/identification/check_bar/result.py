@@ -51,6 +51,8 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         notes.append("No nominal_origin in the data: the centre of the bar counts from the zero point of the beam.")
     if sensor is None:
         notes.append("No inclination compensation: the readings are taken as they are.")
+    else:
+        notes += sensor.notes
     calibration = sensor.calibration if sensor is not None else None
     extras = bar_extras(raw, np.nan_to_num(p0), u0, None, calibration, moves, settings, notes)
     for note in notes:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from errormotion.arrays import Array
 from errormotion.datasets import provenance, validate
+from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, build, half_tilt, hole_texts, terms
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt_vector
@@ -64,6 +65,8 @@ class Settings(BaseModel):
         default="auto", description="whether each setting has a zero of its own, as an interferometer leaves it"
     )
 
+    serial_number: str = Field(default="", description="serial number of the sensor; default: as the readings state it")
+
 
 def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationCalibration:
     """Make a calibration of readings.
@@ -104,11 +107,18 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
         "mirror": int(surface.mirror),
         "free_offsets": int(lines.free_offsets),
         "provenance": json.dumps(provenance.make(settings, raw, None)),
+        **_serial_number(raw, settings),
         **{name: str(raw.attrs[name]) for name in ("machine", "sensor", "source", "title") if name in raw.attrs},
     }
     calibration = InclinationCalibration(build(variables, attrs))
     notes = _notes(calibration, readings, lines, kept, pivot)
     return InclinationCalibration(calibration.dataset.assign_attrs(notes="\n".join(notes)))
+
+
+def _serial_number(raw: xr.Dataset, settings: Settings) -> dict[str, str]:
+    """Return the attribute that states the sensor to which the calibration belongs; empty where it is unknown."""
+    serial = settings.serial_number or owner.serial_number(raw.attrs, "point_lds")
+    return {owner.ATTRIBUTE: serial} if serial else {}
 
 
 def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.bool_], Surface]:
@@ -248,6 +258,8 @@ def _notes(
     different = len(np.unique(np.round(calibration.settings, 6), axis=0))
     if different < _FEW:
         yield f"{different} different tilts: fewer than {_FEW} tell only roughly what lies between them."
+    if not calibration.serial_number:
+        yield "The serial number of the sensor is unknown: the calibration cannot be refused for another sensor."
     yield from _holes(calibration)
 
 

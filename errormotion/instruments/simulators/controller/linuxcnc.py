@@ -1,0 +1,340 @@
+"""A virtual machine under the real LinuxCNC: its bridge hears the driver, its probe sees what the twin has.
+
+The device sits between the driver and the bridge. Before each order it tells HAL where the balls are now: where they
+stand less the error of the tip there, so that the machine trips in its servo thread where the twin would have it trip.
+The world's clock goes on with the real time that the machine moves, and jumps with ``elapse``.
+
+Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
+``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; how long LinuxCNC stays up when the last driver has
+gone; 0 = not at all. It ends with the process anyway), ``wait`` (90 s; for another simulated LinuxCNC on this computer
+to end).
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.controller.linuxcnc import BRIDGE
+from errormotion.instruments.simulators.controller.linuxcnc_config import PINS, hal_text, ini_text, pin_values
+from errormotion.instruments.simulators.controller.linuxcnc_process import LinuxCNCProcess
+from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
+from errormotion.instruments.transports import Address, Transport, open_transport
+
+LINGER = 10.0  # s
+WAIT = 90.0  # s
+FIRST = 5.0  # s that LinuxCNC waits for its first driver, at least
+OWN = "simulator"
+"""What the numbers of requests begin with that the driver knows nothing of."""
+ANSWER = 10.0  # s
+GLANCE = 0.1  # s between two looks whether the device is still wanted
+
+Message = dict[str, Any]
+
+
+class Control:
+    """A running LinuxCNC, the world that it belongs to, and the devices that share it."""
+
+    def __init__(self, world: VirtualWorld, address: Address) -> None:
+        self.world = world
+        self.inch = address.params.get("unit", "mm") == "inch"
+        self.ready = bool(address.number("ready", 1))
+        self.users = 0
+        self.lock = threading.RLock()
+        self._seen: float | None = None  # time of the bridge up to which the world has followed
+        self._moving = False
+        self._speed = 0.0
+        self.process = self._started(address)
+
+    def _started(self, address: Address) -> LinuxCNCProcess:
+        machine, linger = self.world.machine, address.number("linger", LINGER)
+        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, FIRST):g} --pins {PINS}"
+        ini = ini_text(
+            self.world.name,
+            machine.travel,
+            machine.rapid,
+            machine.top_speed,
+            arguments=arguments,
+            inch=self.inch,
+        )
+        files = {"linuxcnc.ini": ini, "balls.hal": hal_text(len(self.world.balls))}
+        return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", WAIT))
+
+    def join(self, world: VirtualWorld) -> None:
+        """Count a device in, and begin anew with another world."""
+        with self.lock:
+            self.users += 1
+            if self.world is not world:
+                self.world, self._seen, self._moving, self._speed = world, None, False, 0.0
+
+    def leave(self, linger: float) -> None:
+        """Count a device out; without lingering LinuxCNC ends with the last one."""
+        with self.lock:
+            self.users -= 1
+            if linger <= 0 and self.users == 0:
+                self.process.end()
+
+    def follow(self, time: float, moving: bool) -> None:
+        """Let the world's clock go on by the time that the machine has moved since the last call."""
+        with self.lock:
+            passed = 0.0 if self._seen is None or not self._moving else time - self._seen
+            self._seen, self._moving = time, moving
+            if passed > 0:
+                with suppress(InstrumentError):  # while sensors stream the clock is theirs
+                    self.world.elapse(passed)
+
+    def turn(self, speed: float) -> None:
+        """Have the twin's spindle turn as the commanded one does."""
+        with self.lock:
+            if speed != self._speed:
+                self._speed = speed
+                self.world.spindle(abs(speed))
+
+    # ------------------------------------------------------------------ the probe
+
+    def balls_for(self, start: list[float], target: list[float] | None, feed: float | None) -> dict[str, float]:
+        """Return the pins that put the balls where they are now.
+
+        On the way from the start to the target the probe trips where the twin says, its scatter and the lobes of its
+        pre-travel included; elsewhere with its mean pre-travel.
+        """
+        world, now = self.world, self.world.time
+        machine, balls = world.machine, world.balls
+        if world.tool != "probe":
+            return {f"{PINS}{ball}.trip.in1": 0.0 for ball in range(len(balls))}
+        centres = balls.centre - machine.probe_error(balls.centre, np.full(len(balls), now))
+        reach = balls.radius + machine.probe.tip_radius - machine.probe.mean
+        if target is not None:
+            contact, way = machine.contact(start, target, now, feed, balls=balls)
+            if contact is not None and way > 0:
+                distance = np.linalg.norm(contact - centres, axis=1)
+                nearest = int(np.argmin(np.abs(distance - reach)))
+                reach[nearest] = distance[nearest]
+        pins: dict[str, float] = {}
+        for ball, (centre, radius) in enumerate(zip(centres.tolist(), reach.tolist(), strict=True)):
+            pins |= pin_values(ball, tuple(centre), radius, inch=self.inch)
+        return pins
+
+
+Key = tuple[str, int, bool, str, float]
+
+_controls: dict[Key, Control] = {}
+_lock = threading.Lock()
+
+
+def _control(world: VirtualWorld, address: Address) -> Control:
+    """Return the running LinuxCNC of a world; one that lingers after a world of the same kind is taken over.
+
+    Raises
+    ------
+    InstrumentError
+        LinuxCNC is not installed, does not start, or runs for another world.
+    """
+    warm, ready = world.machine.sensors_on_for > 0, address.number("ready", 1)
+    key = (world.name, world.seed, warm, address.params.get("unit", "mm"), ready)
+    with _lock:
+        control = _controls.get(key)
+        if control is None or not control.process.running:
+            _end_unused()
+            control = _controls[key] = Control(world, address)
+        control.join(world)
+        return control
+
+
+def _end_unused() -> None:
+    for key, control in list(_controls.items()):
+        if control.users and control.process.running:
+            raise InstrumentError(
+                f"LinuxCNC runs for {key[0]} with seed {key[1]} in this process, and a computer has room for one; "
+                "close that driver first, or give both addresses the same seed and parameters"
+            )
+        control.process.end()
+        del _controls[key]
+
+
+def end() -> None:
+    """End a LinuxCNC that lingers."""
+    with _lock:
+        _end_unused()
+
+
+class SimulatedLinuxCNC(SimulatedDevice):
+    """Hands over what the driver and the bridge of a real LinuxCNC say to one another."""
+
+    faults = ("silence", "split", "garbage", "drop", "disconnect")
+
+    def __init__(self, address: Address) -> None:
+        self._numbers = 0
+        self._then: dict[str, Callable[[Message], None]] = {}
+        self._asked: dict[Any, str] = {}
+        self._closed = False
+        self._trouble = ""  # of a request that the driver knows nothing of
+        super().__init__(address, line_end=b"\n", default_name="linuxcnc")
+        self._linger = address.number("linger", LINGER)
+        try:
+            self._control = _control(self.world, address)
+        except BaseException:
+            super().close()
+            raise
+        try:
+            self._bridge: Transport = open_transport(f"tcp://127.0.0.1:{self._control.process.port}", timeout=ANSWER)
+            if self._control.users == 1 and self._control.ready:
+                self._make_ready()
+        except BaseException:
+            self._control.leave(self._linger)
+            super().close()
+            raise
+        self._pump = threading.Thread(target=self._carry_back, name=f"sim-{self.name}-bridge", daemon=True)
+        self._pump.start()
+
+    def close(self) -> None:
+        """Hang up; LinuxCNC ends a while after the last device has gone. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._pump.join()
+        self._bridge.close()
+        self._control.leave(self._linger)
+        super().close()
+
+    # ------------------------------------------------------------------ to the bridge
+
+    def answer(self, request: bytes) -> bytes:
+        """Not used: answers come from the bridge."""
+        raise NotImplementedError
+
+    def _on_data(self, data: bytes) -> None:
+        self._buffer += data
+        while self._line_end in self._buffer:
+            line, _, self._buffer = self._buffer.partition(self._line_end)
+            try:
+                request = json.loads(line)
+                number, op = request["id"], request["op"]
+            except (ValueError, KeyError, TypeError):
+                self._forward_line(line + b"\n")  # the bridge says what is wrong with it
+                continue
+            self._asked[number] = op
+            if op in ("elapse", "move_to", "probe", "run_program"):
+                self._ask_state(partial(self._prepared, request))
+            else:
+                self._forward(request)
+
+    def _ask_state(self, then: Callable[[Message], None]) -> None:
+        self._numbers += 1
+        number = f"{OWN} {self._numbers}"
+        self._then[number] = then
+        self._forward({"id": number, "op": "state"})
+
+    def _prepared(self, request: Message, state: Message) -> None:
+        """Forward an order for which the state had to be known."""
+        op, start = request["op"], state["commanded_position"]
+        if op == "elapse" and not state["ordered"]:
+            self._jump(request)
+            return
+        if op != "elapse" and not state["ordered"]:
+            self._set_balls(op, start, request)
+        self._forward(request)
+
+    def _jump(self, request: Message) -> None:
+        try:
+            self.world.elapse(float(request.get("seconds", np.nan)))
+        except (InstrumentError, TypeError, ValueError) as error:
+            self._send({"id": request["id"], "ok": False, "error": str(error)})
+        else:
+            self._send({"id": request["id"], "ok": True, "result": None})
+
+    def _set_balls(self, op: str, start: list[float], request: Mapping[str, Any]) -> None:
+        if op == "probe":
+            self.world.tool = "probe"  # it comes by itself when it is needed
+        try:
+            target = request.get("target") if op == "probe" else None
+            pins = self._control.balls_for(start, target, request.get("feed"))
+        except (ValueError, TypeError, ArithmeticError):
+            return  # no place, no feed: the bridge says so
+        self._forward({"id": OWN, "op": "set_pins", "pins": pins})
+
+    def _forward(self, request: Message) -> None:
+        self._forward_line(json.dumps(request).encode() + b"\n")
+
+    def _forward_line(self, line: bytes) -> None:
+        with suppress(InstrumentError):  # the other thread notices, and hangs up
+            self._bridge.write(line)
+
+    # ------------------------------------------------------------------ from the bridge
+
+    def _make_ready(self) -> None:
+        """Leave e-stop, switch on, home, and have the spindle stand, before the driver comes."""
+        self._wait_for("reset")
+        self._wait_for("enable")
+        if not self._wait_for("state")["homed"]:
+            self._wait_for("home")
+        self._wait_for("spindle", speed=0.0)
+
+    def _wait_for(self, op: str, **arguments: Any) -> Any:
+        self._forward({"id": OWN, "op": op, **arguments})
+        while True:
+            message = json.loads(self._bridge.read_until(b"\n"))
+            if "beat" not in message:
+                break
+        if not message["ok"]:
+            raise InstrumentError(f"The simulated LinuxCNC does not {op}: {message['error']}")
+        return message["result"]
+
+    def _carry_back(self) -> None:
+        buffer = b""
+        while not self._closed:
+            try:
+                buffer += self._bridge.read(timeout=GLANCE)
+            except InstrumentTimeoutError:
+                continue
+            except InstrumentError:
+                self._server.hang_up()
+                return
+            *lines, buffer = buffer.split(b"\n")
+            for line in lines:
+                self._carry(json.loads(line))
+
+    def _carry(self, message: Message) -> None:
+        number, result = message["id"], message.get("result")
+        state = result if isinstance(result, dict) and "spindle_commanded" in result else None
+        beating = "beat" in message
+        running = bool(message["running"] if beating else state["running"] if state else False)
+        if beating or state or self._asked.get(number) in ("move_to", "probe", "home"):
+            self._control.follow(message["time"], running)
+        if state:
+            self._control.turn(state["spindle_commanded"])
+        if isinstance(number, str) and number.startswith(OWN):
+            then = self._then.pop(number, None)
+            if then is not None and state:
+                then(state)
+            elif not message["ok"]:
+                self._trouble = str(message["error"])
+            return
+        if self._trouble:
+            message = {"id": number, "ok": False, "error": f"the simulated probe is out of order: {self._trouble}"}
+        if not beating:
+            self._asked.pop(number, None)
+        if isinstance(result, dict):
+            if "time" in result:
+                result["time"] = self.world.time
+            if "serial_number" in result:
+                result["serial_number"] = f"seed {self.world.seed}"
+        self._send(message)
+
+    def _send(self, message: Message) -> None:
+        line = json.dumps(message).encode() + b"\n"
+        if "beat" in message:
+            with self._server.lock:
+                self._server.send(line)
+        else:
+            self.reply(line)
+            if self.fault.kind == "disconnect" and self._answers > self.fault.at:
+                self._bridge.close()  # the bridge is to notice, too

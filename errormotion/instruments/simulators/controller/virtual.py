@@ -1,0 +1,99 @@
+"""The controller of the virtual machine: what it is told, it does to the world."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from errormotion.errors import ErrormotionError
+from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.virtual_world.world import LEAD_IN
+from errormotion.instruments.transports import Address
+from errormotion.twin import Event
+
+MACHINE_FAULTS = ("alarm", "estop", "no_trip", "tripped")
+
+
+class SimulatedController(SimulatedDevice):
+    """Answers requests in JSON lines.
+
+    Further parameters of the address: ``balls`` (how many stand on the table; 4), and of faults, counted in requests:
+    ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or somebody presses the emergency
+    stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or for good, the probe never trips, or
+    is stuck).
+    """
+
+    faults = ("silence", "split", "garbage", "drop", "disconnect", *MACHINE_FAULTS)
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(address, line_end=b"\n", default_name="controller")
+        if "balls" in address.params:
+            self.world.balls = self.world.machine.balls_on_table(int(address.number("balls", 0)))
+
+    def answer(self, request: bytes) -> bytes:
+        """Return the answer to one request."""
+        number: Any = None
+        try:
+            self._befall()
+            message = json.loads(request)
+            number = message.pop("id")
+            reply = {"id": number, "ok": True, "result": self._obey(message.pop("op"), message)}
+        except ErrormotionError as error:
+            reply = {"id": number, "ok": False, "error": str(error)}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            reply = {"id": number, "ok": False, "error": f"this is no request: {error!r}"}
+        return json.dumps(reply).encode() + b"\n"
+
+    def _befall(self) -> None:
+        """Let happen to the machine what is due at this request."""
+        if self.fault.kind == "alarm" and self._answers == self.fault.at:
+            self.world.raise_alarm("servo alarm (simulated)")
+        if self.fault.kind == "estop" and self._answers == self.fault.at:
+            self.world.press_estop()
+        if self.fault.kind in ("no_trip", "tripped"):
+            since = self._answers - self.fault.at
+            broken = since >= 0 and not (self.fault.length and since >= self.fault.length)
+            how: Literal["open", "closed"] = "open" if self.fault.kind == "no_trip" else "closed"
+            self.world.stuck = how if broken else None
+
+    def _obey(self, op: str, arguments: Mapping[str, Any]) -> Any:
+        world = self.world
+        match op:
+            case "identify":
+                return {"manufacturer": "errormotion", "model": world.name, "serial_number": f"seed {world.seed}"}
+            case "state":
+                return world.commanded()
+            case "mount":
+                world.mount(**arguments)
+            case "start":
+                world.start([Event(**event) for event in arguments["schedule"]])
+            case "elapse":
+                world.elapse(**arguments)
+            case "run_steps":
+                program = world.run_steps(**arguments)
+                return {"duration": program.duration, "longest_lead_in": LEAD_IN[1]}
+            case "run_program":
+                path = world.run_program(**arguments)
+                return {"duration": path.duration, "longest_lead_in": LEAD_IN[1]}
+            case "move_to":
+                return {"duration": world.move_to(**arguments)}
+            case "probe":
+                return world.probe(**arguments)
+            case "spindle":
+                world.spindle(**arguments)
+            case "stop":
+                world.stop()
+                if arguments["spindle"]:
+                    world.spindle(0.0)
+            case "estop":
+                world.press_estop()
+            case "reset":
+                world.reset_alarms()
+            case "set_target":
+                world.set_target(**arguments)
+            case "set_station":
+                world.set_station(**arguments)
+            case _:
+                raise ValueError(f"no such operation: {op}")
+        return None

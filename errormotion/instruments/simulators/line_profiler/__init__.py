@@ -1,0 +1,1 @@
+"""Simulated line profilers, and what lies before them."""

@@ -1,0 +1,348 @@
+"""How the axes of a virtual world move: steps of a sphere, NC programs, straight moves, and the touch probe.
+
+The time of a program passes with samples or by waiting. The time of a straight move and of a probing passes at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from errormotion.errors import ErrormotionError, InstrumentError
+from errormotion.instruments.simulators.virtual_world.clock import SampleClock
+from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
+from errormotion.twin import Event, StepProgram
+from errormotion.twin.paths import Path
+
+if TYPE_CHECKING:
+    from errormotion.twin import VirtualMachine
+    from errormotion.twin.balls import Balls
+
+Array = np.ndarray[Any, Any]
+
+TOOLS = ("bar", "sphere", "probe")
+LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: nobody outside knows exactly
+_ROUNDING = 1e-9  # m
+
+
+class Motion(SampleClock):
+    """A clock, and axes that move.
+
+    Attributes
+    ----------
+    tool : str
+        In the spindle. The probe comes by itself when it is needed, and goes when the spindle is to turn.
+    motion : StepProgram or None
+        What steps the sphere.
+    path : Path
+        Of the axes, otherwise.
+    program : str
+        Title of the NC program that was begun last; empty when it was something else.
+    balls : Balls
+        On the table. They are in the way of the probe alone.
+    alarms : list of str
+        Why nothing moves.
+    estop : bool
+        Whether the emergency stop is pressed.
+    stuck : {"open", "closed"} or None
+        A fault of the probe: it never trips, or always.
+    printed : list of (float, str)
+        Lines that NC programs have printed and will print, and when, s.
+    """
+
+    seed: int
+    machine: VirtualMachine
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tool = "bar"
+        self.motion: StepProgram | None = None
+        self.path = Path.resting((0.0, 0.0, 0.0))
+        self.program = ""
+        self.balls: Balls = self.machine.balls
+        self.alarms: list[str] = []
+        self.estop = False
+        self.stuck: Literal["open", "closed"] | None = None
+        self.printed: list[tuple[float, str]] = []
+        self._programs = 0
+        self._program_events: list[Event] = []
+        self._warm_up: float | None = None  # time at which it began
+
+    # ------------------------------------------------------------------ orders
+
+    def mount(self, tool: str) -> None:
+        """Put the bar, the sphere or the touch probe into the spindle."""
+        if tool not in TOOLS:
+            raise InstrumentError(f"The machine has a 'bar' and a 'sphere' to mount, and a 'probe'; found '{tool}'")
+        with self._change:
+            self._refuse_while_streaming("change the tool")
+            self._refuse_in_alarm()
+            self.tool, self.motion = tool, None
+
+    def run_steps(
+        self, start: Sequence[float], direction: Sequence[float], step: float, count: int, dwell: float, travel: float
+    ) -> StepProgram:
+        """Step the sphere along a line; the motion begins a short and unknown time from now."""
+        with self._change:
+            if self.tool != "sphere":
+                raise InstrumentError("Only the sphere is stepped; mount it first")
+            self._refuse_to_move()
+            begin = self._begin_of_motion()
+            self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
+            self.program = ""
+            return self.motion
+
+    def run_program(self, text: str) -> Path:
+        """Run an NC program, see `nc_program`; the motion begins a short and unknown time from now."""
+        with self._change:
+            self._refuse_to_move()
+            place, begin = self.path.place(self.time), self._begin_of_motion()
+            errands = Errands(self, begin)
+            try:
+                path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, errands)
+            except ErrormotionError:
+                errands.undo()
+                self._programs -= 1
+                raise
+            self.motion, self.path = None, path.beginning(begin)
+            self.program, self._program_events = title(text), errands.events
+            self.printed += errands.printed
+            if self._warm_up is None:
+                self._warm_up = self.path.warm_up()
+            return self.path
+
+    def move_to(self, position: Sequence[float], feed: float | None = None) -> float:
+        """Move the axes in a straight line, at a feed in m/s or in rapid; return how long that takes, s.
+
+        The time passes at once, or with the samples while any stream. A probe that trips on the way stops the machine
+        and puts it into alarm.
+        """
+        with self._change:
+            self._refuse_to_move()
+            goal, feed = self._within_travel(position), self._possible_feed(feed)
+            begin, start = self._next_instant(), np.array(self.position())
+            place = self.obstacle(start, goal, begin, feed)
+            if place is not None:
+                self._go(start, place, begin, feed)
+                way = float(np.linalg.norm(place - start))
+                self.raise_alarm(f"the probe has tripped during a move, {way * 1e3:.3f} mm on its way")
+                self._refuse_in_alarm()
+            return self._go(start, goal, begin, feed)
+
+    def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
+        """Move the touch probe in a straight line until it trips, or to the target; the time passes at once.
+
+        Parameters
+        ----------
+        target : (3,)
+            Commanded place of the tip, m.
+        feed : float
+            m/s.
+
+        Returns
+        -------
+        dict
+            ``tripped``, ``position`` (where it has tripped and stands now, m; None) and ``time`` (s).
+
+        Raises
+        ------
+        InstrumentError
+            It is tripped before it moves, the spindle turns, something streams or moves, alarm, out of travel.
+        """
+        with self._change:
+            self._refuse_while_streaming("probe")
+            self._refuse_to_move()
+            goal, feed = self._within_travel(target), self._possible_feed(feed)
+            begin, start = self.time, np.array(self.position())
+            if speed := self.commanded_speed(begin):
+                raise InstrumentError(f"The spindle turns at {speed:g} /min; stop it before the machine probes")
+            if self.stuck == "closed" or not (
+                self.stuck == "open" or self.machine.released(start, begin, balls=self.balls)
+            ):
+                raise InstrumentError("The probe is tripped before it moves; move it off what it touches, or mend it")
+            self.tool = "probe"
+            place = self.trip(start, goal, begin, feed)
+            self._go(start, goal if place is None else place, begin, feed)
+            return {
+                "tripped": place is not None,
+                "position": None if place is None else [float(x) for x in place],
+                "time": self.time,
+            }
+
+    def trip(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
+        """Return where the probe trips on a straight way, m; None: never. The start where it is tripped there."""
+        if self.stuck:
+            return start if self.stuck == "closed" else None
+        return self.machine.contact(start, goal, time, feed, balls=self.balls)[0]
+
+    def obstacle(self, start: Array, goal: Array, time: float, feed: float) -> Array | None:
+        """Return where a probe in the spindle runs into a ball that it does not move off, m."""
+        if self.tool != "probe":
+            return None
+        return self.machine.contact(start, goal, time, feed, balls=self.balls, leaving=True)[0]
+
+    def stop(self) -> None:
+        """Abort all motion: the axes stand from now on. The spindle stays as it is."""
+        with self._change:
+            now = self._next_instant()
+            if self.motion is not None and now < self.motion.end:
+                self.motion, self.path = None, Path.resting(self._sphere(now))  # the sphere is out of sight
+            elif now < self.path.end:
+                self.path = self.path.cut(now)
+                self.machine.forget(self._program_events, now)
+                self.printed = [each for each in self.printed if each[0] <= now]  # the same ones: a printer knows them
+                if self._warm_up is not None and self._warm_up > now:
+                    self._warm_up = None
+            self.program = ""
+
+    def raise_alarm(self, text: str) -> None:
+        """Go into alarm: the axes stand, and nothing moves until `reset_alarms`."""
+        with self._change:
+            self.stop()
+            if text not in self.alarms:
+                self.alarms.append(text)
+
+    def reset_alarms(self) -> None:
+        """Leave alarm and emergency stop; nothing begins to move by itself."""
+        with self._change:
+            self.alarms.clear()
+            self.estop = False
+
+    # ------------------------------------------------------------------ what holds it back
+
+    def _refuse_in_alarm(self) -> None:
+        if self.estop:
+            raise InstrumentError("The machine is in emergency stop; release it and reset the machine")
+        if self.alarms:
+            raise InstrumentError(f"The machine is in alarm: {'; '.join(self.alarms)}. See to it and reset the machine")
+
+    def _refuse_to_move(self) -> None:
+        self._refuse_in_alarm()
+        self._refuse_while_moving()
+
+    def _refuse_while_moving(self) -> None:
+        if self.stepping or self.running:
+            what = "stepping" if self.stepping else "running"
+            raise InstrumentError(f"The machine is still {what}; wait until its program has ended")
+
+    def _within_travel(self, position: Sequence[float]) -> Array:
+        goal = np.array(position, dtype=float)
+        if goal.shape != (3,) or not np.isfinite(goal).all():
+            raise InstrumentError(f"Expected a position X, Y, Z in m; found {position!r}")
+        for (axis, (low, high)), place in zip(self.machine.travel.items(), goal, strict=True):
+            if not low - _ROUNDING <= place <= high + _ROUNDING:
+                raise InstrumentError(f"{axis} travels from {low:g} to {high:g} m; found {place:g}")
+        return goal
+
+    def _possible_feed(self, feed: float | None) -> float:
+        chosen = self.machine.rapid if feed is None else float(feed)
+        if not 0 < chosen <= self.machine.rapid * (1 + 1e-9):
+            raise InstrumentError(f"The feed is above 0 and at most {self.machine.rapid:g} m/s; found {chosen:g}")
+        return chosen
+
+    def commanded_speed(self, time: float) -> float:
+        """Return the spindle speed that is commanded at a time, 1/min."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------ where it is
+
+    def _go(self, start: Array, goal: Array, begin: float, feed: float) -> float:
+        """Go in a straight line; return how long it takes, s."""
+        duration = float(np.linalg.norm(goal - start)) / feed
+        if duration > 0:
+            times, places = np.array([begin, begin + duration]), np.array([start, goal])
+            self.motion, self.path = None, Path(times, places, np.array([feed == self.machine.rapid]))
+            self.program = ""
+            if not self.streaming:
+                self._set_clock(self.path.end)
+        return duration
+
+    def _begin_of_motion(self) -> float:
+        rng = np.random.default_rng([abs(self.seed), self._programs])
+        self._programs += 1
+        return float(self._next_instant() + rng.uniform(*LEAD_IN))
+
+    @property
+    def stepping(self) -> bool:
+        """Whether a step program waits or runs."""
+        return self.motion is not None and self.time < self.motion.end
+
+    @property
+    def running(self) -> bool:
+        """Whether an NC program waits or runs."""
+        return self.time < self.path.end
+
+    def position(self) -> list[float]:
+        """Return the commanded position of the tool, m."""
+        now = self.time
+        place = self.path.place(now) if self.motion is None else self._sphere(now)
+        return [float(x) for x in place]
+
+    def _sphere(self, time: float) -> Array:
+        """Return the place at which the sphere rests at a time, or has rested last, m."""
+        if self.motion is None:
+            return self.path.place(time)
+        place = max(int(np.searchsorted(self.motion.arrivals, time, side="right")) - 1, 0)
+        return np.asarray(self.motion.places[place])
+
+    def feed(self) -> float:
+        """Return how fast the axes move now, m/s; NaN while the sphere is stepped."""
+        return float("nan") if self.stepping else self.path.feed(self.time)
+
+    def warm_time(self, times: ArrayLike) -> Array:
+        """Return how long the axes have been warming up at times of the world's clock, s; 0 before they began.
+
+        This is the time on which the thermal errors of the gantry's crossbeam depend. It starts with the first move of
+        a program that warms up (`Path.warm_up`) and then counts on.
+        """
+        times = np.asarray(times, dtype=float)
+        with self._change:
+            begin = self._warm_up
+        return np.zeros_like(times) if begin is None else np.maximum(times - begin, 0.0)
+
+
+class Errands:
+    """What an NC program orders beside its path; see `nc_program.Peripherals`."""
+
+    def __init__(self, world: Motion, begin: float) -> None:
+        self._world, self._begin = world, begin
+        self._tool = world.tool
+        self.events: list[Event] = []
+        self.printed: list[tuple[float, str]] = []
+
+    def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
+        """Refuse a move on which the probe would run into a ball."""
+        if self._world.obstacle(start, goal, self._begin + time, feed) is not None:
+            raise InstrumentError("the probe would trip on this way")
+
+    def skip(self, start: Array, goal: Array, feed: float, time: float) -> Array:
+        """Return where the probe stops a move."""
+        if speed := self._world.commanded_speed(self._begin + time):
+            raise InstrumentError(f"the spindle turns at {speed:g} /min; M5 first")
+        self._world.tool = "probe"
+        place = self._world.trip(start, goal, self._begin + time, feed)
+        return goal if place is None else place
+
+    def spindle(self, speed: float, time: float) -> None:
+        """Turn the spindle."""
+        event = Event(self._begin + time, spindle_speed=speed)
+        self._world.machine.command(event)
+        self.events.append(event)
+        if speed and self._world.tool == "probe":
+            self._world.tool = "bar"
+
+    def print(self, line: str, time: float) -> None:
+        """Print a line when the program is there."""
+        self.printed.append((self._begin + time, line))
+
+    def clock(self, time: float) -> float:
+        """Return the world's time, s."""
+        return self._begin + time
+
+    def undo(self) -> None:
+        """Take back what an aborted program has ordered."""
+        self._world.machine.forget(self.events, self._begin)
+        self._world.tool = self._tool

@@ -1,0 +1,231 @@
+"""The virtual world: one machine, one clock, and all simulated devices on it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.virtual_world.motion import LEAD_IN, Motion
+from errormotion.instruments.simulators.virtual_world.streams import Carried, Device, Stream
+from errormotion.instruments.simulators.virtual_world.targets import TargetStand
+from errormotion.twin import Event, StepProgram
+from errormotion.twin.paths import Path
+
+__all__ = ["LEAD_IN", "VirtualWorld", "reset", "world"]
+
+
+class VirtualWorld(Motion):
+    """A virtual machine with a clock, shared by all simulated devices on it.
+
+    Parameters
+    ----------
+    name : str
+        Kind of the machine, ``cframe`` or ``gantry``.
+    seed : int
+    warm : bool
+        Whether the sensors were switched on long ago.
+
+    Attributes
+    ----------
+    machine : VirtualMachine
+        The twin, which knows the truth.
+    stand : TargetStand
+        What the point sensors look at.
+    """
+
+    def __init__(self, name: str, seed: int, *, warm: bool = True) -> None:
+        from errormotion.twin import VirtualMachine
+
+        self.name = name
+        self.seed = seed
+        self.machine = VirtualMachine(name, seed, warm=warm)
+        self._compile()
+        super().__init__()
+        self.stand = TargetStand(self.machine)
+        self._asked = 0  # readings by command
+        self._devices: set[Device] = set()
+
+    def _compile(self) -> None:
+        """Have the twin's loops compiled now, so that nobody waits in vain for the first samples."""
+        resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
+        self.machine.distances(0, 1, 1e3, tool="bar")
+        self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
+
+    def attach(self, device: Device, pace: float | None = None) -> None:
+        """Count a device in; ``pace`` holds for the whole world."""
+        with self._change:
+            self._devices.add(device)
+            if pace is not None:
+                self.pace = pace
+
+    def detach(self, device: Device) -> None:
+        """Count a device out; with the last one the world ends."""
+        with self._change:
+            self._devices.discard(device)
+            empty = not self._devices
+        if empty:
+            self.end()
+
+    def end(self) -> None:
+        """Forget this world, end its devices and its thread; what it knows can still be asked. Idempotent."""
+        with _lock:
+            if _worlds.get(self._key) is self:
+                del _worlds[self._key]
+        with self._change:
+            devices, self._devices = self._devices, set()
+            thread = self._forget_streams()
+        for device in devices:
+            device.close()
+        if thread is not None:
+            thread.join()
+
+    @property
+    def _key(self) -> tuple[str, int, bool]:
+        return self.name, self.seed, self.machine.sensors_on_for > 0
+
+    # ------------------------------------------------------------------ heat and time
+
+    def start(self, schedule: Sequence[Event]) -> None:
+        """Begin anew at time 0, cold, with a schedule."""
+        with self._change:
+            self._refuse_while_streaming("start a schedule")
+            self._refuse_in_alarm()
+            self.machine.start(schedule)
+            resting = Path.resting(self.path.place(self.time))
+            self._set_clock(0.0)
+            self.motion, self.path, self.program, self._warm_up = None, resting, "", None
+            self.printed, self._program_events = [], []
+
+    def elapse(self, seconds: float) -> None:
+        """Let simulated time pass without samples."""
+        if not seconds >= 0:
+            raise InstrumentError(f"Time passes forwards only; found {seconds} s")
+        with self._change:
+            self._refuse_while_streaming("let time pass")
+            self._set_clock(self.time + seconds)
+
+    def spindle(self, speed: float) -> None:
+        """Turn the spindle at a speed, 1/min, from now on; 0 stops it. It heats the machine accordingly."""
+        with self._change:
+            if speed:
+                self._refuse_in_alarm()
+            self.machine.command(Event(self._next_instant(), spindle_speed=float(speed)))
+            if speed and self.tool == "probe":
+                self.tool = "bar"
+
+    def press_estop(self) -> None:
+        """Press the emergency stop: axes and spindle stop, and what was scheduled for the spindle is off."""
+        with self._change:
+            self.estop = True
+            self.stop()
+            self.machine.stop_spindle(self._next_instant())
+
+    @property
+    def sensors_on_for(self) -> float:
+        """How long the sensors have been on, s."""
+        return self.machine.sensors_on_for + self.time
+
+    # ------------------------------------------------------------------ what a controller shows
+
+    def commanded_speed(self, time: float) -> float:
+        """Return the spindle speed that is commanded at a time, 1/min."""
+        speeds = [event.spindle_speed for event in self._events(time) if event.spindle_speed is not None]
+        return float(speeds[-1]) if speeds else 0.0
+
+    def _events(self, time: float) -> list[Event]:
+        return [event for event in self.machine.state.schedule.events if event.time <= time]
+
+    def commanded(self) -> dict[str, Any]:
+        """Return what a controller displays."""
+        with self._change:
+            now, moving = self.time, self.stepping or self.running
+            compensation = {"X": True, "Y": True, "Z": True}
+            for event in self._events(now):
+                compensation.update(event.compensation or {})
+            speed = float(self.machine.spindle_speed(now)[0])
+            position = self.position()
+            return {
+                "time": now,
+                "position": position,
+                "commanded_position": list(position),
+                "spindle_speed": speed,
+                "commanded_spindle_speed": self.commanded_speed(now),
+                "spindle_load": float(self.machine.spindle_load(now)[0]),
+                "feed": self.feed(),
+                "mode": "automatic" if moving else "mdi",
+                "program": self.program if moving else "",
+                "stepping": self.stepping,
+                "running": self.running,
+                "homed": True,
+                "enabled": not self.estop and not self.alarms,
+                "estop": self.estop,
+                "alarms": [*(["emergency stop"] if self.estop else []), *self.alarms],
+                "compensation": compensation,
+                "tool": self.tool,
+                **({"target": self.stand.order} if self.stand.order else {}),
+            }
+
+    # ------------------------------------------------------------------ targets, trackers, sensors
+
+    def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
+        """Put a target before the point sensors, see `TargetStand.put`; from then on they ride on the stage."""
+        with self._change:
+            self._refuse_while_streaming("change the target")
+            self._refuse_while_moving()
+            here = Path.resting(self.position())
+            self.stand.put(kind, inclination, rotation)
+            if self.stand.target is not None:
+                self.motion, self.path = None, here
+
+    def set_station(self, position: Sequence[float]) -> None:
+        """Have the trackers beside the machine carried to a place in its coordinates, m."""
+        trackers = [device for device in self._devices if isinstance(device, Carried)]
+        if not trackers:
+            raise InstrumentError("No tracker stands beside this machine; open it first, at the same machine and seed")
+        with self._change:
+            self._refuse_while_streaming("carry a tracker")
+        for tracker in trackers:
+            tracker.carry_to(position)
+
+    def read_point(self, name: str) -> float:
+        """Return what a point sensor with a range about zero reads now, m.
+
+        Minus or plus infinity before or behind its range; NaN without a target, and where the beam misses it.
+        """
+        with self._change:
+            self._asked += 1
+            now = np.array([self.time])
+            return float(self.stand.read(name, now, self.path.place(now), self._asked)[0])
+
+    def _distances(self, first: int, n: int, rate: float, streams: Sequence[Stream]) -> np.ndarray[Any, Any]:
+        if self.stand.target is not None:
+            return self.stand.samples(streams, first, n, rate, self.path)
+        channels = [stream.channel for stream in streams]
+        if self.tool != "bar" and self.motion is None:  # parked outside of the frame
+            return np.full((len(channels), n), np.nan)
+        return self.machine.distances(first, n, rate, channels, tool=self.tool, motion=self.motion)
+
+
+_worlds: dict[tuple[str, int, bool], VirtualWorld] = {}
+_lock = threading.RLock()
+
+
+def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
+    """Return the world of a machine and seed; made when it is not there yet."""
+    with _lock:
+        key = (name, int(seed), warm)
+        if key not in _worlds:
+            _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
+        return _worlds[key]
+
+
+def reset() -> None:
+    """End all worlds of this process and their threads."""
+    with _lock:
+        worlds = list(_worlds.values())
+    for each in worlds:
+        each.end()

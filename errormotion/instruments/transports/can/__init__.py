@@ -1,0 +1,1 @@
+"""CAN bus: frames, SDO clients and simulated nodes."""

@@ -1,0 +1,1 @@
+"""HTTP: requests, streams of parts, and a server for simulators."""

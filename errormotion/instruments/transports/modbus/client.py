@@ -1,0 +1,202 @@
+"""Modbus: a line on which registers are asked for.
+
+* ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
+* ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
+* ``modbus+rtu-tcp://192.168.0.9:4001?unit=1`` RTU frames through a serial server
+* ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
+
+The frames are our own (`modbus_codec`) and go over the byte transports, so that a session can be recorded and played
+back, and each fault be told from the others. `pymodbus`, whose client owns its socket and waits in silence when a
+checksum is wrong, is the simulated device, and the other side in tests.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.transports.address import MODBUS, Address, parse_address
+from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.modbus.codec import (
+    Framing,
+    ModbusRefusal,
+    decode_answer,
+    encode_request,
+    missing,
+)
+from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.instruments.transports.recording import read_recording
+
+QUIET = 0.05  # s without a byte: what was under way is over
+LONGEST = 512  # bytes of rubbish that are waited for
+
+
+class ModbusLine(Transport):
+    """A Modbus client on one line.
+
+    Parameters
+    ----------
+    line : Transport
+        Bytes to and from the device.
+    framing : str
+        ``tcp`` or ``rtu``.
+    unit : int
+        Address of the device.
+    retries : int
+        How often a damaged answer is asked for once more.
+
+    Attributes
+    ----------
+    framing, unit
+        As given.
+    repeated : int
+        How many answers had to be asked for again.
+    """
+
+    def __init__(self, line: Transport, framing: Framing, unit: int, retries: int = 0) -> None:
+        super().__init__(line.url, line.timeout)
+        self.holds_back, self.simulated = line.holds_back, line.simulated
+        self.framing, self.unit, self.repeated = framing, unit, 0
+        self._line, self._retries, self._number = line, retries, 0
+
+    def registers(self, function: int, register: int, count: int) -> list[int]:
+        """Return ``count`` registers from ``register`` on, by function 3 (holding) or 4 (input).
+
+        Raises
+        ------
+        ModbusRefusal
+            An exception reply.
+        ProtocolError
+            A damaged answer: garbage, a wrong checksum, another unit, too short; also when asked again.
+        InstrumentTimeoutError
+            Silence.
+        InstrumentError
+            The connection is lost; the next call connects again.
+        """
+        for attempt in range(self._retries + 1):
+            try:
+                return self._exchange(function, register, count)
+            except ProtocolError:
+                if attempt == self._retries:
+                    raise
+                self.repeated += 1
+        raise AssertionError  # the loop has ended by itself
+
+    def _exchange(self, function: int, register: int, count: int) -> list[int]:
+        forget_input(self._line)
+        self._number = (self._number + 1) % (1 << 16)
+        self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
+        end = time.monotonic() + self.timeout
+        try:
+            while True:
+                data = self._frame(end)
+                found = decode_answer(self.framing, data, self.unit, function, count, self._number)
+                if found is not None:
+                    return found
+        except ModbusRefusal as error:
+            what = f"{self.url}: function {function} of unit {self.unit} for {count} registers from {register} on"
+            raise ModbusRefusal(error.code, what) from None
+        except ProtocolError as error:
+            self._settle()
+            raise ProtocolError(f"{self.url}: {error}") from None
+        except InstrumentTimeoutError:
+            give_up_silent(self._line)
+            raise
+
+    def _frame(self, end: float) -> bytes:
+        """Return one answer, as long as its beginning says that it is."""
+        data = b""
+        while lacking := missing(self.framing, data):
+            try:
+                data += self._line.read(lacking, timeout=max(end - time.monotonic(), 0.0))
+            except InstrumentTimeoutError:
+                if data:
+                    raise ProtocolError(
+                        f"Expected {lacking} bytes more within {self.timeout:g} s; found {data[:24].hex(' ')}"
+                    ) from None
+                raise InstrumentTimeoutError(f"{self.url}: unit {self.unit} is silent for {self.timeout:g} s") from None
+        return data
+
+    def _settle(self) -> None:
+        """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
+        came = 0
+        with suppress(InstrumentError):
+            while came < LONGEST:
+                came += len(self._line.read(LONGEST, timeout=QUIET))
+
+    def _send(self, data: bytes) -> None:
+        self._line.write(data)
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        return self._line.read(max_bytes, timeout)
+
+    def close(self) -> None:
+        """Close the line; idempotent."""
+        self._line.close()
+
+
+def open_modbus(
+    url: str,
+    *,
+    unit: int = 1,
+    simulator: str | None = None,
+    record: Path | None = None,
+    timeout: float = 1.0,
+    retry: float = 1.0,
+    retries: int = 0,
+    baudrate: int | None = None,
+) -> ModbusLine:
+    """Open the Modbus line that an address names; what the address says of ``unit`` and ``baudrate`` wins.
+
+    Parameters
+    ----------
+    url : str
+        See the module.
+    unit, retries
+        As in `ModbusLine`.
+    simulator, record, timeout, retry, baudrate
+        As in `open_reconnecting`.
+
+    Raises
+    ------
+    InstrumentError
+        Nobody there, or no address for Modbus.
+    """
+    address = parse_address(url)
+    device = original(address)
+    framing, unit = framing_of(device), device.whole("unit", unit, 255)
+    line = open_reconnecting(
+        _of_bytes(address), simulator=simulator, record=record, timeout=timeout, retry=retry, baudrate=baudrate
+    )
+    return ModbusLine(line, framing, unit, retries)
+
+
+def original(address: Address) -> Address:
+    """Return the address of the device itself, where this is the one of a recording."""
+    return parse_address(read_recording(Path(address.path))[0]) if address.scheme == "replay" else address
+
+
+def framing_of(address: Address) -> Framing:
+    """Return how frames look at an address."""
+    if address.scheme == "sim":
+        serial = address.params.get("wire") == "pty"
+        framing = address.params.get("framing", "rtu" if serial else "tcp")
+        if framing not in ("tcp", "rtu") or (serial and framing == "tcp"):
+            raise InstrumentError(f"'framing' in '{address.url}': expected 'tcp', or 'rtu'; on a pty 'rtu' only")
+        return "rtu" if framing == "rtu" else "tcp"
+    if address.scheme not in MODBUS:
+        raise InstrumentError(
+            f"Expected an address for Modbus, such as modbus+tcp://HOST:502?unit=1, modbus+rtu:///dev/NAME?unit=1 or "
+            f"modbus+rtu-tcp://HOST:PORT?unit=1; found '{address.url}'"
+        )
+    return "tcp" if address.scheme == "modbus+tcp" else "rtu"
+
+
+def _of_bytes(address: Address) -> Address:
+    """Return the address of the bytes beneath; its URL stays the one that a person knows."""
+    if address.scheme == "modbus+rtu":
+        return replace(address, scheme="serial")
+    return replace(address, scheme="tcp") if address.scheme in MODBUS else address

@@ -1,0 +1,137 @@
+"""Modbus frames for reading registers: functions 3 and 4, in the framings RTU and TCP (MBAP).
+
+After the Modbus application protocol 1.1b3 and the serial line guide 1.02. Pure functions from bytes to numbers.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Literal
+
+from errormotion.errors import InstrumentError, ProtocolError
+
+Framing = Literal["tcp", "rtu"]
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "server device failure",
+    5: "acknowledge, wait",
+    6: "server device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target device failed to respond",
+}
+_HEAD = 7  # bytes of an MBAP header
+_LONGEST = 254  # bytes behind its length
+
+
+def crc16(data: bytes) -> bytes:
+    """Return the checksum of an RTU frame, as it follows the frame: low byte first (polynomial A001, start FFFF)."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+def encode_request(framing: Framing, unit: int, function: int, register: int, count: int, number: int = 0) -> bytes:
+    """Return the request for ``count`` registers from ``register`` on; ``number`` tells TCP's transactions apart."""
+    return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
+
+
+def encode_answer(framing: Framing, unit: int, function: int, registers: Sequence[int], number: int = 0) -> bytes:
+    """Return the answer with these registers."""
+    pdu = struct.pack(f">BB{len(registers)}H", function, 2 * len(registers), *registers)
+    return _frame(framing, unit, pdu, number)
+
+
+def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
+    if framing == "rtu":
+        body = bytes((unit,)) + pdu
+        return body + crc16(body)
+    return struct.pack(">HHHB", number, 0, len(pdu) + 1, unit) + pdu
+
+
+def missing(framing: Framing, data: bytes) -> int:
+    """Return how many bytes an answer that begins so still lacks, as far as its beginning tells."""
+    if framing == "rtu":
+        size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
+    elif len(data) < _HEAD - 1:
+        size = _HEAD + 2
+    else:
+        protocol, length = struct.unpack(">HH", data[2:6])
+        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: nothing is worth waiting for
+    return max(size - len(data), 0)
+
+
+def decode_answer(
+    framing: Framing, data: bytes, unit: int, function: int, count: int, number: int = 0
+) -> list[int] | None:
+    """Return the registers of a complete answer; None for the late answer to an earlier request (TCP only).
+
+    Raises
+    ------
+    ProtocolError
+        Too short, a wrong checksum, another unit, another function, another number of registers.
+    ModbusRefusal
+        An exception reply.
+    """
+    if framing == "rtu":
+        return _decode_rtu(data, unit, function, count)
+    return _decode_tcp(data, unit, function, count, number)
+
+
+class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
+    """The device answers that it does not do what it was asked for.
+
+    Attributes
+    ----------
+    code : int
+        Exception code of Modbus.
+    """
+
+    def __init__(self, code: int, what: str) -> None:
+        self.code = code
+        super().__init__(f"{what} is refused: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
+
+
+def _decode_rtu(data: bytes, unit: int, function: int, count: int) -> list[int]:
+    if len(data) < 5:
+        raise ProtocolError(f"Expected a Modbus answer of at least 5 bytes; found {data.hex(' ') or 'nothing'}")
+    if data[-2:] != (right := crc16(data[:-2])):
+        raise ProtocolError(
+            f"The answer {_shown(data)} has the checksum {data[-2:].hex(' ')}; expected {right.hex(' ')}"
+        )
+    return _decode_pdu(data[0], data[1:-2], unit, function, count, data)
+
+
+def _decode_tcp(data: bytes, unit: int, function: int, count: int, number: int) -> list[int] | None:
+    if len(data) < _HEAD + 2:
+        raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
+    came, protocol, length, came_unit = struct.unpack(">HHHB", data[:_HEAD])
+    if protocol or length != len(data) - 6:
+        raise ProtocolError(f"Expected the head of a Modbus answer; found {_shown(data)}")
+    if came != number:
+        if (number - came) % (1 << 16) < 1 << 15:
+            return None
+        raise ProtocolError(f"Expected the answer to transaction {number}; found one to {came}")
+    return _decode_pdu(came_unit, data[_HEAD:], unit, function, count, data)
+
+
+def _decode_pdu(came_unit: int, pdu: bytes, unit: int, function: int, count: int, data: bytes) -> list[int]:
+    if came_unit != unit:
+        raise ProtocolError(f"Expected an answer of unit {unit}; found one of unit {came_unit}: {_shown(data)}")
+    if pdu[0] == function | 0x80 and len(pdu) == 2:
+        raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
+    if pdu[0] != function:
+        raise ProtocolError(f"Expected an answer to function {function}; found {_shown(data)}")
+    if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
+        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_shown(data)}")
+    return list(struct.unpack(f">{count}H", pdu[2:]))
+
+
+def _shown(data: bytes) -> str:
+    return data[:24].hex(" ") + (" ..." if len(data) > 24 else "")
