@@ -42,7 +42,7 @@ class BenchTable(BaseModel):
     schema_: Literal["errormotion.bench/1"] = Field(alias="schema", description='"errormotion.bench/1"')
     name: str
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
-    instruments: dict[str, InstrumentTable] = Field(min_length=1)
+    instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
 
 

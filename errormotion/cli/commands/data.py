@@ -110,7 +110,7 @@ def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: 
 
 def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
     """Turn a log with columns into a raw dataset."""
-    from errormotion.methods.spindle_drift.log_import.importer import import_log as read_log
+    from errormotion.datasets.importing import import_log as read_log
 
     with Bars(as_json) as bars:
         bars.stage("importing")

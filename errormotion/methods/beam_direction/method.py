@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
+from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-SCHEMA = "errormotion.raw.beam_direction/1"
+    import xarray as xr
 
 
 class BeamDirection:
@@ -91,6 +89,7 @@ class BeamDirection:
         MethodError
             The data do not determine the answer.
         """
+        from errormotion.datasets import validate
         from errormotion.methods.beam_direction.identification.planes import identify_beam
 
         settings = settings or BeamSettings()

@@ -8,13 +8,16 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from errormotion.methods.spindle_drift.identification import averaging
 from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("layout", ["channel first", "time first"])
 @pytest.mark.parametrize("lost", [0.0, 0.02, 1.0])
-def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost):
+@pytest.mark.parametrize("compiled", [False, True])
+def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, monkeypatch):
+    monkeypatch.setattr(averaging, "_COMPILED_SIZE", 0 if compiled else 1 << 30)
     rng = np.random.default_rng(0)
     values = rng.normal(1e-3, 1e-6, (5, 3001)).astype(dtype)
     values[rng.random(values.shape) < lost] = np.nan

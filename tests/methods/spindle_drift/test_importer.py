@@ -6,8 +6,8 @@ import pytest
 import xarray as xr
 
 from errormotion import datasets
+from errormotion.datasets.importing import import_log
 from errormotion.errors import DatasetError
-from errormotion.methods.spindle_drift.log_import.importer import import_log
 
 PLACES = {
     "X1": ("6 mm", "0 mm", "10 mm", [-1, 0, 0]),

@@ -20,7 +20,7 @@ import numpy as np
 
 from errormotion.errors import InstrumentError, ProtocolError
 
-COMMAND_PORT, STREAM_PORT = 24691, 24692
+STREAM_PORT = 24692
 
 # ------------------------------------------------------------------ requests and replies
 

@@ -91,11 +91,6 @@ def distance(raw: int, measuring_range: float) -> float:
     return (raw * SCALE - OFFSET) * measuring_range
 
 
-def raw_value(distance: float, measuring_range: float) -> int:
-    """Return the raw value nearest a distance from the start of the range."""
-    return round((distance / measuring_range + OFFSET) / SCALE)
-
-
 def reason(raw: int) -> str:
     """Return why a raw value is no distance inside the measuring range; empty where it is one."""
     if raw in ERROR_CODES:

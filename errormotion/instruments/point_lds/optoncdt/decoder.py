@@ -37,11 +37,6 @@ class StreamDecoder:
         self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
         self._state[kernels.ANCHORED] = from_zero
 
-    @property
-    def orphans(self) -> int:
-        """Values so far that did not fit together."""
-        return int(self._state[kernels.ORPHANS])
-
     def __call__(self, data: bytes) -> Chunk:
         """Return the samples that the next bytes complete.
 

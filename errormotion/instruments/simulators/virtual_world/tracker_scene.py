@@ -115,10 +115,6 @@ class TrackerScene:
         """Return azimuth and zenith angle (rad) and distance (m) of the reflector, (n, 3)."""
         return spherical((self.places(times) - self.station) @ self._turn)
 
-    def to_tracker(self, place: Array) -> Array:
-        """Return a place in machine coordinates, m, in the tracker's frame."""
-        return np.asarray((np.asarray(place, dtype=float) - self.station) @ self._turn)
-
 
 def spherical(places: Array) -> Array:
     """Return azimuth, zenith angle (rad) and distance (m) of places (n, 3), m."""

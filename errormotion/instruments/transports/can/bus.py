@@ -27,6 +27,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import CAN, Address, parse_address
 from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.lost import Reopened
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it has to say, the errors raised here say
@@ -162,7 +163,7 @@ def to_bytes(can_id: int, data: bytes) -> bytes:
 
 
 class CanNode(Transport):
-    """One CANopen node. A bus that was lost is opened again by the next question, at most every ``retry`` seconds.
+    """One CANopen node; a bus that was lost is opened again, see `transports.lost`.
 
     Parameters
     ----------
@@ -194,12 +195,11 @@ class CanNode(Transport):
         super().__init__(url, timeout)
         self.simulated = simulated
         self.node = node
-        self._connect, self._retry, self._end = network, retry, end
-        self._network: Network | None = None
+        self._bus, self._end = Reopened(url, self._opened, retry), end
+        self._connect = network
         self._remote: Any = None
-        self._tried, self._lost_by, self._closed = 0.0, "", False
         try:
-            self._open_network()
+            self._bus.get()
         except BaseException:
             self.close()
             raise
@@ -232,7 +232,7 @@ class CanNode(Transport):
         return data
 
     def _guarded(self, exchange: Callable[[Any], Any], what: str) -> Any:
-        network = self._open_network()
+        network = self._bus.get()
         where = f"{self.url}: node {self.node}"
         try:
             self._check(network)
@@ -249,39 +249,24 @@ class CanNode(Transport):
             raise ProtocolError(f"{where}, {what}: the answer is too short: {error}") from None
         except (can.CanError, OSError) as error:
             self._lose(f"{self.url}: the bus is lost: {error}")
-            raise InstrumentError(self._lost_by) from None
+            raise InstrumentError(self._bus.reason) from None
 
     def _check(self, network: Network) -> None:
         if network.failed:
             self._lose(f"{self.url}: {network.failed}")
-            raise InstrumentError(self._lost_by)
+            raise InstrumentError(self._bus.reason)
 
-    def _open_network(self) -> Network:
-        if self._closed:
-            raise InstrumentError(f"The connection to {self.url} is closed")
-        if self._network is None:
-            now = time.monotonic()
-            if self._lost_by and now < self._tried + self._retry:
-                raise InstrumentError(
-                    f"{self._lost_by}; the next attempt is in {self._tried + self._retry - now:.1f} s"
-                )
-            self._tried = now
-            try:
-                self._network = self._connect()
-            except InstrumentError as error:
-                self._lost_by = str(error)
-                raise
-            self._lost_by = ""
-            library: Any = canopen  # partly without types
-            self._remote = library.RemoteNode(self.node, library.ObjectDictionary())
-            self._remote.sdo.RESPONSE_TIMEOUT = self.timeout
-            self._network.add_node(self._remote)
-        return self._network
+    def _opened(self) -> Network:
+        network = self._connect()
+        library: Any = canopen  # partly without types
+        self._remote = library.RemoteNode(self.node, library.ObjectDictionary())
+        self._remote.sdo.RESPONSE_TIMEOUT = self.timeout
+        network.add_node(self._remote)
+        return network
 
-    def _lose(self, why: str) -> None:
-        self._lost_by = why
-        network, self._network, self._remote = self._network, None, None
-        _disconnect(network)
+    def _lose(self, reason: str) -> None:
+        self._remote = None
+        _disconnect(self._bus.lose(reason))
 
     def _send(self, data: bytes) -> None:  # noqa: ARG002
         raise InstrumentError(f"{self.url} carries frames, no stream of bytes")
@@ -291,8 +276,7 @@ class CanNode(Transport):
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
-        self._closed = True
-        network, self._network, self._remote = self._network, None, None
+        network, self._remote = self._bus.close(), None
         end, self._end = self._end, None
         try:
             _disconnect(network)

@@ -12,8 +12,6 @@ from typing import Literal
 from errormotion.errors import InstrumentError, ProtocolError
 
 Framing = Literal["tcp", "rtu"]
-MOST_REGISTERS = 125
-"""In one answer: their number of bytes has to fit into one byte."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -48,11 +46,6 @@ def encode_answer(framing: Framing, unit: int, function: int, registers: Sequenc
     """Return the answer with these registers."""
     pdu = struct.pack(f">BB{len(registers)}H", function, 2 * len(registers), *registers)
     return _frame(framing, unit, pdu, number)
-
-
-def encode_refusal(framing: Framing, unit: int, function: int, code: int, number: int = 0) -> bytes:
-    """Return an exception reply."""
-    return _frame(framing, unit, bytes((function | 0x80, code)), number)
 
 
 def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:

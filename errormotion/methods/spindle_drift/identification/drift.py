@@ -14,7 +14,6 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.hashing import DatasetHasher
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
-from errormotion.methods.spindle_drift.identification.averaging import one_thread
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis
 from errormotion.methods.spindle_drift.identification.frame_expansion import (
     frame_warming,
@@ -27,9 +26,10 @@ from errormotion.methods.spindle_drift.identification.record import (
     count_unknown,
     noise,
     reference_windows,
+    run_out_at_rest,
     sensors,
+    settling,
 )
-from errormotion.methods.spindle_drift.identification.turning import run_out_at_rest, settling
 from errormotion.methods.spindle_drift.identification.uncertainty import (
     Frame,
     State,
@@ -63,7 +63,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
-    with DatasetHasher(raw) as hasher, one_thread():
+    with DatasetHasher(raw) as hasher:
         record = average_record(raw, settings, hasher)
         raw_hash = hasher.value()
     measured, raw = raw, raw.drop_vars("distance").sel(channel=list(CHANNELS))
