@@ -120,6 +120,21 @@ class Crossbeam:
         pose[:3, 3] = self.lever + np.array([0.0, position, 0.0])
         return pose
 
+    def pocket_lines(self, along: ArrayLike, lift: float) -> Array:
+        """Return the poses (n, 4, 4) of the profiler relative to a pocket that the cold machine has cut itself.
+
+        Parameters
+        ----------
+        along : (n,)
+            Y of the tool frame relative to the cut, m.
+        lift : float
+            Z of the tool frame relative to the cut, m.
+        """
+        poses = np.tile(self.pose, (np.size(along), 1, 1))
+        poses[:, 1, 3] += along
+        poses[:, 2, 3] += lift
+        return poses
+
     def lines(self, carriage: Array, artefact: Array, *, lift: ArrayLike = 0.0) -> Array:
         """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage.
 
