@@ -176,9 +176,9 @@ def test_a_pocket_at_two_lifts_is_that_of_the_twin() -> None:
             assert controller.state()["position"][2] == pytest.approx(lift)
             finish(controller)
             along = found.encoder * 1e-6
-            truth, _, _ = crossbeam.pocket_scans(circular_pocket(), PROFILER, along, np.array([lift]), (0,))
+            truth = PROFILER.scan(circular_pocket(), crossbeam.pocket_lines(along, lift), key=(0,))
             assert np.isfinite(truth).mean() > 0.5
-            assert same(found.heights, truth[0], STEP / 2 + 1e-12)
+            assert same(found.heights, truth, STEP / 2 + 1e-12)
 
 
 def test_noise_differs_from_scan_to_scan_and_a_campaign_repeats_to_the_bit() -> None:
