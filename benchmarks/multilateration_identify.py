@@ -32,21 +32,23 @@ def make(size: int, folder: Path) -> None:
 
     machine = VirtualMachine("cframe", seed=3)
     across = max(2, round(size ** (1 / 3)))
-    q = machine.target_grid((across, across, max(2, round(size / across**2))))
-    datasets.save(machine.raw_multilateration(q, seed=1), folder / "raw.nc")
-    truth = machine.truth_multilateration(q)
+    from errormotion.methods.multilateration import simulation
+
+    q = simulation.target_grid(machine, (across, across, max(2, round(size / across**2))))
+    datasets.save(simulation.raw(machine, q, seed=1), folder / "raw.nc")
+    truth = simulation.true_errors(machine, q)
     np.save(folder / "truth.npy", np.stack([truth[name].values for name in ("EX", "EY", "EZ")], axis=-1))
 
 
 def identify(folder: Path, *, plain: bool) -> dict[str, float]:
     """Identify what is stored; return time, memory and how many errors lie within their interval of 95 %."""
     from errormotion import datasets
-    from errormotion.methods.multilateration import Multilateration, Settings
+    from errormotion.methods.multilateration import Multilateration, Settings, simulation
     from errormotion.twin import VirtualMachine
 
     method, settings = Multilateration(), Settings(parametric=not plain)
     machine = VirtualMachine("cframe", seed=3)
-    method.identify(machine.raw_multilateration(machine.target_grid(SMALL), seed=2), settings)  # compiles
+    method.identify(simulation.raw(machine, simulation.target_grid(machine, SMALL), seed=2), settings)  # compiles
     raw = datasets.load(folder / "raw.nc")
     wall, processor = time.perf_counter(), time.process_time()
     found = method.identify(raw, settings)

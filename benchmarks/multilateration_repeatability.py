@@ -13,7 +13,7 @@ import logging
 
 import numpy as np
 
-from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.twin import VirtualMachine
 
 COORDINATES = ("EX", "EY", "EZ")
@@ -30,11 +30,11 @@ CASES = (
 def one(seed: int, true: float, returns: int, settings: Settings) -> tuple[float, float, float]:
     """Return the share within 95 % of one machine, the repeatability found and its uncertainty, m."""
     machine = VirtualMachine("cframe", seed=seed)
-    q = machine.target_grid((4, 4, 3))
+    q = simulation.target_grid(machine, (4, 4, 3))
     if returns:
         q = np.concatenate([q, q[:: len(q) // returns][:returns]])
-    found = Multilateration().identify(machine.raw_multilateration(q, seed=seed, repeatability=true), settings)
-    truth = machine.truth_multilateration(q)
+    found = Multilateration().identify(simulation.raw(machine, q, seed=seed, repeatability=true), settings)
+    truth = simulation.true_errors(machine, q)
     left = np.stack([found[name].values - truth[name].values for name in COORDINATES], axis=-1)
     u = np.sqrt(np.einsum("tii->ti", found["covariance"].values[:, :3, :3]))
     told = [float(found[name]) if name in found else float("nan") for name in ("repeatability", "repeatability_u")]

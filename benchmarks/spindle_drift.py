@@ -1,6 +1,6 @@
 """Spindle drift: averages against a plain read, the bar fit against scipy, a four-hour record in constant memory.
 
-``python -m benchmarks.spindle_drift [--quick]``; ``--quick`` leaves the four-hour record (6 GB on disk) out.
+``python -m benchmarks.spindle_drift [--quick] [--hours 4]``; ``--quick`` leaves the long record (6 GB on disk) out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import numba
 import numpy as np
 from scipy.optimize import least_squares
 
-from errormotion.methods.spindle_drift.identification.averaging import window_sums
+from errormotion.methods.spindle_drift import simulation
+from errormotion.methods.spindle_drift.identification.averaging import slices, window_sums
 from errormotion.methods.spindle_drift.identification.bar import fit_axis
 
 R = 5e-3
@@ -112,19 +113,18 @@ def write_record(path: Path, hours: float) -> None:
     """Write a raw dataset of five channels at 20 kHz, as the runner stores one."""
     import zarr
 
+    from errormotion.datasets import save
     from errormotion.twin import Event, VirtualMachine
 
     machine = VirtualMachine("cframe", seed=3)
     machine.start([Event(0.0, 15000.0)])
-    skeleton = machine.raw_spindle_drift(np.array([0.0, 1.0]), seed=0).drop_vars(["temperature", "spindle_speed"])
+    skeleton = simulation.raw_drift(machine, np.array([0.0, 1.0]), seed=0).drop_vars(["temperature", "spindle_speed"])
     samples = round(hours * 3600 * RATE)
     piece = 30 * RATE
     skeleton = (
         skeleton.drop_vars(["distance", "time"]).drop_dims("time", errors="ignore").drop_dims("sensor", errors="ignore")
     )
-    skeleton.assign_attrs(sample_rate=float(RATE)).assign(distance_noise=0.3e-6).to_zarr(
-        path, zarr_format=3, consolidated=False
-    )
+    save(skeleton.assign_attrs(sample_rate=float(RATE)).assign(distance_noise=0.3e-6), path)
     array = zarr.open_group(path, mode="r+").create_array(
         "distance", shape=(5, samples), chunks=(5, piece), dtype="float32", fill_value=float("nan"),
         dimension_names=("channel", "time"), attributes={"units": "m"}, compressors=None,
@@ -133,7 +133,6 @@ def write_record(path: Path, hours: float) -> None:
     for begin in range(0, samples, piece):
         # The same half minute over and over, shifted by 1 nm each, so that no two windows are alike.
         array[:, begin : begin + piece] = (block + np.float32(1e-9 * (begin // piece)))[:, : samples - begin]
-    zarr.consolidate_metadata(path)
 
 
 def peak_memory() -> int:
@@ -144,17 +143,27 @@ def peak_memory() -> int:
 
 def identify_record(path: str) -> None:
     """Identify a record and print time, peak memory and the last errors as JSON; runs in a process of its own."""
-    from errormotion.datasets import load
+    from errormotion.datasets import hash_dataset, load
     from errormotion.methods.spindle_drift import SpindleDrift
 
     raw = load(path)
     before = peak_memory()
     start = time.perf_counter()
     errors = SpindleDrift().identify(raw)
+    seconds = time.perf_counter() - start
+    start, distance = time.perf_counter(), raw["distance"]
+    for _, part in slices(raw):
+        part["distance"].values.sum()
+    read = time.perf_counter() - start
+    start = time.perf_counter()
+    hash_dataset(raw)
     print(
         json.dumps(
             {
-                "seconds": time.perf_counter() - start,
+                "bytes": distance.nbytes,
+                "seconds": seconds,
+                "read": read,
+                "hash": time.perf_counter() - start,
                 "before": before,
                 "peak": peak_memory(),
                 "instants": errors.sizes["time"],
@@ -164,8 +173,7 @@ def identify_record(path: str) -> None:
     )
 
 
-def record() -> None:
-    hours = 4.0
+def record(hours: float) -> None:
     print(f"\nIdentification of a {hours:g} h record, 5 channels at 20 kHz, out of core")
     with tempfile.TemporaryDirectory() as folder:
         samples = round(hours * 3600 * RATE) * 5
@@ -179,16 +187,20 @@ def record() -> None:
             capture_output=True, text=True, check=True,
         )  # fmt: skip
         result = json.loads(answer.stdout.splitlines()[-1])
+        size = result["bytes"] / 1e9
         print(
-            f"  {samples / 1e9:.2f}e9 samples ({samples * 4 / 1e9:.1f} GB) to {result['instants']} instants in "
-            f"{result['seconds']:.1f} s ({samples * 4 / 1e9 / result['seconds']:.2f} GB/s, hash included); peak memory "
-            f"{result['peak'] / 2**20:.0f} MiB, of which {result['before'] / 2**20:.0f} MiB before the first sample"
+            f"  {samples / 1e9:.2f}e9 samples ({size:.1f} GB) to {result['instants']} instants in "
+            f"{result['seconds']:.1f} s ({size / result['seconds']:.2f} GB/s, hash included); peak memory "
+            f"{result['peak'] / 2**20:.0f} MiB, of which {result['before'] / 2**20:.0f} MiB before the first sample\n"
+            f"  the same file afterwards: read and added up {size / result['read']:.2f} GB/s, "
+            f"hash alone {size / result['hash']:.2f} GB/s"
         )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="without the four-hour record")
+    parser.add_argument("--hours", type=float, default=4.0, help="length of the record")
     parser.add_argument("--identify", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.identify:
@@ -197,7 +209,7 @@ def main() -> None:
     averages()
     bar_fit()
     if not options.quick:
-        record()
+        record(options.hours)
 
 
 if __name__ == "__main__":

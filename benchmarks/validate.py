@@ -1,7 +1,7 @@
-"""Monte Carlo validation: does every estimate hold the truth as often as it says, and is it as good as it can be?
+"""Monte Carlo validation: coverage of the stated intervals, and efficiency compared with the Cramer-Rao bound.
 
 ``make validate`` runs it and writes ``docs/validation.md``; ``make validate ARGS="crossbeam_scan --seeds 50"`` runs one
-part and leaves the sections of the others as they stand. Truth comes from the virtual machine; the bound is the
+part and keeps the sections of the others. Truth comes from the virtual machine; the bound is the
 Cramer-Rao bound of each estimator's own model. Coverage over S seeds is itself a draw: its standard deviation is
 sqrt(0.05 * 0.95 / S) where nothing is shared, stated beside it.
 """
@@ -9,23 +9,21 @@ sqrt(0.05 * 0.95 / S) where nothing is shared, stated beside it.
 from __future__ import annotations
 
 import argparse
+import pkgutil
 import re
 import time
+from importlib import import_module
 from pathlib import Path
 
-from validation import beam_direction, crossbeam_scan, multilateration, normal_vector, spindle_drift, thermal_model
+import validation
 
 from errormotion import __version__
 
 PAGE = Path(__file__).parent.parent / "docs" / "validation.md"
 PARTS = {
-    "spindle_drift": spindle_drift,
-    "crossbeam_scan": crossbeam_scan,
-    "beam_direction": beam_direction,
-    "multilateration": multilateration,
-    "normal_vector": normal_vector,
-    "thermal_model": thermal_model,
+    module.name: import_module(f"validation.{module.name}") for module in pkgutil.iter_modules(validation.__path__)
 }
+"""The modules of the folder beside this file, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``."""
 INTRODUCTION = """\
 # Validation
 
@@ -44,8 +42,8 @@ def sections(page: Path) -> dict[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}; all where none is named")
-    parser.add_argument("--seeds", type=int, help="virtual machines; each part has its own default")
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(PARTS)}; default: all")
+    parser.add_argument("--seeds", type=int, help="number of virtual machines; each part has its own default")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):

@@ -10,7 +10,7 @@ import numpy as np
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import error_jacobian
-from errormotion.methods.beam_direction import BeamDirection, Settings
+from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.identification.propagation import expected_beam
 from errormotion.twin import VirtualMachine
@@ -57,10 +57,10 @@ def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
     for seed in range(seeds):
         machine = VirtualMachine("cframe", seed=seed)
         sensor = machine.point_sensor
-        raw = machine.raw_beam_direction(planes, seed=seed, inclination_error=False, speckle=True)
+        raw = simulation.raw(machine, planes, seed=seed, inclination_error=False, speckle=True)
         errors = method.identify(raw, settings)
         covariance = errors["covariance"].values[0]
-        miss.append(np.asarray(errors.em.twist() - machine.truth_beam().em.twist())[0])
+        miss.append(np.asarray(errors.em.twist() - simulation.truth_beam(machine).em.twist())[0])
         stated.append(np.sqrt(np.diag(covariance)))
         least = expected_beam(
             list(raw["stage"].values),
@@ -122,17 +122,17 @@ def compensation(seeds: int) -> list[str]:
             machine = VirtualMachine("cframe", seed=seed)
             true = machine.point_sensor.true_direction
             rotations = np.radians(np.arange(0.0, 180.0, 10.0))
-            calibrate(machine.raw_inclination(betas=rotations, seed=seed)).save(everywhere, overwrite=True)
+            calibrate(simulation.raw_inclination(machine, betas=rotations, seed=seed)).save(everywhere, overwrite=True)
             if seed == 0:
-                calibrate(machine.raw_inclination(seed=seed)).save(published)
+                calibrate(simulation.raw_inclination(machine, seed=seed)).save(published)
             for pair in PAIRS:
                 planes = [(INCLINATION, np.radians(b)) for b in pair]
-                raw = machine.raw_beam_direction(planes, seed=seed, speckle=True)
+                raw = simulation.raw(machine, planes, seed=seed, speckle=True)
                 errors = method.identify(raw, Settings(compensation=str(everywhere), noise="stated"))
                 before, after = (errors[f"{name}direction"].values[0] for name in ("uncompensated_", "beam_"))
                 lean[pair].append([np.arccos(-u[2]) - np.arccos(-true[2]) for u in (before, after)])
                 turn[pair].append([np.linalg.norm(np.cross(u, true)) for u in (before, after)])
-                miss = np.asarray(errors.em.twist() - machine.truth_beam().em.twist())[0, 3:]
+                miss = np.asarray(errors.em.twist() - simulation.truth_beam(machine).em.twist())[0, 3:]
                 stated[pair].append(miss / np.sqrt(np.diag(errors["covariance"].values[0]))[3:])
                 if seed == 0:
                     try:
@@ -192,8 +192,8 @@ def holes(seeds: int) -> list[str]:
         for seed in range(seeds):
             machine, rng = VirtualMachine("cframe", seed=seed), np.random.default_rng([seed, 1])
             sensor, depths = machine.point_sensor, 1e-3 * np.arange(-10.0, 11.0, 4.0)
-            raw = machine.raw_inclination(
-                np.radians(inclinations), np.radians(rotations), depths, seed=seed, speckle=True
+            raw = simulation.raw_inclination(
+                machine, np.radians(inclinations), np.radians(rotations), depths, seed=seed, speckle=True
             )
             known = calibrate(raw)
             steepest = np.hypot(*known.settings.T).max()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import DOF
 from errormotion.kinematics.poses import displaced
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import PARAMETERS, parameters
 from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
 from errormotion.methods.crossbeam_scan.identification.registrations import bound
@@ -84,20 +84,20 @@ def campaign(seed: int) -> Seed:
     """Return how far a campaign is off and what it says of that: pose, errors, errors at the tool, curves."""
     machine = VirtualMachine("gantry", seed=seed)
     beam = machine.crossbeam
-    posed = METHOD.identify(machine.raw_pocket_scan(seed=10_000 + seed), Settings(procedure="profiler_pose"))
+    posed = METHOD.identify(simulation.raw_pocket(machine, seed=10_000 + seed), Settings(procedure="profiler_pose"))
     pose, covariance = posed["profiler_pose"].values, posed["pose_covariance"].values
     true_pose, found_pose = (parameters(RigidTransform.from_matrix(matrix)) for matrix in (beam.pose, pose))
     out = {"pose": found_pose - true_pose, "pose_covariance": covariance}
 
-    raw = machine.raw_crossbeam_scan(
-        TIMES, PLACES, seed=seed, profiler=Profiler(POINTS, PITCH), profiles=LINES, feed=FEED, pose=pose
+    raw = simulation.raw_scans(
+        machine, TIMES, PLACES, seed=seed, profiler=Profiler(POINTS, PITCH), profiles=LINES, feed=FEED, pose=pose
     )
     off = np.random.default_rng([seed, 2]).normal(0, LEVER_SIGMA, 3)
     metres = {"units": "m"}
     raw["pose_covariance"] = (("p", "p_"), covariance)
     raw["lever"] = ("direction", beam.lever + off, metres)
     raw["lever_uncertainty"] = ("direction", np.full(3, LEVER_SIGMA), metres)
-    truth = machine.truth_crossbeam(TIMES, PLACES)
+    truth = simulation.truth_axis(machine, TIMES, PLACES)
     for strain in STRAINS:
         errors = METHOD.identify(raw, Settings(strain=strain))
         for name, ours, true in (("", errors, truth), ("_tool", errors.em.at(TOOL), truth.em.at(TOOL))):

@@ -9,12 +9,12 @@ from numpy.polynomial.legendre import leggauss
 
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import move
-from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.methods.multilateration.identification.volume import grid, volumetric_errors
 from errormotion.methods.multilateration.network.model import motions
 from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.simulation import NOISE, REFLECTOR
 from errormotion.twin import VirtualMachine
-from errormotion.twin.multilateration_rawdata import NOISE, REFLECTOR
 
 TITLE = "Multilateration"
 SEEDS = 300
@@ -49,17 +49,17 @@ def honesty(seeds: int) -> list[str]:
     z, station_z, spread, chi2, station_spread, lost = [], [], [], [], [], 0
     for seed in range(seeds):
         machine = VirtualMachine("cframe", seed=seed)
-        q = machine.target_grid(COUNT)
+        q = simulation.target_grid(machine, COUNT)
         scale = SCALE * np.random.default_rng([seed, 1]).normal()
-        errors = method.identify(machine.raw_multilateration(q, seed=seed, scale=scale), settings)
-        left = vectors(errors) - vectors(machine.truth_multilateration(q))
+        errors = method.identify(simulation.raw(machine, q, seed=seed, scale=scale), settings)
+        left = vectors(errors) - vectors(simulation.true_errors(machine, q))
         C = errors["covariance"].values[:, :3, :3]
         z.append(left / np.sqrt(np.einsum("tii->ti", C)))
         known = np.isfinite(left).all(axis=1)
         lost += int(np.count_nonzero(~known))
         chi2.append(np.mean([e @ np.linalg.solve(c, e) / 3 for e, c in zip(left[known], C[known], strict=True)]))
-        place = machine.reflector_places(q)
-        station = machine.tracker_places()
+        place = simulation.reflector_positions(machine, q)
+        station = simulation.stations(machine)
         true_station = station - of_the_datum(place, place - q - REFERENCE, station)
         least = bound(place, station, noise=NOISE)
         # The scale is no noise: the bound has it beside, one draw for all.
@@ -98,15 +98,15 @@ def axes(seeds: int) -> list[str]:
         held, ratio, inside, off = [], [], [], []
         for seed in range(seeds):
             machine = VirtualMachine(kind, seed=seed)
-            q = machine.target_grid(count)
-            errors = Multilateration().identify(machine.raw_multilateration(q, seed=seed))
+            q = simulation.target_grid(machine, count)
+            errors = Multilateration().identify(simulation.raw(machine, q, seed=seed))
             for name, value, u, true in curves(machine, errors):
                 held.append(np.mean(np.abs(value - true) <= Z95 * u))
                 ratio.append(np.mean((value - true) ** 2) / np.mean(u**2))
                 assert name
             between = grid(errors["axes_low"].values, errors["axes_high"].values, (6, 5, 5))
             volume = volumetric_errors(errors, between)
-            true = vectors(machine.truth_multilateration(np.concatenate([q, between])))
+            true = vectors(simulation.true_errors(machine, np.concatenate([q, between])))
             true -= of_the_datum(q, true[: len(q)], np.concatenate([q, between]))
             left, C = vectors(volume) - true[len(q) :], volume["covariance"].values[:, :3, :3]
             u = np.sqrt(np.einsum("tii->ti", C))

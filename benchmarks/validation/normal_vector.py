@@ -8,11 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, Settings, simulation
 from errormotion.methods.normal_vector.identification.bound import bound
 from errormotion.methods.normal_vector.identification.freedoms import Motion
 from errormotion.twin import Event, VirtualMachine
-from errormotion.twin.probing_rawdata import touch_normals
 
 TITLE = "Balls touched by the machine"
 SEEDS = 300
@@ -56,7 +55,7 @@ def probed(kind: str, seed: int, draw: int = 0):
     """Return machine and raw dataset of a warm-up."""
     machine = VirtualMachine(kind, seed=seed)
     machine.start((Event(time=CYCLE, spindle_speed=SPEED),))
-    return machine, machine.raw_normal_vector(BEGINS, seed=draw, balls=BALLS, touches=TOUCHES, cycle=CYCLE)
+    return machine, simulation.raw(machine, BEGINS, seed=draw, balls=BALLS, touches=TOUCHES, cycle=CYCLE)
 
 
 def off(machine: VirtualMachine, errors) -> np.ndarray:
@@ -72,7 +71,7 @@ def vectors(errors) -> np.ndarray:
 
 def least(machine: VirtualMachine, errors, raw) -> np.ndarray:
     """Return the bound of the standard uncertainties, (cycle, 6)."""
-    normal = np.tile(touch_normals(TOUCHES), (BALLS, 1, 1))
+    normal = np.tile(simulation.touch_normals(TOUCHES), (BALLS, 1, 1))
     balls = machine.balls_on_table(BALLS)
     place = balls.centre[:, None] + (balls.nominal_radius + machine.probe.tip_radius) * normal
     motion = Motion(machine.tool_axes, np.asarray(errors.attrs["functional_point"]))

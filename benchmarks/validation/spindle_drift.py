@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from errormotion.methods.spindle_drift import SpindleDrift
+from errormotion.methods.spindle_drift import SpindleDrift, simulation
 from errormotion.methods.spindle_drift.identification.beams import (
     circles_and_line,
     fisher_bound,
@@ -34,9 +34,9 @@ def drift(seeds: int) -> list[str]:
     for seed in range(seeds):
         machine = VirtualMachine("cframe", seed=seed)
         machine.start([Event(0.0, 15000.0)])
-        beams = method.identify(machine.raw_beam_detection(seed=10_000 + seed))
+        beams = method.identify(simulation.raw_beam_detection(machine, seed=10_000 + seed))
         known = tuple(beams[name].values for name in ("beam_origin", "beam_direction", "beam_covariance"))
-        raw = machine.raw_spindle_drift(TIMES, seed=seed, beams=known, expansion=True)
+        raw = simulation.raw_drift(machine, TIMES, seed=seed, beams=known, expansion=True)
         raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
         errors = method.identify(raw)
         twist = np.asarray(machine.truth_spindle(TIMES, errors.attrs["functional_point"]).em.twist())

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import circular_pocket, swept
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -109,7 +110,7 @@ def draw_rim(ax: Axes, machine: VirtualMachine) -> None:
 def draw_crossbeam(ax: Axes, machine: VirtualMachine) -> None:
     """Draw the six thermal errors along the crossbeam after three hours."""
     y = np.linspace(-0.8, 0.8, 200)
-    truth = machine.truth_crossbeam([WARM], y).isel(time=0)
+    truth = simulation.truth_axis(machine, [WARM], y).isel(time=0)
     lowest = np.inf
     for name in sorted(COLOURS, key=lambda name: -float(truth[name][-1])):
         curve = truth[name].values * 1e6

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.kinematics.beams import across
-from errormotion.methods.beam_direction import BeamDirection
+from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.settings import Settings
@@ -29,9 +29,9 @@ CIRCLE = np.linspace(0, 2 * np.pi, 91)
 
 def measured(machine: VirtualMachine, folder: Path) -> tuple[list, list]:
     """Return the results of many measurements on the same faces, compensated and not."""
-    calibrate(machine.raw_inclination(seed=1)).save(folder / "lk-h050.nc")
+    calibrate(simulation.raw_inclination(machine, seed=1)).save(folder / "lk-h050.nc")
     faces = [(np.radians(a), np.radians(b)) for a, b in FACES]
-    raws = [machine.raw_beam_direction(faces, seed=seed, speckle=True) for seed in SEEDS]
+    raws = [simulation.raw(machine, faces, seed=seed, speckle=True) for seed in SEEDS]
     method = BeamDirection()
     with_it, without = (Settings(compensation=name) for name in (str(folder / "lk-h050.nc"), None))
     return [method.identify(raw, with_it) for raw in raws], [method.identify(raw, without) for raw in raws]
@@ -55,7 +55,7 @@ def draw_region(ax: Axes, one, true: np.ndarray) -> None:
 
 def draw_bar(ax: Axes, machine: VirtualMachine, beams: list, calibrations: list) -> None:
     """Draw the residuals of a check bar as each beam sees it."""
-    scan = machine.raw_check_bar(seed=2)
+    scan = simulation.raw_check_bar(machine, seed=2)
     for errors, calibration, colour in zip(beams, calibrations, (ORANGE, BLUE), strict=True):
         where = [errors[name].values[0] for name in ("beam_origin", "beam_direction", "beam_covariance")]
         points, bar = measure_bar(scan, *where, calibration=calibration)

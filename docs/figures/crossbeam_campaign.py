@@ -12,7 +12,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from errormotion.datasets import DOF
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.profiler import Profiler
@@ -26,8 +26,9 @@ MINUTES = [0, 7, 30, 60, 120, 180]
 def measured(machine: VirtualMachine) -> xr.Dataset:
     """Return the errors of a campaign: the pose from a pocket, then scans of eight artefacts at six times."""
     method = CrossbeamScan()
-    pose = method.identify(machine.raw_pocket_scan(seed=1))
-    raw = machine.raw_crossbeam_scan(
+    pose = method.identify(simulation.raw_pocket(machine, seed=1))
+    raw = simulation.raw_scans(
+        machine,
         60.0 * np.array(MINUTES),
         PLACES,
         seed=1,

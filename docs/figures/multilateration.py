@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.multilateration import Multilateration
+from errormotion.methods.multilateration import Multilateration, simulation
 from errormotion.twin import VirtualMachine
 
 BLUE, ORANGE, GREY = "#1f5a96", "#d9822b", "#8a8f98"
@@ -50,8 +50,8 @@ def draw_volume(ax, found: xr.Dataset) -> None:
 def main() -> None:
     """Measure and draw."""
     machine, method = VirtualMachine("cframe", seed=3), Multilateration()
-    results = [method.identify(machine.raw_multilateration(seed=seed)) for seed in SEEDS]
-    truth = vectors(machine.truth_multilateration(machine.target_grid()))
+    results = [method.identify(simulation.raw(machine, seed=seed)) for seed in SEEDS]
+    truth = vectors(simulation.true_errors(machine, simulation.target_grid(machine)))
     off = [
         (vectors(ds) - truth) / np.sqrt(np.diagonal(ds["covariance"].values, axis1=1, axis2=2))[:, :3] for ds in results
     ]

@@ -1,7 +1,8 @@
-"""Many runs identified as a graph of small tasks: in threads or processes here, or on a Dask cluster.
+"""Identification of many runs as a graph of small tasks: in local threads or processes, or on a Dask cluster.
 
-A task takes paths and settings and leaves a file; no dataset travels. So the same tasks run anywhere that sees the same
-paths, a run that fails harms no other, and a batch that broke off goes on: what is there already is stepped over.
+A task receives paths and settings and writes a file; no dataset is transferred. The same tasks therefore run on any
+machine that sees the same paths, a run that fails does not affect the others, and an interrupted batch is continued:
+results that exist already are skipped.
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
+from errormotion.datasets.hashing import has_hash
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import PluginSettings
@@ -41,30 +44,30 @@ _turn = threading.Lock()
 
 SCHEDULERS = ("threads", "processes", "sync")
 MARK = "identified_from"
-"""Attribute of a result: hashes of the raw dataset and of the settings, by which a batch knows its own again."""
+"""Attribute of a result: hashes of the raw dataset and of the settings, from which a batch recognises its results."""
 CPU_COUNT = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-PATIENCE = 15.0
-"""Seconds until a cluster that does not answer, or has no worker, is given up."""
+CLUSTER_TIMEOUT = 15.0
+"""Time within which a cluster must answer and have a worker, s."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one run.
+    """Result of one run.
 
     Attributes
     ----------
     raw : Path
-        The raw dataset, or the run folder that stands for it.
+        The raw dataset, or the run folder that contains it.
     errors : Path or None
         The error dataset; None where there is none.
     reason : str
-        Why there is none.
+        Cause of the failure; empty where there is none.
     seconds : float
-        How long it took.
+        Duration, s.
     stepped_over : bool
-        Whether the error dataset was there already.
+        Whether the error dataset existed already.
     traceback : str
-        Of a mistake in errormotion or in a plugin; empty for what a person can mend.
+        Of a defect in errormotion or in a plugin; empty for errors that the user can correct.
     """
 
     raw: Path
@@ -76,10 +79,10 @@ class Outcome:
 
 
 class Task(NamedTuple):
-    """What one task is told; small, and good for any machine that sees the same paths."""
+    """Arguments of one task; valid on any machine that sees the same paths."""
 
     raw: str
-    place: str
+    out: str
     method_id: str
     method_version: str
     settings: str
@@ -96,26 +99,26 @@ def identify_runs(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> list[Outcome]:
-    """Identify many runs; each gives one NetCDF file, named after it, in one folder.
+    """Identify many runs; write one NetCDF file for each, named after it, into one folder.
 
     Parameters
     ----------
     raws : sequence of path
-        Raw datasets and run folders; a folder of run folders stands for those of the method.
+        Raw datasets and run folders; a folder of run folders means all of its runs of the method.
     method_id : str
         The method plugin.
     settings : PluginSettings
         For all of them.
     out : path
-        The folder; it is made where it is missing. A result that is there from the same raw data, settings and method
-        is stepped over, any other is never overwritten.
+        The folder; it is created if missing. An existing result of the same raw data, settings and method is skipped;
+        any other is never overwritten.
     scheduler : str, optional
         ``threads``, ``processes``, ``sync`` (one after another), or the address of a Dask scheduler, such as
-        ``tcp://host:8786``. By default what :func:`choose_scheduler` takes.
+        ``tcp://host:8786``. Default: see :func:`choose_scheduler`.
     workers : int, optional
-        Threads or processes; by default one for each processor. A cluster has the workers that it has.
+        Number of threads or processes; default one for each processor. Not for a cluster.
     progress : Progress, optional
-        Whom to tell.
+        Receives the progress.
 
     Returns
     -------
@@ -125,29 +128,29 @@ def identify_runs(
     Raises
     ------
     RunError
-        The batch as a whole cannot be done: no run, a scheduler that is unknown or silent, workers with another
-        errormotion, Dask missing.
+        The batch cannot be executed: no run, an unknown scheduler or one that does not answer, workers with another
+        version of errormotion, Dask missing.
     PluginError
         There is no such method.
     KeyboardInterrupt
-        The operator stopped it; what is done stays.
+        The operator stopped the batch; finished results are kept.
     """
     name, note = choose_scheduler(scheduler)
     if workers is not None and (workers < 1 or name not in SCHEDULERS):
-        raise RunError(f"Expected at least one worker, and none told for a cluster, which has its own; found {workers}")
+        raise RunError(f"--workers: expected 1 or more, and no number for a cluster; found {workers}")
     if note:
         log.warning("%s", note)
     method = plugins.get("methods", method_id)
-    found = list(_meant([Path(raw) for raw in raws], method_id))
+    found = list(_selected([Path(raw) for raw in raws], method_id))
     wanted = [raw for raw, reason in found if not reason]
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunError(f"{out}: expected a folder, or a place where one can be made; {error.strerror}") from error
-    told = (method.info.id, method.info.version, settings.model_dump_json(), __version__)
+        raise RunError(f"{out}: expected a folder that exists or can be created; {error.strerror}") from error
+    common = (method.info.id, method.info.version, settings.model_dump_json(), __version__)
     tasks = [
-        Task(str(raw_of(raw).resolve()), str(out.resolve() / f"{name}.nc"), *told)
+        Task(str(raw_of(raw).resolve()), str(out.resolve() / f"{name}.nc"), *common)
         for raw, name in zip(wanted, _names(wanted), strict=True)
     ]
     outcomes = {raw: Outcome(raw, reason=reason) for raw, reason in found if reason}
@@ -169,15 +172,18 @@ def identify_runs(
     try:
         _work(tasks, name, workers, done)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(f"{len(outcomes)} of {len(found)} runs are done; the same command goes on.") from error
+        raise KeyboardInterrupt(
+            f"{len(outcomes)} of {len(found)} runs are done; repeat the command to continue."
+        ) from error
     return [outcomes[raw] for raw, _ in found]
 
 
 def choose_scheduler(wanted: str | None) -> tuple[str, str]:
-    """Return the scheduler to take, and what is to be said of it (empty where nothing is).
+    """Return the scheduler to use, and a note on it (empty if there is none).
 
-    Processes are the default. Much of an identification is Python and HDF5, which threads can only do one at a time;
-    its kernels use all processors in any case. A process costs some seconds to start, as much as a few small runs.
+    Processes are the default: much of an identification is Python and HDF5, which only one thread at a time can
+    execute, and its kernels use all processors in any case. Starting a process takes some seconds, as long as a few
+    small runs.
 
     Raises
     ------
@@ -189,34 +195,24 @@ def choose_scheduler(wanted: str | None) -> tuple[str, str]:
             f"Expected {', '.join(SCHEDULERS)} or the address of a Dask scheduler, such as tcp://host:8786; "
             f"found '{wanted}'"
         )
-    if wanted == "threads" and _takes_turns():
+    if wanted == "threads" and _one_thread_at_a_time():
         return wanted, (
-            "The threads identify one run at a time: numba has only its 'workqueue' layer here, which ends the process "
-            "when two threads use it at once. Take processes, or install OpenMP (libgomp, libomp) or TBB."
+            "The threads identify one run at a time: numba has only its 'workqueue' layer, which ends the process "
+            "when two threads use it simultaneously. Use processes, or install OpenMP (libgomp, libomp) or TBB."
         )
     return wanted or ("processes" if CPU_COUNT > 1 else "sync"), ""
 
 
-def _takes_turns() -> bool:
-    """Whether numba's parallel kernels may be called from one thread at a time only."""
+def _one_thread_at_a_time() -> bool:
+    """Return whether numba's parallel kernels may be called from only one thread at a time."""
     import numba
 
-    numba.get_num_threads()  # settles the layer
+    numba.get_num_threads()  # selects the layer
     return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
 
 
-def raw_of(path: Path) -> Path:
-    """Return the raw dataset that a path means: a run folder stands for its raw store."""
-    return path / "raw.zarr" if (path / "run.json").exists() else path
-
-
-def is_runs_folder(path: Path) -> bool:
-    """Whether a path is a folder of run folders."""
-    return path.is_dir() and not (path / "run.json").exists() and any(path.glob("*/run.json"))
-
-
-def _meant(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
-    """Yield what is to be identified, each once, with the reason where it cannot be."""
+def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
+    """Yield each path to be identified once, with the reason if it cannot be identified."""
     seen: set[Path] = set()
     for raw in raws:
         for path, reason in _runs(raw, method_id) if is_runs_folder(raw) else [(raw, "")]:
@@ -229,7 +225,7 @@ def _meant(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
 
 
 def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
-    """Return the runs of a method in a folder, with the reason where one cannot be identified."""
+    """Return the runs of a method in a folder, with the reason for those that cannot be identified."""
     found: list[tuple[Path, str]] = []
     others: set[str] = set()
     for path in sorted(file.parent for file in folder.glob("*/run.json") if not file.parent.name.startswith(".")):
@@ -243,15 +239,15 @@ def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
         elif data["acquired"]:
             found.append((path, ""))
         else:
-            go_on = f"'errormotion run --resume --runs {folder}' goes on with it"
-            found.append((path, f"{path}: its measurement is not complete ({data['status']}); {go_on}"))
+            resume = f"continue it with 'errormotion run --resume --runs {folder}'"
+            found.append((path, f"{path}: the measurement is not complete ({data['status']}); {resume}"))
     if not found:
         raise RunError(f"{folder}: expected runs of the method '{method_id}'; found {', '.join(sorted(others))}")
     return found
 
 
 def _names(raws: Sequence[Path]) -> list[str]:
-    """Return a name for each: its own without the ending, behind those of its folders where several share it."""
+    """Return a name for each: its own without suffix, preceded by those of its folders where names are equal."""
     parts = [(*raw.resolve().parts[1:-1], raw.resolve().name if raw_of(raw) != raw else raw.stem) for raw in raws]
     depth = [1] * len(parts)
     while True:
@@ -261,35 +257,35 @@ def _names(raws: Sequence[Path]) -> list[str]:
             return names
         if all(depth[k] >= len(parts[k]) for k in alike):
             same = " and ".join(str(raws[k]) for k in alike if names[k] == names[alike[0]])
-            raise RunError(f"{same}: both would become {names[alike[0]]}.nc; identify them into two folders")
+            raise RunError(f"{same}: both results would be named {names[alike[0]]}.nc; identify them into two folders")
         for k in alike:
             depth[k] += 1
 
 
 def _work(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
-    """Do all tasks, and tell each outcome when it is there."""
+    """Execute all tasks, and call ``done`` with each outcome."""
     if scheduler == "sync":
         for task in tasks:
             done(_identify(*task))
     elif scheduler in SCHEDULERS:
-        _here(tasks, scheduler, workers, done)
+        _locally(tasks, scheduler, workers, done)
     else:
         _on_cluster(tasks, scheduler, done)
 
 
-def _here(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
-    """Work in threads or processes of this machine."""
+def _locally(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
+    """Execute the tasks in threads or processes of this machine."""
     try:
         from dask.base import compute
         from dask.callbacks import Callback
         from dask.delayed import delayed
     except ImportError as error:
         raise _missing("dask") from error
-    told: set[str] = set()
+    finished: set[str] = set()
 
     def after(_key: Any, value: Any, *_: Any) -> None:
         if isinstance(value, Outcome):
-            told.add(str(value.raw))
+            finished.add(str(value.raw))
             done(value)
 
     graph = [delayed(_identify, pure=False)(*task) for task in tasks]
@@ -299,37 +295,35 @@ def _here(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Call
         executor = ThreadPoolExecutor(count)
     else:
         executor = ProcessPoolExecutor(
-            count, multiprocessing.get_context("spawn"), _begin, (max(1, CPU_COUNT // count),)
+            count, multiprocessing.get_context("spawn"), _start_process, (max(1, CPU_COUNT // count),)
         )
     try:
         with executor, Callback(posttask=after):
             compute(*graph, scheduler=scheduler, pool=executor, chunksize=1)
     except BrokenProcessPool:
         for task in tasks:
-            if task.raw not in told:
-                reason = (
-                    "a process died while it was at work (memory? fewer --workers take less); the same command goes on"
-                )
+            if task.raw not in finished:
+                reason = "the process ended unexpectedly (use fewer --workers if memory is short); repeat the command"
                 done(Outcome(Path(task.raw), reason=reason))
 
 
-def _begin(threads: int) -> None:
-    """Set up a process: its share of the processors, and Ctrl-C left to the process that started it."""
+def _start_process(threads: int) -> None:
+    """Set up a process: its number of threads; Ctrl-C is handled by the parent process."""
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _on_cluster(tasks: Sequence[Task], address: str, done: Callable[[Outcome], None]) -> None:
-    """Work on the machines of a Dask cluster."""
+    """Execute the tasks on a Dask cluster."""
     try:
         from dask.delayed import delayed
         from distributed import Client, as_completed
     except ImportError as error:
         raise _missing("distributed") from error
     try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
+        client = Client(address, timeout=CLUSTER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise RunError(f"{address}: expected a Dask scheduler there; none answers ({error})") from error
+        raise RunError(f"{address}: expected a Dask scheduler; none answers ({error})") from error
     with client:
         _check_workers(client, address)
         futures = client.compute([delayed(_identify, pure=False)(*task) for task in tasks])
@@ -337,15 +331,15 @@ def _on_cluster(tasks: Sequence[Task], address: str, done: Callable[[Outcome], N
         for future in as_completed(futures, loop=client.loop):
             if future.status == "finished":
                 done(future.result())
-            else:  # the task did not even come to its own error: a worker died, or has no errormotion
-                reason = f"the cluster could not do it: {future.exception() or future.status}"
+            else:  # the task did not reach its own error handling: a worker died, or lacks errormotion
+                reason = f"the cluster did not execute it: {future.exception() or future.status}"
                 done(Outcome(Path(task_of[future].raw), reason=reason))
 
 
 def _check_workers(client: Client, address: str) -> None:
-    """Refuse a cluster without workers, or whose workers have another errormotion."""
+    """Raise RunError for a cluster without workers, or whose workers have another version of errormotion."""
     try:
-        client.wait_for_workers(1, timeout=PATIENCE)
+        client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
     except TimeoutError as error:
         raise RunError(
             f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'"
@@ -358,67 +352,66 @@ def _check_workers(client: Client, address: str) -> None:
     ]
     if wrong:
         raise RunError(
-            f"{address}: expected errormotion {__version__} on every worker; {', '.join(wrong)}. Install it there"
+            f"{address}: expected errormotion {__version__} on every worker; {', '.join(wrong)}. Install it there."
         )
 
 
 def _missing(package: str) -> RunError:
     return RunError(
-        f"Several runs at once need the package '{package}', which is not installed: "
-        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' identifies one after another."
+        f"Parallel identification needs the package '{package}', which is not installed: "
+        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' identifies one run after another."
     )
 
 
-def _identify(raw: str, place: str, method_id: str, method_version: str, settings: str, version: str) -> Outcome:
-    """Do one task; whatever goes wrong becomes an outcome."""
-    began = time.perf_counter()
+def _identify(raw: str, out: str, method_id: str, method_version: str, settings: str, version: str) -> Outcome:
+    """Execute one task; every error becomes an outcome."""
+    start = time.perf_counter()
     reason = trace = ""
     stepped_over = False
     try:
-        stepped_over = _identify_or_raise(Task(raw, place, method_id, method_version, settings, version))
+        stepped_over = _identify_or_raise(Task(raw, out, method_id, method_version, settings, version))
     except ErrormotionError as error:
         reason = str(error)
-    except Exception as error:  # noqa: BLE001 - a plugin that breaks on one run must not take the others with it
+    except Exception as error:  # noqa: BLE001 - a plugin that fails on one run must not affect the others
         reason, trace = f"{type(error).__name__}: {error}", tracebacks.format_exc()
-    errors = None if reason else Path(place)
-    return Outcome(Path(raw), errors, reason, time.perf_counter() - began, stepped_over, trace)
+    errors = None if reason else Path(out)
+    return Outcome(Path(raw), errors, reason, time.perf_counter() - start, stepped_over, trace)
 
 
 def _identify_or_raise(task: Task) -> bool:
-    """Leave the errors of one raw dataset at its place; return whether they were there already."""
+    """Write the errors of one raw dataset; return whether they existed already."""
     method = plugins.get("methods", task.method_id)
     for what, wanted, found in (
         ("errormotion", task.version, __version__),
         (f"the method {task.method_id}", task.method_version, method.info.version),
     ):
         if wanted != found:
-            raise RunError(f"{platform.node()}: expected {what} in version {wanted}; found {found}. Install it there")
+            raise RunError(f"{platform.node()}: expected {what} in version {wanted}; found {found}. Install it there.")
     settings = method.Settings.model_validate_json(task.settings)
     plain = provenance.plain(settings.model_dump(mode="json"))
-    place = Path(task.place)
+    path = Path(task.out)
     with reading(task.raw), datasets.load(task.raw) as dataset:
-        mark = {
-            "raw": datasets.hash_dataset(dataset),
-            "settings": settings_hash(plain, task.method_id, task.method_version),
-        }
-        if place.exists():
-            if datasets.load(place).attrs.get(MARK) == json.dumps(mark):
+        settings_mark = settings_hash(plain, task.method_id, task.method_version)
+        if path.exists():
+            found = json.loads(datasets.load(path).attrs.get(MARK, "{}"))
+            if found.get("settings") == settings_mark and has_hash(dataset, str(found.get("raw"))):
                 return True
             raise DatasetError(
-                f"{place}: exists already, from other raw data, other settings or another version of the method, and "
-                "a result is never overwritten; give another folder to --out"
+                f"{path}: exists already, from other raw data, other settings or another version of the method, and "
+                "a result is never overwritten; specify another folder with --out"
             )
-        with _turn if _takes_turns() else nullcontext():
+        with _turn if _one_thread_at_a_time() else nullcontext():
             errors = method().identify(dataset, settings)
+        mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)
-    with _locks_of_its_own():
-        datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), place)
+    with _local_locks():
+        datasets.save(errors.assign_attrs({MARK: json.dumps(mark)}), path)
     return False
 
 
 @contextmanager
-def _locks_of_its_own() -> Iterator[None]:
-    """Keep xarray on a worker from asking the cluster for a lock: for a file composed in memory there is none."""
+def _local_locks() -> Iterator[None]:
+    """Prevent xarray on a worker from requesting a lock of the cluster: a file composed in memory has none."""
     if "distributed" not in sys.modules:
         yield
         return

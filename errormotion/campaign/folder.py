@@ -1,6 +1,6 @@
 """A run folder: ``runs/<utc>-<test>-<id>/`` and its ``run.json``.
 
-``run.json`` is replaced in one rename, so it is whole at every moment. All paths in it are relative to the folder,
+``run.json`` is replaced by a rename and is therefore complete at any time. All paths in it are relative to the folder,
 which can be moved together with its neighbours.
 """
 
@@ -21,7 +21,7 @@ from errormotion.errors import RunError
 
 SCHEMA = "errormotion.run/1"
 RESERVE_BYTES = 2**18
-"""Kept in the folder while measuring, and given up when the disk is full, so that run.json and the log still fit."""
+"""Reserved during a measurement and released at its end, so that run.json and the log fit on a full disk, bytes."""
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class RunFolder:
     path : Path
         The folder.
     data : dict
-        What ``run.json`` says.
+        Content of ``run.json``.
     """
 
     def __init__(self, path: Path, data: dict[str, Any]) -> None:
@@ -43,24 +43,24 @@ class RunFolder:
 
     @classmethod
     def create(cls, runs: Path, test: str, run_id: str, data: dict[str, Any]) -> Self:
-        """Make a folder with its ``run.json``, in one rename.
+        """Create a folder with its ``run.json``, by a rename.
 
         Raises
         ------
         RunError
-            The folder exists, or cannot be made.
+            The folder exists, or cannot be created.
         """
         name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{test}-{run_id}"
         path, part = runs / name, runs / f".{name}.part"
         if path.exists():
-            raise RunError(f"{path}: exists already, and a run is never overwritten")
+            raise RunError(f"{path}: exists already; a run is never overwritten")
         try:
             part.mkdir(parents=True)
             folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
             folder.save()
             part.rename(path)
         except OSError as error:
-            raise RunError(f"{path}: cannot make the run folder: {error.strerror}") from error
+            raise RunError(f"{path}: the run folder cannot be created: {error.strerror}") from error
         folder.path = path
         return folder
 
@@ -71,7 +71,7 @@ class RunFolder:
         Raises
         ------
         RunError
-            It is none, or its ``run.json`` is broken.
+            The path is not a run folder, or its ``run.json`` is damaged.
         """
         path = Path(path)
         file = path / "run.json"
@@ -81,7 +81,8 @@ class RunFolder:
             raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
         except ValueError as error:
             raise RunError(
-                f"{file}: is no JSON ({error}); restore it from a copy, or identify raw.zarr by hand"
+                f"{file}: is not valid JSON ({error}); restore it from a copy, "
+                "or identify raw.zarr with 'errormotion identify'"
             ) from error
         if not isinstance(data, dict) or data.get("schema") != SCHEMA:
             found = data.get("schema") if isinstance(data, dict) else type(data).__name__
@@ -89,12 +90,12 @@ class RunFolder:
         return cls(path, data)
 
     def save(self, **changes: Any) -> None:
-        """Change fields of ``run.json`` and write it."""
+        """Change fields of ``run.json`` and write the file."""
         self.data |= changes | {"updated": now()}
         replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 
     def step(self, name: str, outcome: str, **details: Any) -> None:
-        """Add one line to what happened to this run."""
+        """Append an entry to the steps of this run."""
         self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
 
     @property
@@ -114,21 +115,21 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has its result."""
+        """Return whether the run has its result."""
         return bool(self.data.get("status") == "finished")
 
     def take_reserve(self) -> None:
-        """Set a little disk space aside."""
+        """Reserve disk space."""
         with suppress(OSError):
             (self.path / ".reserve").write_bytes(os.urandom(RESERVE_BYTES))
 
     def give_reserve(self) -> None:
-        """Give the space that was set aside back."""
+        """Release the reserved disk space."""
         (self.path / ".reserve").unlink(missing_ok=True)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes out; the lock ends with the process, whatever ends it.
+        """Lock the folder against other processes; the lock ends with the process.
 
         Raises
         ------
@@ -146,7 +147,7 @@ class RunFolder:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise RunError(
-                    f"{self.path}: another process is working on this run; wait for it, or end it"
+                    f"{self.path}: another process is working on this run; wait until it ends, or stop it"
                 ) from error
             yield
         finally:
@@ -154,17 +155,17 @@ class RunFolder:
 
 
 def list_runs(runs: Path) -> list[RunFolder]:
-    """Return the run folders below a folder, the oldest first; one that cannot be read is logged and left out."""
+    """Return the run folders in a folder, the oldest first; unreadable ones are logged and skipped."""
     found = []
     for path in sorted(runs.iterdir()) if runs.is_dir() else []:
         if path.is_dir() and not path.name.startswith(".") and (path / "run.json").exists():
             try:
                 found.append(RunFolder.open(path))
             except RunError as error:
-                log.warning("left out: %s", error)
+                log.warning("skipped: %s", error)
     return sorted(found, key=lambda folder: str(folder.data.get("created", "")))
 
 
 def now() -> str:
-    """Return the time now in UTC, ISO 8601."""
+    """Return the present time in UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

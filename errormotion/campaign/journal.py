@@ -13,7 +13,7 @@ ROOT = "errormotion"
 
 
 class JsonLines(logging.Formatter):
-    """Turn a record into one line of JSON; fields given as ``extra={"data": {...}}`` ride along."""
+    """Format a record as one line of JSON, with the fields given as ``extra={"data": {...}}``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
@@ -31,7 +31,7 @@ class JsonLines(logging.Formatter):
 
 
 class _Handler(logging.FileHandler):
-    """Writes what it can: a full disk must not end a measurement by way of its log."""
+    """Ignores write errors: a full disk must not end a measurement because of its log."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass
@@ -39,7 +39,7 @@ class _Handler(logging.FileHandler):
 
 @contextmanager
 def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
-    """Write everything that errormotion logs to a file, behind what is there, for as long as the context lasts."""
+    """Append all log records of errormotion to a file while the context lasts."""
     logger = logging.getLogger(ROOT)
     handler = _Handler(path, encoding="utf-8", delay=True)
     handler.setFormatter(JsonLines())

@@ -1,4 +1,4 @@
-"""Limits of a machine: what no test may make it leave, checked before anything moves."""
+"""Limits of a machine, checked for all tests before anything moves."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _ROUNDING = 1e-9
 
 
 class Limits(BaseModel):
-    """``[limits]`` of a bench file; what is not given is not limited."""
+    """``[limits]`` of a bench file; quantities without a limit are not checked."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    X: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of X")
-    Y: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of Y")
-    Z: tuple[Length, Length] | None = Field(default=None, description="lowest and highest place of Z")
+    X: tuple[Length, Length] | None = Field(default=None, description="lowest and highest position of X")
+    Y: tuple[Length, Length] | None = Field(default=None, description="lowest and highest position of Y")
+    Z: tuple[Length, Length] | None = Field(default=None, description="lowest and highest position of Z")
     feed: Velocity | None = Field(default=None, description="highest feed", gt=0)
     spindle_speed: Speed | None = Field(default=None, description="highest spindle speed", ge=0)
 
@@ -32,22 +32,24 @@ class Limits(BaseModel):
         for axis in AXES:
             span = getattr(self, axis)
             if span is not None and not span[0] < span[1]:
-                raise ValueError(f"{axis}: expected the lowest place before the highest; found {span[0]}, {span[1]} m")
+                raise ValueError(
+                    f"{axis}: expected the lowest position, then the highest; found {span[0]}, {span[1]} m"
+                )
         return self
 
 
 @dataclass(frozen=True)
 class Extent:
-    """What a test asks of a machine.
+    """Requirements of a test on a machine.
 
     Attributes
     ----------
     seconds : float
-        How long it takes.
-    way : float
+        Duration, s.
+    path : float
         Length of all moves, m.
     low, high : (3,) tuple of float
-        Least and greatest place of X, Y, Z, m; NaN where nothing moves.
+        Lowest and highest position of X, Y, Z, m; NaN where nothing moves.
     feed : float
         Highest feed, m/s; 0 where nothing moves.
     spindle_speed : float
@@ -56,7 +58,7 @@ class Extent:
     """
 
     seconds: float
-    way: float
+    path: float
     low: tuple[float, ...]
     high: tuple[float, ...]
     feed: float
@@ -66,13 +68,13 @@ class Extent:
 
 
 def extent(steps: Sequence[Step]) -> Extent:
-    """Return what steps ask of a machine."""
-    places = [step.place for step in steps if step.place is not None]
-    columns = list(zip(*places, strict=True)) or [(math.nan,)] * 3
+    """Return the requirements of steps on a machine."""
+    positions = [step.place for step in steps if step.place is not None]
+    columns = list(zip(*positions, strict=True)) or [(math.nan,)] * 3
     moving = [step for step in steps if step.place is not None]
     return Extent(
         math.fsum(step.seconds for step in steps),
-        math.fsum(math.dist(a, b) for a, b in pairwise(places)),
+        math.fsum(math.dist(a, b) for a, b in pairwise(positions)),
         tuple(min(column) for column in columns),
         tuple(max(column) for column in columns),
         max((step.feed for step in moving), default=0.0),
@@ -83,28 +85,28 @@ def extent(steps: Sequence[Step]) -> Extent:
 
 
 def violations(found: Extent, limits: Limits) -> list[str]:
-    """Return in one sentence each what would leave the limits."""
-    told = []
+    """Return every violation of the limits, one sentence each."""
+    exceeded = []
     for k, axis in enumerate(AXES):
         span = getattr(limits, axis)
         if span is None or math.isnan(found.low[k]):
             continue
         if found.low[k] < span[0] - _ROUNDING or found.high[k] > span[1] + _ROUNDING:
-            told.append(
+            exceeded.append(
                 f"{axis} would go from {_mm(found.low[k])} to {_mm(found.high[k])}; its limits are {_mm(span[0])} and "
                 f"{_mm(span[1])}"
             )
     if limits.feed is not None and found.feed > limits.feed * (1 + _ROUNDING):
-        told.append(f"the feed would be {_feed(found.feed)}; its limit is {_feed(limits.feed)}")
+        exceeded.append(f"the feed would be {_feed(found.feed)}; its limit is {_feed(limits.feed)}")
     if limits.spindle_speed is not None and found.spindle_speed > limits.spindle_speed:
-        told.append(
+        exceeded.append(
             f"the spindle would turn at {found.spindle_speed:g} /min; its limit is {limits.spindle_speed:g} /min"
         )
-    return told
+    return exceeded
 
 
 def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[Step] | None:
-    """Return every step that a test will make the machine do; None where the method does not say.
+    """Return every step of the machine in a test; None where the method does not state its motions.
 
     Parameters
     ----------

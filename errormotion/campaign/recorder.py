@@ -1,4 +1,4 @@
-"""The thread that brings raw data to the disk while the method goes on measuring."""
+"""The thread that writes raw data to disk while the method measures."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import xarray as xr
 from errormotion.campaign.store import RawStore
 from errormotion.errors import RunError
 
-COMMIT_SECONDS = 0.5
-"""Longest time that samples wait before a reader of the folder sees them; half of what a crash may cost."""
+COMMIT_INTERVAL = 0.5
+"""Longest time until a reader of the folder sees new samples, s; half of what a crash may lose."""
 
 log = logging.getLogger(__name__)
 
 
 class DiskFullError(RunError):
-    """The disk did not take what was measured."""
+    """The disk is full."""
 
 
 class Recorder:
@@ -32,7 +32,7 @@ class Recorder:
     Parameters
     ----------
     path : Path
-        The raw store; made with the first dataset where there is none.
+        The raw store; created with the first dataset where there is none.
     dim : str
         The dimension that grows.
     expected : float
@@ -50,27 +50,27 @@ class Recorder:
 
     @property
     def committed(self) -> int:
-        """Samples that are safe on disk."""
+        """Number of samples on disk."""
         return self._store.committed if self._store else 0
 
     @property
     def attrs(self) -> dict[str, Any]:
-        """Attributes of the store, the counts of dropped and invalid samples among them."""
+        """Attributes of the store, including the counts of dropped and invalid samples."""
         return self._store.attrs if self._store else {}
 
     def put(self, chunk: xr.Dataset) -> None:
-        """Hand a dataset over; it must not be changed afterwards. Waits while the disk is behind.
+        """Queue a dataset for writing; it must not be changed afterwards. Blocks while the queue is full.
 
         Raises
         ------
         DiskFullError
-            The disk is full. What is committed stays whole.
+            The disk is full. Committed data remain complete.
         RunError
-            The data does not fit what is there, or the disk refuses it.
+            The data do not fit the store, or cannot be written.
         """
         while True:
             if self._error is not None:
-                self._complain()
+                self._raise()
             try:
                 self._queue.put(chunk, timeout=0.2)
             except queue.Full:
@@ -92,7 +92,7 @@ class Recorder:
             break
         self._thread.join()
         if self._error is not None and (error is None or not isinstance(error, Exception)):
-            self._complain()
+            self._raise()
 
     def _work(self) -> None:
         try:
@@ -104,7 +104,7 @@ class Recorder:
     def _write_all(self) -> None:
         waiting_since: float | None = None
         while True:
-            limit = None if waiting_since is None else max(waiting_since + COMMIT_SECONDS - time.monotonic(), 0.0)
+            limit = None if waiting_since is None else max(waiting_since + COMMIT_INTERVAL - time.monotonic(), 0.0)
             try:
                 chunk = self._queue.get(timeout=limit)
                 if chunk is None:
@@ -114,7 +114,7 @@ class Recorder:
                     waiting_since = waiting_since or time.monotonic()
             except queue.Empty:
                 pass
-            if self._store and waiting_since is not None and time.monotonic() - waiting_since >= COMMIT_SECONDS:
+            if self._store and waiting_since is not None and time.monotonic() - waiting_since >= COMMIT_INTERVAL:
                 self._store.commit()
                 waiting_since = None
         if self._store:
@@ -126,12 +126,12 @@ class Recorder:
             self._store = RawStore.create(self._path, first, self._dim, self._expected)
         self._store.append(chunk)
 
-    def _complain(self) -> None:
+    def _raise(self) -> None:
         error = self._error
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DiskFullError(f"The disk is full: {self._saved()} are safe in {self._path}.") from error
+            raise DiskFullError(f"The disk is full: {self._saved()} are stored in {self._path}.") from error
         if isinstance(error, OSError):
-            raise RunError(f"{self._path} cannot be written: {error.strerror}; {self._saved()} are safe.") from error
+            raise RunError(f"{self._path} cannot be written: {error.strerror}; {self._saved()} are stored.") from error
         if isinstance(error, RunError):
             raise error
         raise RunError(f"The recorder of {self._path} stopped: {type(error).__name__}: {error}") from error

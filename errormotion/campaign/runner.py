@@ -1,7 +1,7 @@
-"""The runner: test by test acquire, identify and report, and go on after an interruption.
+"""The runner: acquisition, identification and report of each test, and continuation after an interruption.
 
-Everything is on disk before it is used: the settings before the first sample, the raw data before the identification,
-the errors before the report. Whatever ends a run, its folder says how far it came, and :func:`resume` goes on there.
+Everything is stored before it is used: the settings before the first sample, the raw data before the identification,
+the errors before the report. However a run ends, its folder states its progress, and :func:`resume` continues it.
 """
 
 from __future__ import annotations
@@ -36,44 +36,44 @@ log = logging.getLogger(__name__)
 
 
 class Progress(Protocol):
-    """What the runner tells a person while it works."""
+    """Receives the progress of a campaign."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        """Begin a test, or step over one that is finished."""
+        """Start a test, or skip a finished one."""
 
     def stage(self, name: str, total: float | None = None) -> None:
-        """Begin a part of a test; ``total`` in the unit of :meth:`advance`, None where it is not known."""
+        """Start a stage of a test; ``total`` in the unit of :meth:`advance`, None if unknown."""
 
     def advance(self, done: float) -> None:
-        """Say how much of the part is done: seconds of evenly spaced samples, else items."""
+        """Report the completed part of the stage: seconds of evenly spaced samples, else items."""
 
     @property
     def shown(self) -> bool:
-        """Whether anybody sees it: what costs time to find out is told only then."""
+        """Return whether the progress is displayed; notes that take time to compute are omitted otherwise."""
 
     def note(self, text: str) -> None:
-        """Say what the measurement shows so far."""
+        """Report an intermediate result of the measurement."""
 
 
 class Quiet:
-    """Tells nothing."""
+    """Ignores the progress."""
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        """Tell nothing."""
+        """Do nothing."""
 
     def stage(self, name: str, total: float | None = None) -> None:
-        """Tell nothing."""
+        """Do nothing."""
 
     def advance(self, done: float) -> None:
-        """Tell nothing."""
+        """Do nothing."""
 
     @property
     def shown(self) -> bool:
-        """Nobody sees it."""
+        """Return False."""
         return False
 
     def note(self, text: str) -> None:
-        """Tell nothing."""
+        """Do nothing."""
 
 
 def run(
@@ -84,20 +84,20 @@ def run(
     ask: Callable[[str], None] | None = None,
     report: Callable[[Path], Path] | None = None,
 ) -> list[RunFolder]:
-    """Make every test of a campaign.
+    """Execute every test of a campaign.
 
     Parameters
     ----------
     campaign : CampaignPlan
-        What to do.
+        The campaign.
     runs : Path, optional
-        Where run folders go, a local folder; by default what the campaign file says.
+        Local folder of the run folders; default that of the campaign file.
     progress : Progress, optional
-        Whom to tell.
+        Receives the progress.
     ask : callable, optional
-        How to ask the operator; see :class:`~errormotion.campaign.bench.OpenBench`.
+        Sends a request to the operator; see :class:`~errormotion.campaign.bench.OpenBench`.
     report : callable, optional
-        Writes the report of a run folder, and returns where it is.
+        Writes the report of a run folder, and returns its path.
 
     Returns
     -------
@@ -107,11 +107,11 @@ def run(
     Raises
     ------
     BenchError
-        The instruments did not come up. Nothing was measured.
+        An instrument could not be opened. Nothing was measured.
     RunError
-        A test failed. Its message says which and why, where the data is, and how to go on.
+        A test failed. The message states the test, the cause, the location of the data, and how to continue.
     KeyboardInterrupt
-        The operator stopped the run; the folder is whole and can be resumed.
+        The operator stopped the run; the folder is complete and can be resumed.
     """
     session = _Session(campaign, runs or campaign.runs, uuid4().hex[:8], progress, ask, report)
     return session.work({})
@@ -125,24 +125,24 @@ def resume(
     ask: Callable[[str], None] | None = None,
     report: Callable[[Path], Path] | None = None,
 ) -> list[RunFolder]:
-    """Go on with the newest unfinished campaign of a runs folder; finished tests are stepped over.
+    """Continue the newest unfinished campaign of a runs folder; finished tests are skipped.
 
     Parameters
     ----------
     campaign : CampaignPlan, optional
-        Go on with this one only. Its files must be as they were when it was started.
+        Continue only this one. Its files must not have changed since it was started.
     runs, progress, ask, report
         As for :func:`run`.
 
     Raises
     ------
     RunError
-        Nothing there is unfinished, or the campaign's files have changed; and as for :func:`run`.
+        No campaign is unfinished, or the campaign's files have changed; and as for :func:`run`.
     """
     runs = runs or (campaign.runs if campaign else Path("runs"))
     groups: dict[str, list[RunFolder]] = {}
     for folder in list_runs(runs):
-        if "campaign" not in folder.data:  # the log of a monitor
+        if "campaign" not in folder.data:  # a log
             continue
         groups.setdefault(str(folder.data["id"]), []).append(folder)
     changed = ""
@@ -158,14 +158,14 @@ def resume(
         return session.work({str(folder.data["test"]): folder for folder in folders})
     if changed and campaign:
         raise RunError(
-            f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Go on with the "
-            "files as they were: 'errormotion run --resume' without the campaign. Or start anew: without --resume."
+            f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
+            "stored files: 'errormotion run --resume' without the campaign. Or start again: without --resume."
         )
-    raise RunError(f"Nothing to resume in {runs}: {len(groups)} campaigns there, all of them finished.")
+    raise RunError(f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished.")
 
 
 class _Session:
-    """One campaign from here to its end."""
+    """Execution of one campaign."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class _Session:
         self.report = report
 
     def work(self, folders: dict[str, RunFolder]) -> list[RunFolder]:
-        """Do what is not finished."""
+        """Execute the unfinished tests."""
         with ExitStack() as opened:
             for number, test in enumerate(self.campaign.tests):
                 folder = folders.get(test.name)
@@ -245,7 +245,7 @@ class _Session:
         for key, name in test.inputs.items():
             source = folders[name]
             if source.errors is None:
-                raise RunError(f"{source.path}: expected the errors that test '{test.name}' needs; found none")
+                raise RunError(f"{source.path}: expected the errors that the test '{test.name}' needs; found none")
             inputs[key] = datasets.load(source.errors)
             folder.data["inputs"][key] = f"../{source.path.name}/{source.data['errors']}"
         folder.save(status="running", reason="")
@@ -259,7 +259,9 @@ class _Session:
     def _acquire(self, folder: RunFolder, test: TestPlan, inputs: Mapping[str, xr.Dataset]) -> None:
         method, bench = test.method(), self.bench.chosen(test.instruments)
         dim, expected = method.append_dim(test.settings), float(method.progress(test.settings))
-        if folder.raw.exists() and committed_length(folder.raw, dim) == 0:  # made, and cut off before its first samples
+        if (
+            folder.raw.exists() and committed_length(folder.raw, dim) == 0
+        ):  # created, but interrupted before its first samples
             shutil.rmtree(folder.raw)
         done = datasets.load(folder.raw) if folder.raw.exists() else None
         before = int(done.sizes[dim]) if done is not None else 0
@@ -273,7 +275,7 @@ class _Session:
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
-        tell = follow(test.settings) if follow else None
+        note = follow(test.settings) if follow else None
         try:
             with (
                 _in_order(),
@@ -285,10 +287,10 @@ class _Session:
                     taken += chunk.sizes.get(dim, 0)
                     rate = chunk.attrs.get("sample_rate")
                     self.progress.advance(taken / rate if rate else taken)
-                    if tell:
-                        self.progress.note(tell(chunk))
+                    if note:
+                        self.progress.note(note(chunk))
         finally:
-            if recorder.committed == 0 and folder.raw.exists():  # made, and not one sample came to it
+            if recorder.committed == 0 and folder.raw.exists():  # created, but without samples
                 shutil.rmtree(folder.raw)
             folder.give_reserve()
             folder.data["samples"] = {
@@ -305,19 +307,19 @@ class _Session:
     def _identify(self, folder: RunFolder, test: TestPlan) -> None:
         self.progress.stage("identifying")
         method = test.method()
-        place = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
-        if not (folder.path / place).exists():  # else: computed, but the process ended before run.json said so
+        path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
+        if not (folder.path / path).exists():  # else: computed, but the process ended before run.json was written
             with datasets.load(folder.raw) as raw:
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
-            (folder.path / place).parent.mkdir(parents=True, exist_ok=True)
-            datasets.save(errors, folder.path / place)
+            (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
+            datasets.save(errors, folder.path / path)
         folder.step("identify", "done")
-        folder.save(errors=place)
-        log.info("identified", extra={"data": {"errors": place}})
+        folder.save(errors=path)
+        log.info("identified", extra={"data": {"errors": path}})
 
     def _report(self, folder: RunFolder) -> None:
-        """Write the report; the measurement is good without, so a report that fails is noted and no more."""
+        """Write the report; a failure is only logged, since the measurement is valid without it."""
         if self.report is None:
             return
         self.progress.stage("writing the report")
@@ -332,7 +334,7 @@ class _Session:
 
 
 class _Chunks:
-    """The method's datasets, with a ``close`` whatever kind of iterator it returns."""
+    """The datasets of the method, with a ``close`` for any kind of iterator."""
 
     def __init__(self, chunks: Iterator[xr.Dataset]) -> None:
         self._chunks = chunks
@@ -341,7 +343,7 @@ class _Chunks:
         return iter(self._chunks)
 
     def close(self) -> None:
-        """End the acquisition: what the method does on its way out happens now."""
+        """End the acquisition, including the clean-up of the method."""
         close = getattr(self._chunks, "close", None)
         if close is not None:
             close()
@@ -349,14 +351,14 @@ class _Chunks:
 
 @contextmanager
 def _failures(folder: RunFolder) -> Iterator[None]:
-    """Bring what ended a test into its ``run.json`` and its log, and say where the data is."""
+    """Record the failure of a test in its ``run.json`` and its log, and state the location of the data."""
     try:
         yield
     except KeyboardInterrupt as error:
         log.warning("interrupted by the operator")
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
-        raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_go_on(folder)}") from error
+        raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
     except Exception as error:
         reason = str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
         log.exception("failed")
@@ -366,12 +368,12 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         raise RunError(
             f"Test '{folder.data['test']}' failed: {reason}\n"
             f"{_kept(folder)} in {folder.path}; the log is {folder.log}.\n"
-            f"When the cause is mended: {_go_on(folder)}"
+            f"Remove the cause first. {_continuation(folder)}"
         ) from error
 
 
 def _mark(folder: RunFolder, status: str, reason: str) -> None:
-    """Write how a run ended; where even that cannot be written it stays 'running', which can be resumed as well."""
+    """Write the status of a run; if this fails it remains 'running', which can be resumed as well."""
     try:
         folder.save(status=status, reason=reason)
     except OSError:
@@ -380,17 +382,17 @@ def _mark(folder: RunFolder, status: str, reason: str) -> None:
 
 def _kept(folder: RunFolder) -> str:
     if folder.data["acquired"]:
-        return "The raw data is complete and kept"
-    return f"{folder.data['samples'].get('count', 0)} samples are kept"
+        return "The raw data are complete and stored"
+    return f"{folder.data['samples'].get('count', 0)} samples are stored"
 
 
-def _go_on(folder: RunFolder) -> str:
-    return f"'errormotion run --resume --runs {folder.path.parent}' goes on."
+def _continuation(folder: RunFolder) -> str:
+    return f"Continue with 'errormotion run --resume --runs {folder.path.parent}'."
 
 
 @contextmanager
 def _in_order() -> Iterator[None]:
-    """Let the first Ctrl-C stop the measurement; further ones must not disturb the writing of the last samples."""
+    """Let the first Ctrl-C stop the measurement; ignore further ones while the last samples are written."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -408,13 +410,13 @@ def _in_order() -> Iterator[None]:
 
 
 def settings_hash(settings: Mapping[str, Any], method: str, method_version: str) -> str:
-    """Return twelve hexadecimal digits that stand for effective settings, method and version."""
+    """Return twelve hexadecimal digits of the hash of effective settings, method and version."""
     text = json.dumps([method, method_version, settings], sort_keys=True, ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _stored_plan(folder: RunFolder) -> CampaignPlan:
-    """Return the plan of a run as it was when it was started."""
+    """Return the plan of a run as of its start."""
     campaign, bench = folder.data["campaign"], folder.data["bench"]
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     found = parse_campaign(campaign["text"], folder.path / f"run.json ({campaign['file']})", plan)

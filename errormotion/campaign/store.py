@@ -1,12 +1,12 @@
-"""The raw store: a Zarr v3 folder that grows while measuring and is whole at every moment.
+"""The raw store: a Zarr v3 folder that grows during a measurement and is complete at any time.
 
-Samples go to disk in blocks along one dimension. The order of writing makes the folder safe against ``kill -9``:
+Samples are written in blocks along one dimension. The order of writing protects the folder against ``kill -9``:
 
-1. the chunks of a block are written, each beside its place and renamed;
-2. then the root ``zarr.json`` is replaced in one rename. It carries the metadata of all arrays (Zarr calls it
-   consolidated), so all of them get their new length at once, and whoever opens the store sees whole samples only.
+1. the chunks of a block are written, each to a temporary file that is renamed;
+2. then the root ``zarr.json`` is replaced by a rename. It contains the (consolidated) metadata of all arrays, which
+   therefore get their new length simultaneously: a reader of the store sees complete samples only.
 
-What is dead between 1 and 2 is invisible: the next :meth:`RawStore.open` writes over it.
+Chunks written before a crash between 1 and 2 are invisible; the next opening of the store overwrites them.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from zarr.codecs import BloscCodec
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
-"""Most that one block of all appended variables takes in memory."""
+"""Largest size of one block of all appended variables in memory, bytes."""
 
 LONGEST_BLOCK = 2**18
-"""Most samples in one block."""
+"""Largest number of samples in one block."""
 
 PER_CHUNK = ("dropped", "invalid", "time_start")
-"""Attributes that a method sets anew on every dataset that it yields."""
+"""Attributes that differ between the datasets that a method yields."""
 
 
 class RawStore:
@@ -48,9 +48,9 @@ class RawStore:
     Attributes
     ----------
     count : int
-        Samples appended, those not yet committed included.
+        Samples appended, including those not yet committed.
     committed : int
-        Samples that a reader of the folder sees.
+        Samples visible to a reader of the folder.
     """
 
     def __init__(self, path: Path, dim: str) -> None:
@@ -76,16 +76,16 @@ class RawStore:
 
     @classmethod
     def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
-        """Make a store that fits a dataset, without its samples.
+        """Create a store for datasets like this one, without samples.
 
         Parameters
         ----------
         path : Path
-            The folder to make; it must not exist.
+            The folder to create; it must not exist.
         first : Dataset
-            The first dataset to append. What has not the dimension ``dim`` is stored once, here. A variable whose
+            The first dataset to append. Variables without the dimension ``dim`` are stored once, here. A variable whose
             ``encoding`` has ``dtype`` (an integer), ``scale_factor``, ``add_offset`` and ``_FillValue`` is packed
-            so if that loses nothing.
+            accordingly if this is lossless.
         dim : str
             The dimension that grows.
         expected : float
@@ -110,11 +110,11 @@ class RawStore:
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]
             if variable.dtype.kind in "fiub":
-                encoding[name]["compressors"] = [BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle")]
+                encoding[name]["compressors"] = [BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle")]
             if variable.dtype.kind == "f":
                 encoding[name] |= {"fill_value": packings[name].get("_FillValue", np.nan)}
         part = path.with_name(path.name + ".part")
-        # xarray's stub says nothing of zarr_format=3 with encodings per variable
+        # xarray's stub lacks zarr_format=3 with encodings per variable
         cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
         part.rename(path)
         store = cls(path, dim)
@@ -122,14 +122,14 @@ class RawStore:
         return store
 
     def append(self, chunk: xr.Dataset) -> None:
-        """Add samples; whole blocks go to disk, the rest waits for :meth:`commit`.
+        """Append samples; complete blocks are written, the remainder with :meth:`commit`.
 
         Raises
         ------
         RunError
-            The dataset does not go on where the store ends, or does not have its variables.
+            The dataset does not continue the store, or has other variables.
         OSError
-            The disk does not take it.
+            The data cannot be written.
         """
         if self.dim not in chunk.dims:
             raise RunError(f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}")
@@ -155,7 +155,7 @@ class RawStore:
         self._add_counts(chunk.attrs)
 
     def commit(self) -> None:
-        """Bring every sample to the disk, and then to the readers, in this order."""
+        """Write every sample to disk, then make all visible to readers."""
         if self.count % self.block:
             self._write_block()
         for path in self._unsynced:
@@ -183,7 +183,9 @@ class RawStore:
 
     def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
         if name not in self._arrays:
-            raise RunError(f"{self.path}: the method yielded the variable '{name}', which its first dataset lacked")
+            raise RunError(
+                f"{self.path}: the method yielded the variable '{name}', which is missing in its first dataset"
+            )
         column = self._arrays[name]
         expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != self.dim}
         found = {str(d): n for d, n in variable.sizes.items() if d != self.dim}
@@ -192,8 +194,8 @@ class RawStore:
         packed = _encode(variable.transpose(*column.dims), column.packing)
         if packed is None:
             raise RunError(
-                f"{self.path}: '{name}' promised to be integers of {column.packing['scale_factor']!r} and holds other "
-                "values; the instrument or method that sets this encoding must keep to it or leave it out"
+                f"{self.path}: expected '{name}' in integer steps of {column.packing['scale_factor']!r}, as the "
+                "encoding states; found other values. Correct the encoding in the instrument or method, or omit it."
             )
         return packed
 
@@ -206,11 +208,11 @@ class RawStore:
         if self.count and abs(start - expected) * rate > 0.5:
             raise RunError(
                 f"{self.path}: expected the next samples at {expected:.6f} s; the method yielded samples from "
-                f"{start:.6f} s. A gap is to be filled with NaN."
+                f"{start:.6f} s. The method must fill gaps with NaN."
             )
 
     def _add_counts(self, attrs: Mapping[Any, Any]) -> None:
-        """Add up what was lost and why: numbers for a person, no part of the samples."""
+        """Add the counts of dropped and invalid samples, by reason."""
         self.attrs["dropped"] = int(self.attrs.get("dropped", 0)) + int(attrs.get("dropped", 0))
         total: dict[str, int] = _counts(self.attrs.get("invalid"))
         for reason, count in _counts(attrs.get("invalid")).items():
@@ -245,7 +247,7 @@ class _Column:
         return tuple(slice(start, stop) if axis == self.axis else slice(None) for axis in range(len(self.dims)))
 
     def load(self, count: int) -> None:
-        """Fetch the block that is not full yet, and forget what a crash left behind it."""
+        """Read the last, incomplete block, and discard data beyond it."""
         self._resize(count)
         start = count // self.block * self.block
         if count > start:
@@ -274,7 +276,7 @@ class _Column:
 
 
 def committed_length(path: Path, dim: str) -> int:
-    """Return the samples that a reader of a store sees; 0 before the first commit."""
+    """Return the number of samples visible to a reader of a store; 0 before the first commit."""
     root = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
     for metadata in root.get("consolidated_metadata", {}).get("metadata", {}).values():
         if dim in _dims(metadata):
@@ -287,7 +289,7 @@ def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file beside its place, bring it to the disk and rename it."""
+    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
     part = path.with_name(f"{path.name}.part")
     with part.open("w", encoding="utf-8") as file:
         file.write(text)
@@ -297,7 +299,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def _sync(path: Path) -> None:
-    if not path.exists():  # a chunk of nothing but NaN has no file
+    if not path.exists():  # a chunk that is entirely NaN has no file
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -307,13 +309,13 @@ def _sync(path: Path) -> None:
 
 
 def _stored(dataset: xr.Dataset, dim: str) -> dict[str, xr.Variable]:
-    """Return what is stored: all but the times of evenly spaced samples, which a rate and a start say better."""
+    """Return the stored variables: all but the times of evenly spaced samples, which follow from rate and start."""
     regular = dim == "time" and "sample_rate" in dataset.attrs
     return {str(n): v for n, v in dataset.variables.items() if not (regular and n == "time")}
 
 
 def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes as JSON has them, without those of one chunk; ``time_start`` stays, as that of the whole."""
+    """Return attributes as JSON values, without those of one chunk; ``time_start`` is kept as that of the store."""
     kept = {str(k): v for k, v in attrs.items() if k not in PER_CHUNK or k == "time_start"}
     return {k: v.tolist() if isinstance(v, np.generic | np.ndarray) else v for k, v in kept.items()}
 
@@ -325,7 +327,7 @@ def _counts(value: Any) -> dict[str, int]:
 
 
 def _packing(variable: xr.Variable) -> dict[str, Any]:
-    """Return the integer packing that a variable's encoding asks for, if it loses nothing; else an empty one."""
+    """Return the integer packing that a variable's encoding states, if it is lossless; else an empty one."""
     keys = ("dtype", "scale_factor", "add_offset", "_FillValue")
     wanted = variable.encoding
     if variable.dtype.kind != "f" or any(key not in wanted for key in keys):
@@ -341,7 +343,7 @@ def _packing(variable: xr.Variable) -> dict[str, Any]:
 
 
 def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the numbers to store, or None if the packing would lose more than rounding error."""
+    """Return the numbers to store; None if the packing would lose more than the rounding error."""
     values = variable.values
     if not packing:
         if values.dtype.kind == "U":
@@ -365,7 +367,7 @@ def _encode(variable: xr.Variable, packing: Mapping[str, Any]) -> np.ndarray | N
 def _block_length(
     growing: Mapping[str, xr.Variable], packings: Mapping[str, Mapping[str, Any]], dim: str, expected: float
 ) -> int:
-    """Return the samples of one block: a power of two that fits the memory and is not far beyond the expected total."""
+    """Return the samples of one block: a power of two within the size limits, not far above the expected total."""
     per_sample = 0
     for name, variable in growing.items():
         size = np.dtype(packings[name].get("dtype", variable.dtype)).itemsize

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -284,6 +284,20 @@ def plugins_check(
 
     if not command.check_plugin(plugin, address, json_):
         raise typer.Exit(INVALID)
+
+
+@plugins_app.command("new")
+@guarded
+def plugins_new(
+    what: Annotated[Literal["instrument", "method"], typer.Argument(help="instrument or method.")],
+    name: Annotated[str, typer.Argument(help="Name of the plugin; its id is made from it.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write; default: errormotion-NAME.")] = None,
+    json_: Json = False,
+) -> None:
+    """Write a new distribution with a plugin that passes the conformance kit."""
+    from errormotion.cli.commands import new as command
+
+    command.new(what, name, out, json_)
 
 
 @bench_app.command("validate")

@@ -31,17 +31,18 @@ def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
 
 
 def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return every freedom at its last known time with its expanded uncertainty; none for a dataset without time."""
+    """Return every estimate at its last known time with its expanded uncertainty; none for a dataset without time."""
     found = []
-    for k, name in enumerate(errors["dof"].values):
-        error = errors[str(name)]
+    covariance = errors.em.covariance().values
+    for k, name in enumerate(errors.em.names):
+        error = errors[name]
         values = np.asarray(error.values, dtype=float)
         known = np.flatnonzero(np.isfinite(values))
         if error.dims != ("time",) or known.size == 0:
             continue
         last = int(known[-1])
         minutes = float(errors["time"].values[last]) / 60.0
-        u = math.sqrt(float(errors["covariance"].values[last, k, k]))
+        u = math.sqrt(float(covariance[last, k, k]))
         found.append(FigureOfMerit(f"{name} after {minutes:.1f} min", float(values[last]), 2 * u, error.attrs["units"]))
     return found
 

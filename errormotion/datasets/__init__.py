@@ -4,7 +4,7 @@ Importing this package registers the accessor ``ds.em``.
 """
 
 from errormotion.datasets.accessor import Combination, ErrorMotion
-from errormotion.datasets.error_dataset import build_errors
+from errormotion.datasets.error_dataset import build_deviations, build_errors
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage import load, save
@@ -15,6 +15,7 @@ __all__ = [
     "SCHEMA",
     "Combination",
     "ErrorMotion",
+    "build_deviations",
     "build_errors",
     "hash_dataset",
     "load",

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.datasets.schemas import DOF, SCHEMA
+from errormotion.datasets.schemas import COMPONENTS, DOF, SCHEMA
 from errormotion.errors import DatasetError
 from errormotion.kinematics import iso, twists
 
@@ -52,6 +52,11 @@ class ErrorMotion:
         """Dimensions of the errors, without ``dof``."""
         return tuple(str(dim) for dim in self._ds["EX"].dims)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the estimates: the six freedoms, or ``deviation`` where the method sees one direction only."""
+        return ("deviation",) if "deviation" in self._ds.variables else DOF
+
     def twist(self) -> xr.DataArray:
         """Return all six freedoms in one array.
 
@@ -61,29 +66,55 @@ class ErrorMotion:
             m and rad; NaN where not seen.
         """
         values = np.stack([self._ds[name].values for name in DOF], axis=-1)
-        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="twist")
+        coords = {**self._coords(), "dof": list(DOF)}
+        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=coords, name="twist")
+
+    def estimates(self) -> xr.DataArray:
+        """Return what was measured: the six freedoms, or the deviation as the only ``dof``.
+
+        Returns
+        -------
+        DataArray, (..., dof)
+            m and rad; NaN where not seen.
+        """
+        values = np.stack([self._ds[name].values for name in self.names], axis=-1)
+        return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="estimates")
+
+    def covariance(self) -> xr.DataArray:
+        """Return the total covariance of `estimates` at every position.
+
+        Returns
+        -------
+        DataArray, (..., dof, dof_)
+            m^2, m rad, rad^2.
+        """
+        values = self._covariance()
+        return xr.DataArray(values, dims=(*self.dims, "dof", "dof_"), coords=self._coords("dof", "dof_"))
 
     def expanded(self, k: float = 2.0) -> xr.DataArray:
-        """Return the expanded uncertainty ``k u`` of every freedom.
+        """Return the expanded uncertainty ``k u`` of every estimate.
 
         Returns
         -------
         DataArray, (..., dof)
             m and rad.
         """
-        variance = np.diagonal(self._ds["covariance"].values, axis1=-2, axis2=-1)
+        variance = np.diagonal(self._covariance(), axis1=-2, axis2=-1)
         values = k * np.sqrt(np.maximum(variance, 0.0))
         return xr.DataArray(values, dims=(*self.dims, "dof"), coords=self._coords("dof"), name="uncertainty")
 
     def iso_names(self) -> dict[str, str]:
-        """Return the ISO 230-1 name of each freedom, such as ``{"EX": "EXX", ...}``."""
-        return iso.iso_names(self._ds.attrs["component"])
+        """Return the ISO 230-1 name of each estimate, such as ``{"EX": "EXX", ...}``; else its own."""
+        component = self._ds.attrs["component"]
+        if component not in COMPONENTS or self.names != DOF:
+            return {name: name for name in self.names}
+        return iso.iso_names(component)
 
     def at(self, point: ArrayLike) -> xr.Dataset:
         """Return the same errors at another functional point.
 
-        Values, covariance and influence move: ``E' = E + R x r``. Further results of the method stay as it computed
-        them, for its own point.
+        Values, covariance and influence move: ``E' = E + R x r``; of a deviation, the sensitivity. Further results of
+        the method stay as it computed them, for its own point.
 
         Parameters
         ----------
@@ -107,8 +138,8 @@ class ErrorMotion:
     def in_frame(self, pose: RigidTransform, name: str) -> xr.Dataset:
         """Return the same errors, at the same physical point, in another frame.
 
-        Values, covariance, influence, functional point and the commanded ``x y z`` change their coordinates. Further
-        results of the method stay as it computed them, in its own frame.
+        Values, covariance, influence, sensitivity, functional point and the commanded ``x y z`` change their
+        coordinates. Further results of the method stay as it computed them, in its own frame.
 
         Parameters
         ----------
@@ -153,13 +184,14 @@ class ErrorMotion:
         """
         first, second = self._index(i), self._index(j)
         if first == second:
-            covariance = self._ds["covariance"].values[first]
+            covariance = self._covariance()[first]
         else:
             F = np.moveaxis(self._influence(), 0, -1)
             covariance = F[first] @ F[second].T
             if not F.size:  # no shared source: known to be 0 where both values are known
                 covariance = covariance + 0 * np.add.outer(self._values()[first], self._values()[second])
-        return xr.DataArray(covariance, dims=("dof", "dof_"), coords={"dof": list(DOF), "dof_": list(DOF)})
+        labels = {"dof": list(self.names), "dof_": list(self.names)}
+        return xr.DataArray(covariance, dims=("dof", "dof_"), coords=labels)
 
     def combine(self, weights: ArrayLike, dim: str) -> Combination:
         """Return a linear combination of the errors along a dimension, with its covariance.
@@ -226,16 +258,23 @@ class ErrorMotion:
         return plot_errors(self._ds)
 
     def _values(self) -> Array:
-        return np.asarray(self.twist().values, dtype=float)
+        return np.asarray(self.estimates().values, dtype=float)
+
+    def _covariance(self) -> Array:
+        if self.names == DOF:
+            return np.asarray(self._ds["covariance"].values, dtype=float)
+        return np.asarray(self._ds["deviation_variance"].values, dtype=float)[..., None, None]
 
     def _influence(self) -> Array:
-        if "influence" in self._ds.variables:
+        if self.names == DOF and "influence" in self._ds.variables:
             return np.asarray(self._ds["influence"].values, dtype=float)
+        if self.names != DOF and "deviation_influence" in self._ds.variables:
+            return np.asarray(self._ds["deviation_influence"].values, dtype=float)[..., None]
         return np.zeros((0, *self._values().shape))
 
     def _independent(self) -> Array:
         F = self._influence()
-        C: Array = self._ds["covariance"].values - np.einsum("s...i,s...j->...ij", F, F, optimize=True)
+        C: Array = self._covariance() - np.einsum("s...i,s...j->...ij", F, F, optimize=True)
         return C
 
     def _nothing(self, axis: int) -> Array:
@@ -243,7 +282,7 @@ class ErrorMotion:
 
     def _coords(self, *dof: str, without: str = "") -> dict[str, Any]:
         kept = {name: self._ds.coords[name] for name in self.dims if name != without and name in self._ds.coords}
-        return {**kept, **{name: list(DOF) for name in dof}}
+        return {**kept, **{name: list(self.names) for name in dof}}
 
     def _index(self, place: int | Sequence[int] | Mapping[str, int]) -> tuple[int, ...]:
         if isinstance(place, Mapping):
@@ -260,14 +299,16 @@ class ErrorMotion:
         return tuple(number % size for number, size in zip(index, sizes, strict=True))
 
     def _transformed(self, A: Array) -> xr.Dataset:
-        """Return a copy with twist, covariance and influence under a 6x6 matrix."""
+        """Return a copy with twist, covariance, influence and sensitivity under a 6x6 matrix."""
         ds = self._ds.copy()
-        E = twists.transform(self._values(), A)
+        E = twists.transform(self.twist().values, A)
         for k, name in enumerate(DOF):
             ds[name] = ds[name].copy(data=E[..., k].copy())
         ds["covariance"] = ds["covariance"].copy(data=twists.transform_covariance(ds["covariance"].values, A))
         if "influence" in ds.variables:
             ds["influence"] = ds["influence"].copy(data=twists.transform(ds["influence"].values, A))
+        if "sensitivity" in ds.variables:  # h . E = h' . E'
+            ds["sensitivity"] = ds["sensitivity"].copy(data=ds["sensitivity"].values @ np.linalg.inv(A))
         return ds
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -23,9 +23,13 @@ _UNIT_NORM = 1e-6
 _ROUNDING = 1e-8
 
 
-def variant_of(ds: xr.Dataset) -> RawSchema | None:
-    """Return the raw schema that a dataset claims, the variant by its content; None if the id is unknown."""
-    found = variants(str(ds.attrs.get("schema")))
+def variant_of(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> RawSchema | None:
+    """Return the raw schema that a dataset claims, the variant by its content; None if the id is unknown.
+
+    ``tables`` are searched before the raw schemas of the installed plugins.
+    """
+    schema = str(ds.attrs.get("schema"))
+    found = tuple(table for table in tables if table.id == schema) or variants(schema)
     for raw in found:
         if raw.marker in ds.variables or raw.marker in ds.dims:
             return raw

@@ -18,7 +18,13 @@ SIGN = "actual minus commanded, tool side relative to workpiece side"
 """The one sign convention, as it stands in the attribute ``sign``."""
 
 ERROR_DIMS = ("time", "position", "target", "beam")
-"""Dimensions that errors may have."""
+"""Dimensions that errors may have; others are declared by a coordinate of their own name."""
+
+ERROR_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+"""Units of the six freedoms."""
+
+COMPONENTS = (*"XYZABCUVW", "spindle", "tool", "beam")
+"""Values of the attribute ``component``; others are declared by the attribute ``component_description``."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +73,8 @@ class RawSchema:
         Dimensions of fixed length.
     labels : mapping of str to tuple of str
         Labels that a dimension must have, all of them and no other.
-    ordered : bool
-        Whether a dimension without a coordinate may be taken to have its labels in their order. Dimensions with
-        a coordinate may have them in any order where this is False.
+    aliases : mapping of str to str
+        Short names of columns in text files, and the columns that they stand for.
     """
 
     id: str
@@ -78,6 +83,7 @@ class RawSchema:
     rows: tuple[Row, ...]
     sizes: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    aliases: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def title(self) -> str:
@@ -127,6 +133,34 @@ ERROR_ROWS = (
         "signed effect of one standard uncertainty of a source that is one draw for many values; m, rad",
         required=False,
     ),
+    Row(
+        "deviation",
+        ("...",),
+        "m",
+        -0.1,
+        0.1,
+        "error along one known direction, where the method sees no freedom alone: `sensitivity` times the six freedoms",
+        required=False,
+    ),
+    Row(
+        "sensitivity",
+        ("...", "dof"),
+        "",
+        -20.0,
+        20.0,
+        "effect of one unit of each freedom on `deviation`: a unit vector, and the lever of the rotations; 1, m",
+        required=False,
+    ),
+    Row("deviation_variance", ("...",), "m^2", 0.0, 1e-2, "total variance of `deviation`", required=False),
+    Row(
+        "deviation_influence",
+        ("source", "..."),
+        "m",
+        -0.1,
+        0.1,
+        "effect of one standard uncertainty of each source on `deviation`, as in `influence`",
+        required=False,
+    ),
     Row("source_group", ("source",), "", -NO_LIMIT, NO_LIMIT, "what a source belongs to in the budget", required=False),
     Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "since the reference state, increasing", required=False),
     *(
@@ -137,7 +171,8 @@ ERROR_ROWS = (
 
 ERROR_ATTRIBUTES = {
     "schema": f"`{SCHEMA}`",
-    "component": "what moves wrongly: an axis (X, Y, Z, A, B, C, U, V, W), `spindle`, `tool` (the volume) or `beam`",
+    "component": "what moves wrongly: an axis (X, Y, Z, A, B, C, U, V, W), `spindle`, `tool` (the volume) or `beam`; "
+    "another name with the attribute `component_description`",
     "machine": "which machine",
     "frame": "coordinate system of the components",
     "functional_point": "three coordinates in that frame, m",
@@ -167,11 +202,13 @@ def known_schemas() -> set[str]:
 
 
 __all__ = [
+    "COMPONENTS",
     "DIRECTION",
     "DOF",
     "ERROR_ATTRIBUTES",
     "ERROR_DIMS",
     "ERROR_ROWS",
+    "ERROR_UNITS",
     "NOISE",
     "NO_LIMIT",
     "POSITION",

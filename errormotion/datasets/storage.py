@@ -32,6 +32,9 @@ _CLASSIC_SIGNATURE = b"CDF"
 # Longer time coordinates are left on disk: an index would pull them into memory.
 _LONGEST_INDEX = 100_000
 
+# Bytes; below, the structure of the chunks takes the space that compression saves.
+_LEAST_COMPRESSED = 2**16
+
 _REASONS = {
     errno.ENOENT: "there is no such folder",
     errno.EACCES: "permission denied; choose a place where you may write, or have the permission given",
@@ -127,7 +130,8 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
             storable(ds).to_zarr(part, mode="w-", zarr_format=3, consolidated=False)
         else:
             # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
-            part.write_bytes(storable(ds).to_netcdf(engine="h5netcdf"))
+            ready = storable(ds)
+            part.write_bytes(ready.to_netcdf(engine="h5netcdf", encoding=_compression(ready)))
         _sync(part)
         _refuse_existing(path, overwrite)
         _replace(part, path)
@@ -148,6 +152,19 @@ def storable(ds: xr.Dataset) -> xr.Dataset:
         .assign(texts)
         .set_coords([name for name in texts if name in ds.coords])
     )
+
+
+def _compression(ds: xr.Dataset) -> dict[Any, dict[str, Any]]:
+    """Return the NetCDF encoding of the large variables of an error dataset: without loss, and by any reader's means.
+
+    Raw datasets stay as they are: noise takes more time than it saves space.
+    """
+    if ds.attrs.get("schema") != SCHEMA:
+        return {}
+    large = [
+        name for name, each in ds.variables.items() if each.dtype.kind in "fiu" and each.nbytes >= _LEAST_COMPRESSED
+    ]
+    return {name: {"zlib": True, "complevel": 1, "shuffle": True} for name in large}
 
 
 def _engine_of(path: Path) -> str:

@@ -1,29 +1,33 @@
-"""The one validator: every dataset, by the schema that it claims."""
+"""The validator of all datasets, by the schema that they claim."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.datasets.error_dataset import error_violations
+from errormotion.datasets.error_checks import error_violations
 from errormotion.datasets.raw import raw_violations, variant_of
-from errormotion.datasets.schemas import SCHEMA, known_schemas
+from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
 from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 
 
-def violations(ds: xr.Dataset) -> list[str]:
-    """Return everything in which a dataset breaks its schema, one sentence each; empty if it follows it.
+def violations(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> list[str]:
+    """Return every violation of the schema of a dataset, one sentence each; none if it follows its schema.
 
     Parameters
     ----------
     ds : Dataset
-        With the attribute ``schema``. Big variables of a raw dataset are looked at in samples, never loaded whole.
+        With the attribute ``schema``. Large variables of a raw dataset are checked in samples, never loaded whole.
+    tables : sequence of RawSchema, optional
+        Raw schemas to use before those of the installed plugins: for a plugin that is not installed.
     """
     schema = ds.attrs.get("schema")
     if schema == SCHEMA:
         return error_violations(ds)
-    raw = variant_of(ds)
+    raw = variant_of(ds, tables)
     if raw is not None:
         return raw_violations(ds, raw)
     owner = plugins.owner_of_schema(str(schema))
@@ -35,14 +39,14 @@ def violations(ds: xr.Dataset) -> list[str]:
     return [f"attribute 'schema': '{schema}' is unknown; {nearest(str(schema), known)}"]
 
 
-def validate(ds: xr.Dataset) -> None:
-    """Refuse a dataset that breaks its schema.
+def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
+    """Refuse a dataset that breaks its schema; ``tables`` as in `violations`.
 
     Raises
     ------
     DatasetError
-        Its ``violations`` hold one sentence for each.
+        Its ``violations`` hold one sentence for each violation.
     """
-    found = violations(ds)
+    found = violations(ds, tables)
     if found:
         raise DatasetError(f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", found)

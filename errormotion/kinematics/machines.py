@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
 from errormotion.kinematics.axes import Axis
+from errormotion.kinematics.chains import parse_chain
 from errormotion.kinematics.iso import DOF, LINEAR_AXES, ROTARY_AXES, iso_names, location_names
 from errormotion.kinematics.poses import displacement
 from errormotion.kinematics.twists import adjoint, known_product
@@ -63,7 +64,7 @@ class Machine:
     """
 
     def __init__(self, chain: str, references: Mapping[str, ArrayLike] | None = None) -> None:
-        carries_tool = _parse(chain)
+        carries_tool = parse_chain(chain)
         references = dict(references or {})
         if stray := set(references) - set(carries_tool):
             raise ValueError(
@@ -220,23 +221,3 @@ class Machine:
 def _to_tool(pose: RigidTransform, reference: Array, at: Array) -> Array:
     """Return the adjoint from ``reference`` in the frame ``pose`` to the points ``at`` of the workpiece frame."""
     return adjoint(pose.rotation, pose.inv().apply(at) - reference)
-
-
-def _parse(chain: str) -> dict[str, bool]:
-    """Return axis to whether it carries the tool, in the order from workpiece to tool."""
-    words = [word.strip() for word in chain.split("-")]
-    if words[0] != "workpiece" or words[-1] != "tool" or words.count("bed") != 1:
-        raise ValueError(
-            f"expected a chain from 'workpiece' over one 'bed' to 'tool', "
-            f"such as 'workpiece-X-Y-bed-Z-spindle-tool'; found '{chain}'"
-        )
-    inner = words[1:-1]
-    if inner[-1] == "spindle":
-        inner = inner[:-1]
-    axes = [word for word in inner if word != "bed"]
-    if unknown := [word for word in axes if word not in (*LINEAR_AXES, *ROTARY_AXES)]:
-        known = ", ".join((*LINEAR_AXES, *ROTARY_AXES))
-        raise ValueError(f"expected axes {known} in '{chain}' ('spindle' only before 'tool'); found '{unknown[0]}'")
-    if not axes or len(set(axes)) != len(axes):
-        raise ValueError(f"expected every axis of '{chain}' once, and at least one")
-    return {axis: inner.index("bed") < i for i, axis in enumerate(inner) if axis != "bed"}

@@ -7,6 +7,7 @@ A plugin is a plain class, named in the entry-point group ``errormotion.instrume
 from errormotion.plugins.contracts import (
     ERRORS_SCHEMA,
     Bench,
+    Calibration,
     Contact,
     DatasetInfo,
     FigureOfMerit,
@@ -42,6 +43,7 @@ __all__ = [
     "ERRORS_SCHEMA",
     "GROUPS",
     "Bench",
+    "Calibration",
     "Contact",
     "DatasetInfo",
     "Environment",

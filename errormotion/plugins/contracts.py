@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 import xarray as xr
 from pydantic import BaseModel, ConfigDict
+
+if TYPE_CHECKING:
+    from errormotion.kinematics.description import MachineDescription
 
 Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
 
@@ -86,6 +89,28 @@ class FigureOfMerit:
     expanded_uncertainty: float
     unit: str
     limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration that a plugin makes from readings, for ``errormotion calibrate``.
+
+    Attributes
+    ----------
+    Settings : type of pydantic.BaseModel
+        How the calibration is made.
+    make : function
+        ``make(raw, settings)`` returns the calibration dataset.
+    figures : function
+        ``figures(calibration)`` returns its figures as a mapping, for ``--json``.
+    text : function
+        ``text(calibration)`` returns its figures as lines for the terminal.
+    """
+
+    Settings: type[BaseModel]
+    make: Callable[[xr.Dataset, Any], xr.Dataset]
+    figures: Callable[[xr.Dataset], Mapping[str, Any]]
+    text: Callable[[xr.Dataset], Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -227,9 +252,14 @@ class Instrument(Protocol):
 
 @runtime_checkable
 class Bench(Protocol):
-    """What a method sees of a bench: opened instruments by kind, and where and what the machine is."""
+    """A bench as a method sees it: opened instruments by kind, and the machine.
+
+    ``machine`` is the name of the machine tool; ``description`` is its chain, travel, spindle axis and rotary axes,
+    None where the bench file gives the name only.
+    """
 
     machine: str
+    description: MachineDescription | None
 
     def of_kind(self, kind: str) -> Any:
         """Return the one instrument of this kind; BenchError names what is missing."""
@@ -269,8 +299,18 @@ class Method(Protocol):
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
+    ``check_machine(settings, machine)`` : mapping of str to str
+        Which settings contradict the machine of the bench (a `MachineDescription`), by setting, with what was expected
+        and what was found; used when a campaign is read.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
+
+    ``calibrations`` : mapping of str to `Calibration`
+        Raw schema of readings to the calibration that ``errormotion calibrate`` makes from them.
+    ``log_readers`` : mapping of str to function
+        Formats of maps for ``errormotion import`` that are the method's own: value of the key ``schema`` of the map to
+        a function ``(log, map)`` of two paths that returns the raw dataset. A map whose key ``schema`` is a raw schema
+        needs no function.
 
     ``programs`` and ``motions`` get the settings of the bench's instruments by kind.
     """

@@ -16,7 +16,7 @@ _INDEPENDENT = "sensor noise, independent from instant to instant"
 
 
 def groups_at(errors: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the standard uncertainty (6,) of every group of sources at one place, the independent rest last.
+    """Return the standard uncertainty (n,) of every group of sources at one place, the independent rest last.
 
     Parameters
     ----------
@@ -27,12 +27,19 @@ def groups_at(errors: xr.Dataset) -> dict[str, np.ndarray]:
     return {str(name): budget.sel(group=name).values for name in budget["group"].values}
 
 
+def sigma(errors: xr.Dataset) -> np.ndarray:
+    """Return the standard uncertainty of every estimate, (..., n); NaN where it is unknown."""
+    variance = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
+    return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+
 def table(errors: xr.Dataset, when: str) -> Table:
     """Return the budget table at one place; ``errors`` has no dims of place left."""
     groups = groups_at(errors)
-    sizes = np.array([UM[1]] * 3 + [SECOND_OF_ARC[1]] * 3)
-    variance = np.array([float(errors["covariance"].isel(dof=i, dof_=i)) for i in range(6)])
-    combined = np.sqrt(np.where(variance >= 0, variance, np.nan))
+    names = errors.em.names
+    units = [UM if i < 3 else SECOND_OF_ARC for i in range(len(names))]
+    sizes = np.array([size for _, size in units])
+    combined = sigma(errors)
     reason = "not observed by this method"
     decimals = [decimals_of(value, 3) for value in combined / sizes]
 
@@ -43,9 +50,9 @@ def table(errors: xr.Dataset, when: str) -> Table:
         ]
 
     return Table(
-        f"Uncertainty budget {when}: standard uncertainty (k = 1) of the six error motions at the functional point, "
-        "by group of sources.",
-        ["source", *(f"{name} / {UM[0] if i < 3 else SECOND_OF_ARC[0]}" for i, name in enumerate(FREEDOMS))],
+        f"Uncertainty budget {when}: standard uncertainty (k = 1) of the "
+        f"{'six error motions at the functional point' if len(names) > 1 else names[0]}, by group of sources.",
+        ["source", *(f"{name} / {unit}" for name, (unit, _) in zip(names, units, strict=True))],
         [
             *(row(readable(name), values) for name, values in groups.items()),
             row("combined, k = 1", combined),
@@ -73,18 +80,17 @@ def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:
 def twist_table(errors: xr.Dataset, places: dict[str, xr.Dataset], names: dict[str, str]) -> Table:
     """Return the six error motions at a few places; a freedom that the method does not see is a dash."""
     rows: list[list[Cell | str]] = []
-    for i, freedom in enumerate(FREEDOMS):
+    for i, freedom in enumerate(errors.em.names):
         unit, size = UM if i < 3 else SECOND_OF_ARC
         unseen = not np.isfinite(errors[freedom].values).any()
         reason = "not observed by this method" if unseen else "no valid reading at this place"
         cells = []
         for place in places.values():
-            variance = float(place["covariance"].isel(dof=i, dof_=i))
-            expanded = 2 * math.sqrt(variance) if variance >= 0 else math.nan
-            cells.append(estimate(float(place[freedom]) / size, expanded / size, reason=reason))
+            cells.append(estimate(float(place[freedom]) / size, 2 * sigma(place)[i] / size, reason=reason))
         rows.append([freedom, names.get(freedom, ""), unit, *cells])
     return Table(
-        "The six error motions at the functional point (actual minus commanded, tool side relative to workpiece side). "
+        f"The {'six error motions at the functional point' if len(errors.em.names) > 1 else 'deviation'} "
+        "(actual minus commanded, tool side relative to workpiece side). "
         "After ±: expanded uncertainty, k = 2.",
         ["freedom", "ISO 230-1", "unit", *places],
         rows,

@@ -1,4 +1,4 @@
-"""The chapter of any error dataset: its six error motions over its dims, with their bands."""
+"""The chapter of any error dataset: its error motions, or its deviation, over its dims, with their bands."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from errormotion.kinematics.iso import iso_names
 from errormotion.report import budget, canvas, provenance, quality
 from errormotion.report.document import (
     Block,
@@ -27,6 +26,7 @@ from errormotion.report.document import (
 from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, listed, percent
 
 _MOST = 5  # curves drawn of a further dim
+DEVIATION = ("deviation", "deviation_variance", "deviation_influence", "sensitivity")
 
 
 def part(source: Source, key: str) -> Part:
@@ -51,11 +51,9 @@ def part(source: Source, key: str) -> Part:
 
 
 def names_of(errors: xr.Dataset) -> dict[str, str]:
-    """Return the ISO 230-1 names of the component's freedoms; the freedoms' own where the standard has none."""
-    try:
-        return iso_names(str(errors.attrs.get("component", "")))
-    except ValueError:
-        return {name: name for name in budget.FREEDOMS}
+    """Return the ISO 230-1 names of the component's freedoms; their own where the standard has none."""
+    found: dict[str, str] = errors.em.iso_names()
+    return found
 
 
 def unit_at(index: int) -> tuple[str, float]:
@@ -68,13 +66,12 @@ def _dims(errors: xr.Dataset) -> tuple[str, ...]:
 
 
 def _sigma(errors: xr.Dataset, index: int) -> np.ndarray:
-    variance = errors["covariance"].isel(dof=index, dof_=index).transpose(*_dims(errors)).values
-    return np.sqrt(np.where(variance >= 0, variance, np.nan))
+    return np.asarray(budget.sigma(errors)[..., index])
 
 
 def _worst(errors: xr.Dataset, index: int) -> tuple[float, float]:
     """Value and standard uncertainty in SI where a freedom's error is largest; NaN where it is unknown."""
-    values = errors[budget.FREEDOMS[index]].values.ravel()
+    values = errors[errors.em.names[index]].values.ravel()
     if not np.isfinite(values).any():
         return math.nan, math.nan
     place = int(np.nanargmax(np.abs(values)))
@@ -83,7 +80,7 @@ def _worst(errors: xr.Dataset, index: int) -> tuple[float, float]:
 
 def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     names, found = names_of(errors), []
-    for i, freedom in enumerate(budget.FREEDOMS):
+    for i, freedom in enumerate(errors.em.names):
         unit, size = unit_at(i)
         value, sigma = _worst(errors, i)
         if math.isfinite(value):
@@ -93,12 +90,14 @@ def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
 
 def _summary(errors: xr.Dataset) -> list[str]:
     names = names_of(errors)
-    seen = [name for name in budget.FREEDOMS if np.isfinite(errors[name].values).any()]
-    unseen = [name for name in budget.FREEDOMS if name not in seen]
+    seen = [name for name in errors.em.names if np.isfinite(errors[name].values).any()]
+    unseen = [name for name in errors.em.names if name not in seen]
     places = " × ".join(f"{errors.sizes[dim]} ({dim})" for dim in _dims(errors)) or "one place"
     words = [f"Observed: {listed([names[name] for name in seen]) or 'nothing'}, at {places}."]
     if unseen:
         words.append(f"Not observed: {listed([names[name] for name in unseen])}. Reported as unknown, not as zero.")
+    if "deviation" in errors:
+        words.append("The errors are seen along one known direction only; no freedom is known alone.")
     return words
 
 
@@ -111,7 +110,7 @@ def _abscissa(errors: xr.Dataset, dim: str) -> tuple[np.ndarray, str]:
         if axis in errors.coords and errors[axis].dims == (dim,) and np.ptp(errors[axis].values) > 0:
             return 1e3 * np.asarray(errors[axis].values, float), f"{axis} / mm"
     if dim in errors.coords and errors[dim].dtype.kind in "iuf":
-        scale, unit = (1e3, "mm") if dim == "position" else (1.0, "1")
+        scale, unit = (1e3, "mm") if dim == "position" else (1.0, str(errors[dim].attrs.get("units", "1")))
         return scale * np.asarray(errors[dim].values, float), f"{dim} / {unit}"
     return np.arange(1.0, size + 1), f"number of {dim}"
 
@@ -122,7 +121,7 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
         return [budget.twist_table(errors, {"value": errors}, names_of(errors))]
     along = max(dims, key=lambda dim: (dim == "time", errors.sizes[dim]))
     others = [dim for dim in dims if dim != along]
-    flat = errors[[*budget.FREEDOMS, "covariance"]]
+    flat = errors.em.estimates().to_dataset().assign(sigma=(errors.em.estimates().dims, budget.sigma(errors)))
     flat = flat.stack(other_=others, create_index=False) if others else flat.expand_dims("other_", -1)
     picks = np.unique(np.linspace(0, flat.sizes["other_"] - 1, _MOST).astype(int))
     x, label = _abscissa(errors, along)
@@ -131,15 +130,17 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
         x, flat = x[order], flat.isel({along: order})
     names = names_of(errors)
 
+    single = len(names) == 1
+
     def paint(figure: Canvas) -> None:
-        panels = figure.subplots(3, 2, sharex=True)
-        figure.subplots_adjust(left=0.075, right=0.985, top=0.95, bottom=0.09, wspace=0.19, hspace=0.3)
-        for i, freedom in enumerate(budget.FREEDOMS):
+        panels = figure.subplots(*((1, 1) if single else (3, 2)), sharex=True, squeeze=False)
+        bottom = 0.18 if single else 0.09
+        figure.subplots_adjust(left=0.075, right=0.985, top=1 - bottom / 1.8, bottom=bottom, wspace=0.19, hspace=0.3)
+        for i, freedom in enumerate(errors.em.names):
             axes: Axes = panels[i % 3, i // 3]
             unit, size = unit_at(i)
-            values = flat[freedom].transpose("other_", along).values / size
-            variance = flat["covariance"].isel(dof=i, dof_=i).transpose("other_", along).values
-            expanded = 2 * np.sqrt(np.where(variance >= 0, variance, np.nan)) / size
+            values = flat["estimates"].isel(dof=i).transpose("other_", along).values / size
+            expanded = 2 * flat["sigma"].isel(dof=i).transpose("other_", along).values / size
             axes.set_title(names[freedom])
             axes.set_ylabel(unit)
             if not np.isfinite(values).any():
@@ -155,8 +156,9 @@ def _curves(errors: xr.Dataset, key: str) -> list[Block]:
 
     shown = f" {len(picks)} of {flat.sizes['other_']} curves over {listed(others)} are shown." if others else ""
     caption = f"Error motions over {along}, actual minus commanded. Bands: expanded uncertainty, k = 2.{shown}"
-    spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(budget.FREEDOMS))
-    return [Figure(canvas.draw(paint, f"{key}-errors", 4.6), caption, f"Error motions over {along}: {spans}.")]
+    spans = "; ".join(f"{names[name]} {_span(errors, name, i)}" for i, name in enumerate(errors.em.names))
+    height = 2.3 if single else 4.6
+    return [Figure(canvas.draw(paint, f"{key}-errors", height), caption, f"Error motions over {along}: {spans}.")]
 
 
 def _span(errors: xr.Dataset, name: str, index: int) -> str:
@@ -170,7 +172,7 @@ def _span(errors: xr.Dataset, name: str, index: int) -> str:
 def _uncertainty(errors: xr.Dataset) -> list[Block]:
     names = names_of(errors)
     rows: list[list[Cell | str]] = []
-    for i, freedom in enumerate(budget.FREEDOMS):
+    for i, freedom in enumerate(errors.em.names):
         unit, size = unit_at(i)
         values, expanded = errors[freedom].values / size, 2 * _sigma(errors, i) / size
         spans = (finite(np.min, values), finite(np.max, values), finite(np.median, expanded), finite(np.max, expanded))
@@ -184,14 +186,14 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
         )
     ]
     dims = _dims(errors)
-    if "influence" in errors:
+    if {"influence", "deviation_influence"} & set(errors.data_vars):
         blocks.append(budget.table(errors.isel(dict.fromkeys(dims, -1)), "at the last place" if dims else ""))
     return blocks
 
 
 def _further(errors: xr.Dataset) -> Block:
     """List what else the dataset holds, so that nothing rides along unseen."""
-    known = {*budget.FREEDOMS, "covariance", "influence"}
+    known = {*budget.FREEDOMS, "covariance", "influence", *DEVIATION}
     rows: list[list[Cell | str]] = []
     for name, variable in errors.data_vars.items():
         if name in known:
@@ -203,5 +205,5 @@ def _further(errors: xr.Dataset) -> Block:
         shape = ", ".join(f"{dim} {variable.sizes[dim]}" for dim in variable.dims) or "scalar"
         rows.append([str(name), shape, str(variable.attrs.get("units", "")), span])
     if not rows:
-        return Text("The result holds nothing beyond the six error motions and their covariance.", "note")
+        return Text("The result holds nothing beyond the errors and their covariance.", "note")
     return Table("Further results in the dataset, in SI units.", ["name", "dims", "unit", "span"], rows, numeric=False)

@@ -5,6 +5,7 @@ The views are chosen with radio buttons, so arrow keys turn the drawing. On pape
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -72,6 +73,14 @@ class Scene:
                 reach = np.sqrt(np.diagonal(part.shapes, axis1=1, axis2=2))
                 found += [part.places - reach, part.places + reach]
         return np.concatenate(found)
+
+
+def enlargement(longest: float, wanted: float) -> int:
+    """Return 1, 2 or 5 times a power of ten that draws a length at most as long as wanted; 1 at least."""
+    if not (math.isfinite(longest) and longest > 0 and math.isfinite(wanted) and wanted > longest):
+        return 1
+    power = 10 ** math.floor(math.log10(wanted / longest))
+    return int(max(step * power for step in (1, 2, 5) if step * power <= wanted / longest))
 
 
 def camera(azimuth: float, elevation: float) -> Array:

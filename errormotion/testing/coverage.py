@@ -14,10 +14,9 @@ import math
 import numpy as np
 from scipy import stats
 
-from errormotion.kinematics.iso import DOF
 from errormotion.plugins import MethodSubject
 from errormotion.testing.kit import require
-from errormotion.testing.results import covariance, influence, truth_at_places, values
+from errormotion.testing.results import covariance, influence, names, truth_at_places, values
 
 #: Probability that a method with the right covariance fails one of the checks below.
 FALSE_ALARM = 1e-3
@@ -42,8 +41,8 @@ def recovers_truth(subject: MethodSubject) -> str:
         worst = max(worst, ratio.max())
         require(
             ratio.max() <= GROSS,
-            f"seed {seed}: {DOF[freedom]} at place {place} of {len(ratio)} is off by {error[place, freedom]:.3g}, "
-            f"{ratio.max():.1f} standard uncertainties",
+            f"seed {seed}: {names(errors)[freedom]} at place {place} of {len(ratio)} is off by "
+            f"{error[place, freedom]:.3g}, {ratio.max():.1f} standard uncertainties",
         )
     return f"at worst {worst:.1f} standard uncertainties off"
 
@@ -53,7 +52,7 @@ def coverage(subject: MethodSubject) -> str:
     places = tested_places(subject)
     errors, covariances = _samples(subject, places)
     verdicts = [
-        _require_honest(errors[:, i], covariances[:, i], f"at place {place}", share=len(places))
+        _require_honest(errors[:, i], covariances[:, i], _labels(subject), f"at place {place}", share=len(places))
         for i, place in enumerate(places)
     ]
     return f"{len(errors)} seeds; " + "; ".join(verdicts)
@@ -72,7 +71,8 @@ def differences(subject: MethodSubject) -> str:
         shared.append(first.T @ second + second.T @ first)
     difference = errors[:, 1] - errors[:, 0]
     spread = covariances[:, 1] + covariances[:, 0] - np.array(shared)
-    verdict = _require_honest(difference, spread, f"between places {places[0]} and {places[1]}", share=1)
+    between = f"between places {places[0]} and {places[1]}"
+    verdict = _require_honest(difference, spread, _labels(subject), between, share=1)
     return f"{len(errors)} seeds; {verdict}"
 
 
@@ -86,7 +86,7 @@ def tested_places(subject: MethodSubject) -> tuple[int, ...]:
 
 
 def _samples(subject: MethodSubject, places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (seed, place, 6) and stated covariances (seed, place, 6, 6)."""
+    """Return errors (seed, place, n) and stated covariances (seed, place, n, n)."""
     freedoms = int(np.isfinite(values(subject.outcome(0)[0])[list(places)]).any(axis=0).sum())
     seeds = subject.seeds or max(FEWEST_SEEDS, math.ceil(degrees_needed(share=len(places)) / freedoms))
     errors, covariances = [], []
@@ -105,8 +105,14 @@ def degrees_needed(share: int) -> int:
     return degrees
 
 
-def _require_honest(errors: np.ndarray, covariances: np.ndarray, where: str, share: int) -> str:
-    """Fail unless errors (seed, 6) are as large as covariances (seed, 6, 6) say.
+def _labels(subject: MethodSubject) -> tuple[str, ...]:
+    return names(subject.outcome(0)[0])
+
+
+def _require_honest(
+    errors: np.ndarray, covariances: np.ndarray, labels: tuple[str, ...], where: str, share: int
+) -> str:
+    """Fail unless errors (seed, n) are as large as covariances (seed, n, n) say.
 
     Half of the allowed false alarms goes to the intervals, half to NEES; ``share`` tests divide them again.
     """
@@ -120,7 +126,7 @@ def _require_honest(errors: np.ndarray, covariances: np.ndarray, where: str, sha
     k = stats.norm.ppf(0.975)
     low, high = (float(stats.binom.ppf(p, seeds, 0.95)) for p in (alarm / freedoms / 2, 1 - alarm / freedoms / 2))
     held = (np.abs(e) <= k * u).sum(axis=0)
-    for name, hits in zip(np.array(DOF)[seen], held, strict=True):
+    for name, hits in zip(np.array(labels)[seen], held, strict=True):
         require(
             low <= hits <= high,
             f"{where}: 95 % intervals of {name} hold the truth in {hits} of {seeds} seeds, "

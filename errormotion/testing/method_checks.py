@@ -23,7 +23,7 @@ from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status
 from errormotion.testing.coverage import coverage, differences, recovers_truth
 from errormotion.testing.instrument_checks import check_settings
 from errormotion.testing.kit import Checks, require
-from errormotion.testing.results import covariance, functional_point, sigma, values
+from errormotion.testing.results import covariance, functional_point, names, sigma, values
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
 
@@ -61,8 +61,9 @@ def settings_strict(subject: MethodSubject) -> str:
 def schema(subject: MethodSubject) -> str:
     """Raw data and result follow their schemas, and the result says which method made it, from which settings."""
     raw, _ = subject.make(0)
-    if variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
-        datasets.validate(raw)
+    tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
+    if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
+        datasets.validate(raw, tables)
     expected = subject.plugin.needs.raw_schema
     require(raw.attrs["schema"] == expected, f"raw data: expected schema {expected}, found {raw.attrs.get('schema')}")
     errors = subject.identify(raw)
@@ -86,7 +87,8 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
     raw, _ = subject.make(0)
     # What is acquired may be another variant of the schema than what is handed to the kit.
     known = {str(d) for d in raw.dims}
-    known |= {d for variant in variants(method.needs.raw_schema) for row in variant.rows for d in row.dims}
+    tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
+    known |= {d for table in tables for row in table.rows for d in row.dims}
     require(dim in known, f"append_dim: expected one of {', '.join(sorted(known))}; found '{dim}'")
     require(0 < length < float("inf"), f"progress: expected a positive length, found {length}")
     return f"{length:g} along {dim}"
@@ -122,6 +124,8 @@ def frame_invariance(subject: MethodSubject) -> str:
         subject.identify(raw),
         _moved_subject(subject, pose).identify(moved_raw(raw, subject.raw_vectors, pose)),
     )
+    if names(here) != DOF:
+        return _deviation_invariance(here, there, pose)
     back = np.round(pose.apply(functional_point(here)) - functional_point(there), 12)  # else NaN times rounding is NaN
     turned = twists.adjoint(rotation=pose.rotation)
     expected, spread = twists.transform(values(here), turned), twists.transform_covariance(covariance(here), turned)
@@ -133,6 +137,15 @@ def frame_invariance(subject: MethodSubject) -> str:
         twists.transform_covariance(covariance(there), carried),
     )
     return f"{np.isfinite(expected).sum()} values alike"
+
+
+def _deviation_invariance(here: xr.Dataset, there: xr.Dataset, pose: RigidTransform) -> str:
+    """Fail unless the deviations are the same numbers, and their sensitivity turned with the frame."""
+    expected = here.em.in_frame(pose, "moved").em.at(functional_point(there))["sensitivity"]
+    same = expected.sizes == there["sensitivity"].sizes and np.allclose(expected, there["sensitivity"], atol=1e-9)
+    require(bool(same), "the sensitivity did not turn with the frame")
+    _require_close(values(here), covariance(here), values(there), covariance(there))
+    return f"{np.isfinite(values(here)).sum()} values alike"
 
 
 def _moved_subject(subject: MethodSubject, pose: RigidTransform) -> MethodSubject:
@@ -298,7 +311,7 @@ def plan(subject: MethodSubject) -> str:
     datasets.validate(planned)
     expected = np.isfinite(values(subject.outcome(0)[0])).any(axis=0)
     found = np.isfinite(sigma(planned)).any(axis=0)
-    seen, planned_for = (", ".join(np.array(DOF)[which]) for which in (expected, found))
+    seen, planned_for = (", ".join(np.array(names(planned))[which]) for which in (expected, found))
     require(bool((found == expected).all()), f"plan covers {planned_for or 'nothing'}, identification sees {seen}")
     known = values(planned)
     require(bool((known[np.isfinite(known)] == 0).all()), "planned values are not zero")
@@ -336,7 +349,7 @@ def _require_close(
     fraction: float = SAME,
     what: str = "",
 ) -> None:
-    """Fail unless two results, (place, 6) with covariances, agree to a fraction of their standard uncertainty."""
+    """Fail unless two results, (place, n) with covariances, agree to a fraction of their standard uncertainty."""
     require(one.shape == other.shape, f"{what} {one.shape[0]} places became {other.shape[0]}".strip())
     known, known_other = np.isfinite(one), np.isfinite(other)
     require(bool((known == known_other).all()), f"{what} freedoms became known or unknown".strip())

@@ -15,30 +15,37 @@ def place_dims(errors: xr.Dataset) -> tuple[str, ...]:
     return tuple(str(dim) for dim in errors["EX"].dims)
 
 
+def names(errors: xr.Dataset) -> tuple[str, ...]:
+    """Return the names of the estimates: the six freedoms, or ``deviation`` alone."""
+    return tuple(errors.em.names)
+
+
 def values(errors: xr.Dataset) -> np.ndarray:
-    """Return the six freedoms, (place, 6), SI; NaN is unknown."""
-    return np.stack([errors[name].transpose(*place_dims(errors)).values.ravel() for name in DOF], axis=-1)
+    """Return the estimates, (place, n), SI; NaN is unknown."""
+    full = errors.em.estimates().transpose(*place_dims(errors), "dof").values
+    return np.reshape(full, (-1, full.shape[-1]))
 
 
 def covariance(errors: xr.Dataset) -> np.ndarray:
-    """Return the covariance at every place, (place, 6, 6), SI."""
-    full = errors["covariance"].transpose(*place_dims(errors), "dof", "dof_").values
-    blocks: np.ndarray = np.reshape(full, (-1, 6, 6))
-    return blocks
+    """Return the covariance of the estimates at every place, (place, n, n), SI."""
+    full = errors.em.covariance().transpose(*place_dims(errors), "dof", "dof_").values
+    return np.reshape(full, (-1, *full.shape[-2:]))
 
 
 def sigma(errors: xr.Dataset) -> np.ndarray:
-    """Return the standard uncertainties, (place, 6), SI."""
+    """Return the standard uncertainties, (place, n), SI."""
     u: np.ndarray = np.sqrt(np.einsum("pii->pi", covariance(errors)))
     return u
 
 
 def influence(errors: xr.Dataset) -> np.ndarray:
-    """Return the effects of the shared sources, (place, source, 6), SI; no source where none is stated."""
-    if "influence" not in errors:
-        return np.zeros((len(values(errors)), 0, 6))
-    full = errors["influence"].transpose(*place_dims(errors), "source", "dof").values
-    return np.reshape(full, (-1, full.shape[-2], 6))
+    """Return the effects of the shared sources, (place, source, n), SI; no source where none is stated."""
+    n = len(names(errors))
+    name = "influence" if n > 1 else "deviation_influence"
+    if name not in errors:
+        return np.zeros((len(values(errors)), 0, n))
+    full = errors[name].transpose(*place_dims(errors), "source", ...).values
+    return np.reshape(full, (-1, errors.sizes["source"], n))
 
 
 def functional_point(errors: xr.Dataset) -> np.ndarray:
@@ -47,10 +54,12 @@ def functional_point(errors: xr.Dataset) -> np.ndarray:
 
 
 def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
-    """Return the true errors, (place, 6), at the places and at the functional point of a result."""
+    """Return the true estimates, (place, n), at the places and at the functional point of a result."""
     dims = place_dims(errors)
     require(place_dims(truth) == dims, f"the truth is given over {place_dims(truth)}, the result over {dims}")
-    known = truth[list(DOF)]
+    seen = ("deviation",) if "deviation" in truth else DOF
+    require(seen == DOF or names(errors) == seen, "the truth is a deviation, and the result is none")
+    known = truth[list(seen)]
     for dim in dims:
         if errors[dim].dtype.kind in "fiu":
             low, high = float(truth[dim].min()), float(truth[dim].max())
@@ -59,4 +68,11 @@ def truth_at_places(errors: xr.Dataset, truth: xr.Dataset) -> np.ndarray:
             known = known.interp({dim: errors[dim].values})
         else:
             known = known.sel({dim: errors[dim].values})
-    return twists.move(values(known), functional_point(errors) - functional_point(truth))
+    true = np.stack([known[name].transpose(*dims).values.ravel() for name in seen], axis=-1)
+    if seen != DOF:
+        return true
+    moved = twists.move(true, functional_point(errors) - functional_point(truth))
+    if names(errors) == DOF:
+        return moved
+    sensitivity = errors["sensitivity"].broadcast_like(errors["deviation"]).transpose(*dims, "dof").values
+    return np.asarray(np.einsum("pi,pi->p", sensitivity.reshape(-1, 6), moved))[:, None]

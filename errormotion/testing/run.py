@@ -9,7 +9,6 @@ from typing import Any
 from errormotion import plugins
 from errormotion.errors import PluginError
 from errormotion.plugins import Group, InstrumentSubject, MethodSubject, load_object
-from errormotion.testing.builtin import builtin_subjects
 from errormotion.testing.kit import Check, CheckResult, run_check
 
 SIMULATED = "sim://cframe?seed=3"
@@ -79,8 +78,6 @@ def subjects_of(
         subjects = stated if isinstance(stated, tuple) else (stated,)
         if not all(isinstance(subject, InstrumentSubject | MethodSubject) for subject in subjects):
             raise PluginError(f"The attribute conformance of '{plugin_id}' gives no InstrumentSubject or MethodSubject")
-    else:
-        subjects = builtin_subjects(group, plugin_id, cls)
     if not subjects and group == "methods":
         raise PluginError(
             f"The method '{plugin_id}' does not say how to check it; give its class an attribute "

@@ -126,7 +126,7 @@ class Probe:
 
 def seeded_balls(rng: np.random.Generator, travel: Mapping[str, tuple[float, float]]) -> Balls:
     """Return all the balls that the table has room for, spread in the travel at different heights."""
-    low, high = np.array([travel[axis] for axis in "XYZ"]).T
+    low, high = np.array([travel.get(axis, (0.0, 0.0)) for axis in "XYZ"]).T
     share = np.array(PLACES)
     share[:, :2] = (1 + share[:, :2]) / 2
     nominal = low + share * (high - low)

@@ -9,22 +9,15 @@ and a rotation), a point (x, 0, z) of a profile lies in the machine at
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import xarray as xr
 from numpy.polynomial import polynomial
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
-from errormotion.twin.artefacts import Artefact
-from errormotion.twin.profiler import Profiler
 
-SCHEMA = "errormotion.raw.crossbeam_scan/1"
 #: time constants of screw, beam and columns, s
 LAGS = (900.0, 2700.0, 7200.0)
 #: steady errors: per lag a polynomial in u = y / half of the travel, lowest power first; um and urad
@@ -41,24 +34,7 @@ LIFT = -0.174
 #: how far off an artefact stands, m, and how crooked, rad (one sigma)
 PLACE, TURN = 0.2e-3, 3e-3
 
-_SCAN, _PHASE, _ARTEFACT = 1, 2, 3
-
-
-@dataclass(frozen=True)
-class Scans:
-    """How artefacts are scanned: see `VirtualMachine.raw_crossbeam_scan`."""
-
-    artefact: Artefact
-    profiler: Profiler
-    profiles: int
-    feed: float
-    motion: str
-
-    def __post_init__(self) -> None:
-        if self.motion not in ("axis", "rigid"):
-            raise BenchError(f"The motion of a scan is 'axis' or 'rigid'; found {self.motion!r}.")
-        if self.profiles < 2 or not self.feed > 0:
-            raise BenchError(f"A scan has two lines at least and a feed above 0; found {self.profiles}, {self.feed} m.")
+_ARTEFACT = 3
 
 
 @dataclass(frozen=True)
@@ -154,99 +130,6 @@ class Crossbeam:
         to_profiler[:, 2, 3] += np.asarray(lift, dtype=float)
         return np.asarray(np.linalg.inv(artefact) @ carriage @ to_profiler)
 
-    def pocket_scans(
-        self, pocket: Artefact, profiler: Profiler, along: Array, lifts: Array, key: tuple[int, ...]
-    ) -> tuple[Array, Array, Array]:
-        """Return scans of a pocket that the cold machine has cut itself, one per lift.
-
-        Parameters
-        ----------
-        along, lifts : (profile,), (scan,)
-            Y and Z of the tool frame at each line and scan, off its place over the pocket when it was cut, m.
-
-        Returns
-        -------
-        height : ndarray, (scan, profile, point)
-            m.
-        stage : ndarray, (scan, profile, 3)
-            Where the tool frame was, m.
-        centre : ndarray, (3,)
-            Of the rim in the tool frame when that is at 0, m: straight below the profiler's lift.
-        """
-        stage = np.zeros((lifts.size, along.size, 3))
-        stage[..., 1], stage[..., 2] = along, lifts[:, None]
-        poses = np.tile(self.pose, (*stage.shape[:2], 1, 1))
-        poses[..., :3, 3] += stage
-        scans = [profiler.scan(pocket, poses[k], key=(*key, k)) for k in range(lifts.size)]
-        return np.array(scans), stage, np.zeros(3)
-
-    def raw(
-        self,
-        times: Array,
-        positions: Array,
-        scans: Scans,
-        seeds: tuple[int, int],
-        pose: ArrayLike | None,
-        labels: Mapping[str, str],
-    ) -> xr.Dataset:
-        """Return the raw dataset: see `VirtualMachine.raw_crossbeam_scan`; ``seeds`` are the machine's and the noise's.
-
-        The sampling phase of each scan is random: y of its middle is off by up to half a feed.
-        """
-        reach = scans.profiles * scans.feed / 2
-        if positions.min() - reach < self.travel[0] or positions.max() + reach > self.travel[1]:
-            raise BenchError(
-                f"The axis travels from {self.travel[0]} to {self.travel[1]} m; the scans reach from "
-                f"{positions.min() - reach:.3f} to {positions.max() + reach:.3f} m."
-            )
-        profiler = scans.profiler
-        shape = (times.size, positions.size, scans.profiles)
-        height = np.empty((*shape, profiler.points), dtype=np.float32)
-        y = np.empty(shape)
-        places = [self.artefact_pose(seeds[0], position) for position in positions]
-        phase = np.random.default_rng([abs(seeds[1]), int(seeds[1] < 0), _PHASE]).uniform(-0.5, 0.5, shape[:2])
-        for cycle, artefact in np.ndindex(shape[:2]):
-            middle = float(positions[artefact])
-            index = np.arange(scans.profiles) - (scans.profiles - 1) / 2
-            y[cycle, artefact] = (index + phase[cycle, artefact]) * scans.feed
-            carriage = self.carriage(float(times[cycle]), middle + y[cycle, artefact], middle, scans.motion)
-            poses = self.lines(carriage, places[artefact])
-            key = (*seeds, _SCAN, cycle, artefact)
-            height[cycle, artefact] = profiler.scan(scans.artefact, poses, key=key)
-        metres = {"units": "m"}
-        return xr.Dataset(
-            {
-                "height": (("cycle", "artefact", "profile", "point"), height, metres),
-                "x": ("point", profiler.x, metres),
-                "y": (("cycle", "artefact", "profile"), y, metres),
-                "time": ("cycle", times, {"units": "s"}),
-                "position": ("artefact", positions, metres),
-                "profiler_pose": (("row", "column"), self.pose if pose is None else np.asarray(pose, dtype=float)),
-                "lever": ("direction", self.lever, metres),
-                "height_noise": ((), profiler.disturbances.noise, metres),
-            },
-            {"direction": list("xyz")},
-            {"schema": SCHEMA, **labels},
-        )
-
-
-def pocket_dataset(
-    x: Array, height: Array, stage: Array, centre: Array, radius: float, labels: Mapping[str, str]
-) -> xr.Dataset:
-    """Return scans of a pocket as a raw dataset, heights as float32: see `VirtualMachine.raw_pocket_scan`."""
-    metres = {"units": "m"}
-    return xr.Dataset(
-        {
-            "height": (("scan", "profile", "point"), height.astype(np.float32), metres),
-            "x": ("point", x, metres),
-            "stage": (("scan", "profile", "direction"), stage, metres),
-            "pocket_centre": ("direction", centre, metres),
-            "pocket_radius": ((), radius, metres),
-        },
-        {"direction": list("xyz")},
-        {"schema": SCHEMA, **labels},
-    )
-
 
 def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
     """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a profiler set up by hand."""
@@ -258,9 +141,3 @@ def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> C
     set_up = rng.normal(0, [2e-3, 2e-3, 2e-3, 3e-3, 3e-3, 6e-3])
     set_up[2] += LIFT
     return Crossbeam(travel, steady, np.asarray(displaced(set_up).as_matrix()))
-
-
-def instrument_note(seed: int) -> str:
-    """Return the attribute ``instruments``: that all of this is simulated."""
-    note = {"id": "virtual line profiler", "address": f"twin://gantry?seed={seed}", "simulated": True}
-    return json.dumps([note])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from errormotion.errors import BenchError
+from errormotion.kinematics.description import MachineDescription
 
 Table = Mapping[str, float]
 
@@ -50,6 +51,11 @@ class MachineKind:
     behind: tuple[str, ...] = ("spindle_front", "spindle_rear", "motor", "head")
     top_speed: float = 15000.0
     rapid: float = 20.0 / 60
+
+    @property
+    def description(self) -> MachineDescription:
+        """The machine as a bench file describes it."""
+        return MachineDescription(self.name, self.chain, self.travel)
 
 
 CFRAME = MachineKind(
@@ -181,8 +187,20 @@ GANTRY = MachineKind(
 KINDS: Mapping[str, MachineKind] = {"cframe": CFRAME, "gantry": GANTRY}
 
 
-def machine_kind(name: str) -> MachineKind:
-    """Return the tables of a machine; BenchError names the ones there are."""
-    if name not in KINDS:
-        raise BenchError(f"There is no virtual machine '{name}'; there are: {', '.join(KINDS)}.")
-    return KINDS[name]
+def machine_kind(machine: str | MachineDescription) -> tuple[str, MachineKind]:
+    """Return the name of a kind and its tables.
+
+    A described machine has its own chain and travel. It warms up like the gantry where X, Y and Z all carry the tool,
+    otherwise like the C-frame.
+
+    Raises
+    ------
+    BenchError
+        An unknown kind.
+    """
+    if isinstance(machine, MachineDescription):
+        name = "gantry" if machine.tool_axes == "XYZ" else "cframe"
+        return name, replace(KINDS[name], name=machine.name, travel=machine.travel, chain=machine.chain)
+    if machine not in KINDS:
+        raise BenchError(f"expected a virtual machine, {' or '.join(KINDS)}, or a description; found '{machine}'")
+    return machine, KINDS[machine]

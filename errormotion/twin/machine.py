@@ -11,19 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
+from errormotion.kinematics.description import MachineDescription
+from errormotion.kinematics.iso import ROTARY_AXES
 from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
 from errormotion.twin import frame as frames
-from errormotion.twin import rawdata, truth
-from errormotion.twin.beam_rawdata import BeamMeasurements
+from errormotion.twin import truth
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
-from errormotion.twin.crossbeam_rawdata import CrossbeamMeasurements
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
 from errormotion.twin.kinds import machine_kind
-from errormotion.twin.multilateration_rawdata import TrackerMeasurements
 from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
+from errormotion.twin.sensing import Sensing
+from errormotion.twin.stage_sensor import StageSensor
 from errormotion.twin.state import ThermalState, seeded_state
 
 #: the spindle reaches full speed in this time, s
@@ -35,16 +35,17 @@ _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "prob
 _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
-class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurements, ProbeMeasurements):
-    """A machine tool that knows its own errors.
+class VirtualMachine(StageSensor, ProbeMeasurements):
+    """A machine tool whose true errors are known.
 
     The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
     schedule give the same numbers, whatever is asked for in which order.
 
     Parameters
     ----------
-    kind : str
-        "cframe" (610 x 510 x 460 mm) or "gantry" (4 x 1.8 x 1 m).
+    machine : str or MachineDescription
+        "cframe" (610 x 510 x 460 mm), "gantry" (4 x 1.8 x 1 m), or the description of any other machine: it has the
+        heat of the gantry where X, Y and Z all carry the tool, else that of the C-frame.
     seed : int
         Which individual.
     warm : bool
@@ -53,13 +54,17 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
     Attributes
     ----------
     name : str
-        For people.
+        For reports.
+    kind : str
+        "cframe" or "gantry".
+    description : MachineDescription
+        Chain, travel, spindle axis and rotary axes.
     travel : mapping
-        Axis to (lowest, highest) position, m.
+        Moving axis to (lowest, highest) position, m or rad.
     rapid : float
         Feed of rapid moves, m/s.
     chain : str
-        Bodies from workpiece to tool.
+        Bodies from workpiece to tool, without the fixed axes.
     frame : FrameGeometry
         The five sensors.
     bar : Bar
@@ -69,23 +74,22 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
     state : ThermalState
         Temperatures and thermal errors under the present schedule.
     geometry : GeometricErrors
-        The 21 geometric errors.
+        The geometric errors of all axes.
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
-        A point sensor on the stage and what it looks at: see `BeamMeasurements`, also for the measurements with them.
-        Measurements with a laser tracker: see `TrackerMeasurements`; of balls by the machine itself: see
-        `ProbeMeasurements`.
+        A point sensor on the stage and what it looks at.
     """
 
-    def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
-        tables = machine_kind(kind)
-        self.kind = kind
+    def __init__(self, machine: str | MachineDescription = "cframe", seed: int = 0, *, warm: bool = True) -> None:
+        self.kind, tables = machine_kind(machine)
         self.seed = int(seed)
         self.name = tables.name
-        self.travel = dict(tables.travel)
+        self._described = isinstance(machine, MachineDescription)
+        self.description = machine if isinstance(machine, MachineDescription) else tables.description
+        self.travel = {axis: self.description.travel[axis] for axis in self.description.moving_axes}
         self.rapid = tables.rapid
-        self.chain = tables.chain
+        self.chain = self.description.moving_chain
         self.top_speed = tables.top_speed
         self.bar_radius = bars.RADIUS
         self.sphere_radius = 5e-3
@@ -93,14 +97,14 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
         self.frame = frames.seeded_frame(self._rng("frame"), self.bar_radius)
         self.bar = bars.seeded_bar(self._rng("bar"), len(self.frame.channels))
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
-        self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
-        self.crossbeam: Crossbeam = seeded_crossbeam(self._rng("crossbeam"), self.travel["Y"])
+        self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.description)
+        self.crossbeam: Crossbeam = seeded_crossbeam(self._rng("crossbeam"), tables.travel.get("Y", (0.0, 0.0)))
         self._set_up_point_sensor(self._rng("point_sensor"))
         self._set_up_probing(self._rng("probing"))
         self._sensing = self._sense()
 
     def __repr__(self) -> str:
-        return f"VirtualMachine({self.kind!r}, seed={self.seed})"
+        return f"VirtualMachine({self.name if self._described else self.kind!r}, seed={self.seed})"
 
     def _rng(self, part: str) -> np.random.Generator:
         return np.random.default_rng([abs(self.seed), int(self.seed < 0), _PART[part]])
@@ -211,23 +215,38 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
         return truth.dataset(twist, "time", coords, "spindle", point, "cold state at time 0", self._origin())
 
     def truth_axis(self, axis: str, positions: ArrayLike) -> xr.Dataset:
-        """Return the geometric errors of an axis as an error dataset over ``position`` (m), at the machine's origin."""
+        """Return the geometric errors of an axis as an error dataset over ``position``, m or rad.
+
+        They are stated at the machine's origin; those of a rotary axis at the point of its line that the description
+        gives.
+        """
         if axis not in self.geometry.motions:
             raise BenchError(f"The axes are {', '.join(self.geometry.motions)}; found {axis!r}.")
         q = _times(positions)
-        coords = {axis.lower(): ("position", q, {"units": "m"})}
+        (joint,) = (each for each in self.geometry.machine.joints if each.name == axis)
+        coords = {axis.lower(): ("position", q, {"units": "rad" if joint.rotary else "m"})}
         twist = self.geometry.motions[axis](q)
-        return truth.dataset(twist, "position", coords, axis, np.zeros(3), "axis at zero", self._origin())
+        return truth.dataset(twist, "position", coords, axis, joint.reference, "axis at zero", self._origin())
 
     def volumetric_truth(self, points: ArrayLike) -> xr.Dataset:
-        """Return the errors of the tool at commanded points (n, 3), m, as an error dataset over ``target``."""
+        """Return the errors of the tool at commanded points as an error dataset over ``target``.
+
+        Parameters
+        ----------
+        points : (n, moving axis)
+            See `GeometricErrors.twist`, m and rad.
+        """
         places = np.atleast_2d(np.asarray(points, dtype=float))
-        coords = {name: ("target", places[:, i], {"units": "m"}) for i, name in enumerate("xyz")}
+        coords = {
+            axis.lower(): ("target", column, {"units": "rad" if axis in ROTARY_AXES else "m"})
+            for axis, column in zip(self.description.moving_axes, places.T, strict=False)
+        }
         twist = self.geometry.twist(places)
         return truth.dataset(twist, "target", coords, "tool", np.zeros(3), "commanded point", self._origin())
 
     def _origin(self) -> truth.Origin:
-        return truth.Origin(self.name, self.kind, self.seed, self._events)
+        description = self.description if self._described else None
+        return truth.Origin(self.name, self.kind, self.seed, self._events, description)
 
     # ------------------------------------------------------------------ readings
 
@@ -285,78 +304,6 @@ class VirtualMachine(BeamMeasurements, CrossbeamMeasurements, TrackerMeasurement
                 f"The spindle holds a 'bar', or a 'sphere' with a StepProgram; found {tool!r}, {motion!r}."
             )
         return out
-
-    def raw_spindle_drift(
-        self,
-        t: ArrayLike,
-        *,
-        seed: int,
-        beams: str | rawdata.Beams = "true",
-        averaged: int = 10000,
-        expansion: bool = False,
-        warm_up: bool = True,
-        radius_error: bool = True,
-    ) -> xr.Dataset:
-        """Return a raw dataset of a drift measurement, each sample the mean over whole turns.
-
-        Parameters
-        ----------
-        t : (n,)
-            Times, s, increasing.
-        seed : int
-            Of the noise alone; the machine stays the same.
-        beams : {"true", "nominal"} or (origin, direction, covariance)
-            The beams that the dataset states: (channel, 3) m, (channel, 3), (channel, 6, 6) or None.
-        averaged : int
-            Samples in each mean: ``distance_noise`` is that of one sample by the root of this, and so is the noise.
-        expansion : bool
-            Whether the readings hold the expansion of the frame; without it they are as if compensated perfectly.
-        warm_up : bool
-            Whether they hold the warm-up of the sensors; nothing in a warm machine.
-        radius_error : bool
-            Whether the dataset states the certificate's radius of the bar and not the true one.
-        """
-        t = _times(t)
-        noise = float(self.frame.noise.max()) / np.sqrt(averaged)
-        readings = self.still_readings(t, expansion=expansion, warm_up=warm_up)
-        readings = readings + noise * np.random.default_rng(seed).normal(size=readings.shape)
-        readings[~((readings >= 0) & (readings <= self.frame.range))] = np.nan
-        known = {
-            "true": (self.frame.true_origin, self.frame.true_direction, None),
-            "nominal": (self.frame.nominal_origin, self.frame.nominal_direction, None),
-        }
-        if isinstance(beams, str) and beams not in known:
-            raise BenchError(f"The beams are 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
-        return rawdata.spindle_drift(
-            self.frame,
-            t,
-            readings,
-            noise,
-            known[beams] if isinstance(beams, str) else beams,
-            self.bar_radius if radius_error else self.bar.radius,
-            {
-                "temperature": (("time", "sensor"), self.temperatures(t), {"units": "degC"}),
-                "spindle_speed": ("time", self.spindle_speed(t), {"units": "1/min"}),
-            },
-            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
-        ).assign_coords(sensor=list(self.temperature_sensors))
-
-    def raw_beam_detection(self, *, seed: int) -> xr.Dataset:
-        """Return a raw dataset of a beam detection in the cold state, one mean reading per rest of the sphere.
-
-        Parameters
-        ----------
-        seed : int
-            Of positions and speckle; the machine stays the same.
-        """
-        return rawdata.beam_detection(
-            self.frame,
-            self.sphere_radius,
-            REPEATABILITY,
-            SPECKLE,
-            np.random.default_rng(seed),
-            {"machine": self.name, "instruments": rawdata.instrument_note(self.kind, self.seed)},
-        )
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)

@@ -21,7 +21,6 @@ from errormotion.arrays import Array
 from errormotion.twin import kernels, truth
 from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
 from errormotion.twin.geometry import GeometricErrors
-from errormotion.twin.probing_rawdata import Cycles, Moved, touches_dataset
 from errormotion.twin.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
@@ -244,6 +243,40 @@ class ProbeMeasurements:
             return None, length
         return begin + way.min() * direction[0], float(way.min())
 
+    def trip_positions(
+        self,
+        ball: NDArray[np.intp],
+        start: Array,
+        direction: Array,
+        t: Array,
+        balls: Balls,
+        scatter: Array,
+        shift: Array,
+    ) -> Array:
+        """Return where the probe trips on given balls, each approached on a straight path that takes no time.
+
+        Parameters
+        ----------
+        ball : ndarray, (n,)
+            Number of the ball of each touch.
+        start, direction : ndarray, (n, 3)
+            Commanded start of the tip, m, and unit direction of its motion.
+        t : ndarray, (n,)
+            s.
+        balls : Balls
+        scatter : ndarray, (n,)
+            Scatter of the trigger along the normal, m.
+        shift : ndarray, (n, 3)
+            Displacement of the ball from its position on the table, m.
+
+        Returns
+        -------
+        ndarray, (n, 3)
+            Commanded positions of the tip, m; NaN where the path misses the ball.
+        """
+        distance = self._way(start, direction, ball, balls, self._error_at(t), scatter, shift)
+        return np.asarray(start + distance[:, None] * direction)
+
     def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
         """Return how far the tip's centre is from that of a ball when the probe trips, m."""
         return np.asarray(balls.height(ball, normal) + self.probe.tip_radius - self.probe.pretravel(normal))
@@ -286,7 +319,7 @@ class ProbeMeasurements:
         bits = np.array([*start, *target, t], dtype=float).view(np.int64)
         return float(kernels.normal(kernels.stream_key(self.seed, _TRIGGER, *bits), 0))
 
-    # ------------------------------------------------------------------ raw data
+    # ------------------------------------------------------------------ temperatures
 
     def sensor_temperatures(self, t: ArrayLike, *, seed: int = 0, noise: float = TEMPERATURE_NOISE) -> Array:
         """Return what sensors at all places read at times t, degC, shape (n, sensor).
@@ -300,77 +333,3 @@ class ProbeMeasurements:
             for i, bits in enumerate(times.view(np.int64)):
                 readings[i, sensor] += noise * kernels.normal(key, bits)
         return readings
-
-    def raw_normal_vector(
-        self,
-        times: ArrayLike,
-        *,
-        seed: int,
-        balls: int = BALLS,
-        touches: int = 5,
-        cycle: float | None = None,
-        variant: str = "touches",
-        moved: Moved | None = None,
-        missing: float = 0.0,
-        noise: float | None = None,
-    ) -> xr.Dataset:
-        """Return a raw dataset of balls that the machine probes in cycles, under the schedule of `start`.
-
-        Parameters
-        ----------
-        times : (n,)
-            When each cycle begins, s, increasing; the first is the cold one and the reference.
-        seed : int
-            Of the noise alone; machine and balls stay as they are.
-        balls : int
-            1 to 8.
-        touches : int
-            Of each ball, 5 or more: four around, one from above, the others from above at 45 degrees.
-        cycle : float, optional
-            How long a cycle takes, s; 6 s for each touch where not given, 0 for none.
-        variant : {"touches", "centres"}
-            Contacts, or the centres that a controller makes of them.
-        moved : (int, float, (3,)), optional
-            A ball (counted from 0) is pushed at a time, s, by a shift, m.
-        missing : float
-            Share of the touches (of the centres) that give none.
-        noise : float, optional
-            Scatter of the trigger, m; that of the probe where not given.
-
-        Raises
-        ------
-        BenchError
-            Something of that is out of range.
-        """
-        cycles = Cycles.of(times, balls, touches, cycle, moved, missing)
-        rng = np.random.default_rng([abs(self.seed), _TRIGGER, seed])
-        set_up = self.balls_on_table(balls)
-        sigma = self.probe.noise if noise is None else float(noise)
-        contacts = self._contacts(cycles, set_up, sigma * rng.normal(size=cycles.shape))
-        temperature = self.sensor_temperatures(cycles.times, seed=seed)
-        more = {
-            "temperature": (("time", "sensor"), temperature, {"units": "degC"}),
-            "spindle_speed": ("time", self.spindle_speed(cycles.times), {"units": "1/min"}),
-            "feed": ("time", np.zeros(len(cycles.times)), {"units": "m/s"}),
-        }
-        attrs = {"machine": self.name, "chain": self.chain, "tool_axes": self.tool_axes}
-        origin = {"kind": self.kind, "seed": self.seed}
-        return touches_dataset(
-            cycles,
-            set_up,
-            self.probe,
-            contacts,
-            sigma,
-            variant,
-            rng,
-            {**more, "sensor": list(self.temperature_sensors)},
-            attrs,
-            origin,
-        )
-
-    def _contacts(self, cycles: Cycles, balls: Balls, scatter: Array) -> Array:
-        """Return the commanded places of the tip at all contacts, m, (time, ball, touch, 3)."""
-        ball, start, direction, times, shift = cycles.ways(balls)
-        error = self._error_at(times)
-        way = self._way(start, direction, ball, balls, error, scatter.ravel(), shift)
-        return np.asarray((start + way[:, None] * direction).reshape(*cycles.shape, 3))

@@ -1,5 +1,6 @@
 """Many runs give the same errors wherever they are identified; what breaks, breaks alone."""
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from errormotion.campaign import batch, runner
 from errormotion.campaign.batch import Outcome, identify_runs
 from errormotion.campaign.files import CampaignPlan
 from errormotion.errors import PluginError, RunError
+from errormotion.methods.spindle_drift import simulation
 from errormotion.plugins import PluginSettings
 from errormotion.twin import Event, VirtualMachine
 
@@ -34,7 +36,7 @@ def raws(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
     t = np.arange(0.25, 60.0, 0.5)
-    good = [datasets.save(machine.raw_spindle_drift(t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
+    good = [datasets.save(simulation.raw_drift(machine, t, seed=k), folder / f"run{k}.nc") for k in range(COUNT)]
     cut = folder / "cut.nc"
     cut.write_bytes(good[0].read_bytes()[:5000])
     return [*good[:2], cut, *good[2:]]
@@ -130,13 +132,13 @@ def test_worker_that_came_later_with_another_version_refuses_its_task(
 
 
 def test_cluster_that_is_not_there_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "PATIENCE", 0.3)
+    monkeypatch.setattr(batch, "CLUSTER_TIMEOUT", 0.3)
     with pytest.raises(RunError, match="none answers"):
         identify(scheduler="tcp://127.0.0.1:9")
 
 
 def test_cluster_without_workers_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "PATIENCE", 2.0)
+    monkeypatch.setattr(batch, "CLUSTER_TIMEOUT", 2.0)
     with (
         local_cluster(0) as empty,
         pytest.raises(RunError, match="has no workers; start some with 'dask worker"),
@@ -150,13 +152,24 @@ def test_goes_on_where_it_was_interrupted(raws: list[Path], identify: Identify, 
             if done == 2:
                 raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; the same command goes on"):
+    with pytest.raises(KeyboardInterrupt, match="2 of 5 runs are done; repeat the command to continue"):
         identify(progress=Impatient())
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
     assert sorted(path.name for path in before) == ["run0.nc", "run1.nc"]
     outcomes = identify()
     assert [outcome.stepped_over for outcome in outcomes] == [True, True, False, False, False]
     assert all(path.stat().st_mtime_ns == then for path, then in before.items())
+
+
+def test_result_of_an_earlier_version_is_recognised_by_the_hash_it_carries(
+    raws: list[Path], identify: Identify, tmp_path: Path
+) -> None:
+    (outcome,) = identify(raws[:1])
+    errors = datasets.load(outcome.errors)
+    with datasets.load(raws[0]) as raw:
+        mark = json.loads(errors.attrs[batch.MARK]) | {"raw": datasets.hash_dataset(raw, "sha256")}
+    datasets.save(errors.assign_attrs({batch.MARK: json.dumps(mark)}), outcome.errors, overwrite=True)
+    assert [each.stepped_over for each in identify(raws[:1])] == [True]
 
 
 def test_result_of_anything_else_is_never_overwritten(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
@@ -195,7 +208,7 @@ def test_plugin_that_breaks_on_one_run_harms_no_other(
 def test_process_that_dies_is_told(raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "_identify", lambda *_: os._exit(1))
     (outcome,) = identify(raws[:1], scheduler="processes", workers=1)
-    assert "a process died" in outcome.reason
+    assert "the process ended unexpectedly" in outcome.reason
 
 
 def test_names_tell_runs_apart(tmp_path: Path) -> None:
@@ -222,8 +235,8 @@ def test_folder_of_runs_means_those_of_the_method(plan: Callable[..., CampaignPl
     assert [outcome.raw for outcome in outcomes] == [first.path, second.path, runs / "torn"]
     assert outcomes[0].errors == tmp_path / "out" / f"{first.path.name}.nc"
     assert outcomes[0].errors.exists()
-    assert "not complete (interrupted): 'errormotion run --resume" in outcomes[1].reason.replace(";", ":")
-    assert "is no JSON" in outcomes[2].reason
+    assert "not complete (interrupted); continue it with 'errormotion run --resume" in outcomes[1].reason
+    assert "is not valid JSON" in outcomes[2].reason
     again = identify_runs([first.path, first.raw], "ramp", ramp, tmp_path / "out", scheduler="sync")
     assert [outcome.stepped_over for outcome in again] == [True]
     (runs / "torn" / "run.json").unlink()

@@ -10,7 +10,7 @@ from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
 from errormotion.errors import BenchError, RunError
-from errormotion.methods.beam_direction import BeamDirection
+from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.twin import VirtualMachine
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "virtual_beam"
@@ -48,14 +48,14 @@ def measured(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     machine = VirtualMachine("cframe", seed=3)
     if request.param == "keyence_lk":
-        plan, truth = write(folder), machine.truth_beam()
+        plan, truth = write(folder), simulation.truth_beam(machine)
     else:
         plan = write(
             folder,
             [(KEYENCE, OPTO)],
             [(ORIGIN, FROM_START), (COMPENSATION, f"{COMPENSATION}\nallow_other_sensor = true")],
         )
-        truth = machine.truth_beam(machine.point_sensor.from_start(20e-3))
+        truth = simulation.truth_beam(machine, machine.point_sensor.from_start(20e-3))
     (run,) = runner.run(plan, runs=folder / "runs", ask=never)
     return run, truth
 

@@ -1,4 +1,4 @@
-"""A real process is killed, stopped, and cut off in the middle of an acquisition; the run goes on in another one."""
+"""A real process is killed, stopped and interrupted during an acquisition; another process continues the run."""
 
 import json
 import os

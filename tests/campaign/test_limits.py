@@ -70,7 +70,7 @@ def test_a_test_that_would_leave_them_is_refused_when_it_is_read(tmp_path: Path,
 @pytest.mark.parametrize(
     ("limits", "told"),
     [
-        ('X = ["4 m", "0 m"]', "X: expected the lowest place before the highest"),
+        ('X = ["4 m", "0 m"]', "X: expected the lowest position, then the highest"),
         ("X = [0, 4]", r"limits\.X\[0\]: expected a length with its unit, such as '5 mm'; found 0"),
         ('W = ["0 m", "4 m"]', r"limits\.W: unknown key"),
     ],
@@ -88,7 +88,7 @@ def test_the_extent_is_what_the_steps_say() -> None:
         Step("move", (0.3, 0.4, -1.0), 0.2, 5.0),
     ]
     found = extent(steps)
-    assert (found.seconds, found.way, found.touches, found.moves) == (65.0, 1.5, 1, 2)
+    assert (found.seconds, found.path, found.touches, found.moves) == (65.0, 1.5, 1, 2)
     assert (found.low, found.high) == ((0.0, 0.0, -1.0), (0.3, 0.4, 0.0))
     assert (found.feed, found.spindle_speed) == (0.2, 6000.0)
     assert violations(found, Limits()) == []

@@ -1,4 +1,4 @@
-"""A monitor logs what answers, marks what does not, and goes on."""
+"""A monitor logs the instruments that answer, marks the others, and continues."""
 
 import json
 import math
@@ -213,6 +213,6 @@ def test_ticks_that_were_missed_are_not_counted_as_rows(tmp_path):
         monitor = Monitor(bench(dcon("front", f"tcp://127.0.0.1:{server.server_address[1]}")), tmp_path, TICK)
         with monitor:
             for last in islice(monitor.watch(), 3):
-                told = last.logged
+                logged = last.logged
                 time.sleep(2.5 * TICK)
-    assert told == 3 == RunFolder.open(monitor.folder.path).data["samples"]["count"]
+    assert logged == 3 == RunFolder.open(monitor.folder.path).data["samples"]["count"]

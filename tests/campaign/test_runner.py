@@ -1,4 +1,4 @@
-"""The runner brings everything to disk before it uses it, and goes on where a run ended."""
+"""The runner stores everything before it uses it, and continues a run where it ended."""
 
 import errno
 import json
@@ -70,7 +70,7 @@ def test_result_of_an_earlier_test_reaches_the_later_one(plan: Plan) -> None:
 
 def test_settings_are_on_disk_even_if_the_first_sample_never_came(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "broken").touch()
-    with pytest.raises(RunError, match="1000 samples are kept"):
+    with pytest.raises(RunError, match="1000 samples are stored"):
         runner.run(plan('name = "a"\nsettings = {count = 5000}', bench=f'breaks = "{tmp_path / "broken"}"'))
     (folder,) = list_runs(tmp_path / "runs")
     assert folder.data["status"] == "failed"
@@ -88,7 +88,7 @@ def test_breakdown_keeps_what_was_measured_and_resume_goes_on_behind_it(plan: Pl
     assert "InstrumentError: the counter fell off the table" in last["traceback"]
     assert plugins.get("instruments", "counter").opened == []
     whole(folder, 1000)
-    with pytest.raises(RunError, match="1000 samples are kept"):
+    with pytest.raises(RunError, match="1000 samples are stored"):
         runner.resume(broken)
     (tmp_path / "broken").unlink()
     (folder,) = runner.resume(broken)
@@ -101,7 +101,7 @@ def test_failed_identification_keeps_the_raw_data_and_is_redone_without_the_benc
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}')
-    with pytest.raises(RunError, match="The raw data is complete and kept"):
+    with pytest.raises(RunError, match="The raw data are complete and stored"):
         runner.run(made)
     (tmp_path / "needed").touch()
     monkeypatch.setattr(plugins.get("instruments", "counter"), "open", lambda self: pytest.fail("the bench was opened"))
@@ -135,7 +135,7 @@ def test_full_disk_says_how_much_is_safe_and_can_be_resumed(
         self.commit()
 
     monkeypatch.setattr(RawStore, "append", append_until_full)
-    with pytest.raises(RunError, match=r"The disk is full: 1000 samples \(1\.0 s\) are safe in .*raw\.zarr"):
+    with pytest.raises(RunError, match=r"The disk is full: 1000 samples \(1\.0 s\) are stored in .*raw\.zarr"):
         runner.run(made)
     (folder,) = list_runs(tmp_path / "runs")
     assert folder.data["status"] == "failed"
@@ -152,7 +152,7 @@ def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) ->
     with pytest.raises(RunError, match="failed"):
         runner.run(plan(f'name = "a"\n{setting}'))
     changed = plan(f'name = "a"\n# another text\n{setting}')
-    with pytest.raises(RunError, match=r"has changed since .* was measured\. Go on with the files as they were"):
+    with pytest.raises(RunError, match=r"has changed since .* was measured\. Continue with the stored files"):
         runner.resume(changed)
     (tmp_path / "needed").touch()
     (folder,) = runner.resume(runs=tmp_path / "runs")
@@ -161,10 +161,10 @@ def test_changed_files_are_not_resumed_by_mistake(plan: Plan, tmp_path: Path) ->
 
 def test_nothing_to_resume_is_said(plan: Plan) -> None:
     made = plan('name = "a"')
-    with pytest.raises(RunError, match=r"Nothing to resume in .*runs: 0 campaigns"):
+    with pytest.raises(RunError, match=r"Nothing to resume in .*runs: found 0 campaigns"):
         runner.resume(made)
     runner.run(made)
-    with pytest.raises(RunError, match="1 campaigns there, all of them finished"):
+    with pytest.raises(RunError, match="found 1 campaigns, none of them unfinished"):
         runner.resume(made)
 
 
@@ -199,7 +199,7 @@ def test_method_without_data_is_a_failure(plan: Plan) -> None:
 def test_broken_run_json_is_told_and_harms_no_other_run(plan: Plan, tmp_path: Path, write: Callable[..., Path]) -> None:
     first, _ = runner.run(plan('name = "a"', 'name = "b"'))
     (first.path / "run.json").write_text("{")
-    with pytest.raises(RunError, match=r"run\.json: is no JSON"):
+    with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
         RunFolder.open(first.path)
     assert [folder.data["test"] for folder in list_runs(tmp_path / "runs")] == ["b"]
     assert load_campaign(write('name = "a"')).name == "Ramps"

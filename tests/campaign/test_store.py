@@ -1,5 +1,7 @@
 """The raw store holds what was appended, whatever write was the last."""
 
+import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +78,14 @@ def test_sensor_steps_are_stored_as_integers_and_times_not_at_all(tmp_path: Path
         np.testing.assert_allclose(raw["time"].values, np.arange(100) / RATE)
 
 
+def test_texts_have_a_type_with_a_specification(tmp_path: Path) -> None:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        fill(tmp_path / "raw.zarr", [100, 28], expected=100)
+    assert not found
+    assert json.loads((tmp_path / "raw.zarr" / "sensor" / "zarr.json").read_text())["data_type"] == "string"
+
+
 def test_packing_that_would_lose_something_is_left_out(tmp_path: Path) -> None:
     part = chunk(0, 100)
     part["distance"].values[0, 50] += LSB / 10
@@ -89,7 +99,7 @@ def test_broken_promise_of_packing_is_refused(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     part = chunk(0, 10)
     part["distance"].values[0, 0] += LSB / 10
-    with pytest.raises(RunError, match=r"promised to be integers of 3\.1e-08"):
+    with pytest.raises(RunError, match=r"expected '\w+' in integer steps of 3\.1e-08"):
         store.append(part)
 
 
@@ -179,7 +189,10 @@ def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
     ("change", "message"),
     [
         (lambda raw: raw.drop_vars("temperature"), "expected the variables distance, temperature along 'time'"),
-        (lambda raw: raw.assign(extra=raw["distance"]), "yielded the variable 'extra', which its first dataset lacked"),
+        (
+            lambda raw: raw.assign(extra=raw["distance"]),
+            "yielded the variable 'extra', which is missing in its first dataset",
+        ),
         (
             lambda raw: raw.isel(channel=slice(3)),
             r"'distance' has the sizes \{'channel': 3\}; expected \{'channel': 5\}",

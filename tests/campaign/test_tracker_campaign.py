@@ -13,7 +13,7 @@ from errormotion.errors import RunError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import SimulatedEmScon
-from errormotion.methods.multilateration import Multilateration
+from errormotion.methods.multilateration import Multilateration, simulation
 from errormotion.methods.multilateration.planning.layout import serpentine
 from errormotion.twin import VirtualMachine
 
@@ -90,7 +90,7 @@ def miss(run):
     """Return by how many standard uncertainties each error of the volume misses the truth, and the errors."""
     ds = datasets.load(run.errors)
     position = np.stack([ds[name].values for name in "xyz"], axis=-1)
-    truth = VirtualMachine("cframe", seed=3).truth_multilateration(position, (0.02, -0.01, -0.08))
+    truth = simulation.true_errors(VirtualMachine("cframe", seed=3), position, (0.02, -0.01, -0.08))
     found = np.stack([ds[name].values for name in ("EX", "EY", "EZ")], axis=-1)
     true = np.stack([truth[name].values for name in ("EX", "EY", "EZ")], axis=-1)
     sigma = np.sqrt(np.diagonal(ds["covariance"].values, axis1=1, axis2=2))[:, :3]

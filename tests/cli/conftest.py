@@ -12,6 +12,7 @@ from typer.testing import CliRunner, Result
 
 from errormotion import datasets
 from errormotion.cli.app import app
+from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import Event, VirtualMachine
 
 Run = Callable[..., Result]
@@ -42,7 +43,7 @@ def record() -> xr.Dataset:
     """Two minutes of a warming spindle."""
     machine = VirtualMachine("cframe", seed=1)
     machine.start([Event(0.0, 15000.0, None)])
-    return machine.raw_spindle_drift(np.arange(0.25, 120.0, 0.5), beams="true", seed=1)
+    return simulation.raw_drift(machine, np.arange(0.25, 120.0, 0.5), beams="true", seed=1)
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.methods.beam_direction import simulation
 from errormotion.twin import VirtualMachine
 
 HEAD = """# schema = errormotion.raw.inclination/1
@@ -19,7 +20,7 @@ inclination [deg],rotation [deg],reading [mm],reference [mm]
 
 @pytest.fixture(scope="module")
 def readings() -> xr.Dataset:
-    return VirtualMachine("cframe", seed=3).raw_inclination(depths=1e-3 * np.arange(-10, 11, 4), seed=1)
+    return simulation.raw_inclination(VirtualMachine("cframe", seed=3), depths=1e-3 * np.arange(-10, 11, 4), seed=1)
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def test_readings_become_a_calibration_that_is_found_by_its_name(run, data, tmp_
     assert "note: Holes between the settings" in shown
     known = InclinationCalibration.find("left")
     assert known.supported([0.1, 0.0])
-    assert "good" in run("validate", "calibrations/left.nc").stdout
+    assert "valid" in run("validate", "calibrations/left.nc").stdout
 
 
 def test_a_program_gets_the_figures(answer, data):

@@ -12,6 +12,7 @@ from errormotion import datasets
 from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
 from errormotion.compensation.thermal_model.fitting import LEAST_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
+from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 
@@ -85,6 +86,18 @@ def test_an_unknown_temperature_makes_an_unknown_error_and_is_counted(
     assert np.isnan(predicted["EZ"][4])
     assert int(np.isnan(predicted["EZ"]).sum()) == 1
     assert "1 of 31 times without a prediction" in predicted.attrs["notes"]
+
+
+def test_figures_are_those_of_the_datasets(model: ThermalModel, pair: list[xr.Dataset]) -> None:
+    found = {figure.name: figure for figure in ThermalModelDataset.figures(model.dataset)}
+    assert found["misfit of EZ"].value == float(model.dataset["misfit"][2])
+    assert found["removed fraction of EZ"].value == float(model.dataset["removed"][2])
+    predicted = model.predict(pair[0])
+    found = {figure.name: figure for figure in ThermalModelDataset.figures(predicted)}
+    last = found["EZ after 180.0 min"]
+    assert (last.value, last.unit) == (float(predicted["EZ"][-1]), "m")
+    assert last.expanded_uncertainty == pytest.approx(2 * float(np.sqrt(predicted["covariance"][-1, 2, 2])))
+    assert found["fraction of times outside the training range"].value == float(predicted["outside"].mean())
 
 
 def test_a_saved_model_predicts_the_same(model: ThermalModel, pair: list[xr.Dataset], tmp_path: Path) -> None:

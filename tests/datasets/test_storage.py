@@ -1,7 +1,9 @@
 import errno
 import io
+import json
 import os
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from errormotion import datasets
 from errormotion.datasets import load, save, validate
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import VirtualMachine
 
 both = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
@@ -31,6 +34,34 @@ def test_an_error_dataset_comes_back_identical(errors, tmp_path, suffix) -> None
     assert back["source"].dtype.kind == back["dof"].dtype.kind == "U"
     assert datasets.violations(back) == []
     assert names(tmp_path) == [f"errors{suffix}"]
+
+
+def test_a_large_result_is_compressed_and_comes_back_to_the_last_bit(errors, tmp_path) -> None:
+    ds = errors(n=20_000)
+    # Beams and references: sources that act in one part of the record only.
+    ds["influence"].values[:, 5_000:] = 0.0
+    path = save(ds, tmp_path / "errors.nc")
+    back = load(path)
+    for name, variable in ds.variables.items():
+        assert back[name].values.tobytes() == variable.values.tobytes(), name
+    assert path.stat().st_size < 0.75 * ds.nbytes
+
+
+@both
+def test_texts_have_a_type_with_a_specification(drift, tmp_path, suffix) -> None:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        path = save(drift(), tmp_path / f"raw{suffix}")
+    assert not found
+    if suffix == ".zarr":
+        assert json.loads((path / "channel" / "zarr.json").read_text())["data_type"] == "string"
+
+
+def test_a_store_with_texts_of_fixed_length_is_read(drift, tmp_path) -> None:
+    with pytest.warns(zarr.errors.UnstableSpecificationWarning):
+        drift().to_zarr(tmp_path / "raw.zarr", consolidated=False)
+    with load(tmp_path / "raw.zarr") as back:
+        xr.testing.assert_identical(back, drift())
 
 
 @both
@@ -222,7 +253,7 @@ def test_what_is_no_dataset_is_told(tmp_path) -> None:
 
 
 def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
-    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift([0.0, 10.0], seed=0)
+    raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), [0.0, 10.0], seed=0)
     raw.drop_vars(["temperature", "spindle_speed", "sensor"]).to_netcdf(tmp_path / "raw.nc", engine="scipy")
     with load(tmp_path / "raw.nc") as found:
         validate(found)
@@ -230,7 +261,7 @@ def test_netcdf_of_the_classic_format_is_read_as_well(tmp_path) -> None:
 
 
 def test_a_chunk_that_is_cut_off_shows_while_it_is_read(tmp_path) -> None:
-    raw = VirtualMachine("cframe", seed=1).raw_spindle_drift(np.arange(5000.0), seed=0)
+    raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), np.arange(5000.0), seed=0)
     path = save(raw, tmp_path / "raw.zarr")
     (chunk, *_) = [file for file in (path / "distance").rglob("*") if file.is_file() and file.name != "zarr.json"]
     chunk.write_bytes(chunk.read_bytes()[:20])

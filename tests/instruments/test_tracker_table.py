@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from errormotion.errors import InstrumentError, ReplayError
+from errormotion.instruments.laser_tracker.table_conformance import length_table
 from errormotion.instruments.laser_tracker.tracker_table import TrackerTable, TrackerTableSettings
 from errormotion.testing import InstrumentConformance, InstrumentSubject
-from errormotion.testing.builtin import length_table
 
 HEAD = "station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]"
 LINES = ("S1,1,1500.5,20.1,1013,40", "S1,2,1501.25,20.2,1013,40", "S2,1,900,20.3,1012,41", "S2,2,901,20.4,1012,41")

@@ -8,6 +8,7 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
+from errormotion.methods.beam_direction import simulation
 from errormotion.twin.planes import Plane
 from errormotion.twin.point_sensor import PointSensor
 
@@ -97,7 +98,7 @@ def test_both_kinds_of_sensor_read_the_same_surface(kind: str) -> None:
         here = world("cframe", 3)
         machine = here.machine
         controller.set_target(kind, *(TILT if kind == "plane" else ()))
-        middle = machine.raw_check_bar(seed=0)["bar_stage"].values[10] if kind == "bar" else machine.home()
+        middle = simulation.raw_check_bar(machine, seed=0)["bar_stage"].values[10] if kind == "bar" else machine.home()
         for shift in (-3e-3, 0.0, 2e-3):
             controller.move_to(middle + np.array([0.0, 0.0, shift]))
             true = expected(here, machine.point_sensor)

@@ -14,10 +14,18 @@ HOMES = {
     for group in GROUPS
     for plugin_id, value in ENTRY_POINTS[f"errormotion.{group}"].items()
 }
-#: Text files of the package in which examples are shipped: campaigns and benches that a person may write.
+#: Folder of the package with examples: campaigns and benches that a person may write, and their programs.
 EXAMPLES = "errormotion/cli/demo/"
-#: A word that is an id of one plugin and a variable of the published schema of another: (word, folder).
-VARIABLES = {("beam_direction", "errormotion/methods/spindle_drift"), ("beam_direction", "errormotion/instruments")}
+#: Words that are ids and something else as well: variables of published datasets, the command of a package, and
+#: defaults of published settings that name another plugin.
+OTHER_MEANINGS = {
+    ("optoncdt", "errormotion/instruments/spindle_frame/"),
+    ("virtual_controller", "errormotion/instruments/touch_probe/controller_probe.py"),
+    ("beam_direction", "errormotion/methods/spindle_drift/"),
+    ("beam_direction", "errormotion/instruments/"),
+    ("beam_direction", "errormotion/report/beams.py"),
+    ("thermal_model", "errormotion/cli/commands/model.py"),
+}
 
 
 def sources() -> list[Path]:
@@ -31,9 +39,11 @@ def named(path: Path, text: str) -> list[str]:
         return []
     found = []
     for plugin_id, home in HOMES.items():
-        if place.startswith((f"{home}/", f"{home}.")) or f"{home}.py" == place:
+        # The simulators of a kind of instrument have a folder beside those of the drivers.
+        simulators = "/".join(home.split("/")[:3]).replace("instruments/", "instruments/simulators/")
+        if place.startswith((f"{home}/", f"{home}.", f"{simulators}/")):
             continue
-        if any(word == plugin_id and place.startswith(folder) for word, folder in VARIABLES):
+        if any(word == plugin_id and place.startswith(folder) for word, folder in OTHER_MEANINGS):
             continue
         if re.search(rf"(?<![A-Za-z0-9_]){plugin_id}(?![A-Za-z0-9_])", text):
             found.append(plugin_id)

@@ -111,7 +111,7 @@ def _real_setup(tmp_path: Path, path: str, **environment: str) -> subprocess.Com
 def _path_with(folder: Path, **commands: str) -> str:
     """Return a PATH of one folder: the basic tools, and the given commands as shell scripts."""
     folder.mkdir()
-    for tool in ("sh", "dirname", "cut", "env"):
+    for tool in ("sh", "dirname", "cut", "env", "mkdir", "touch"):
         (folder / tool).symlink_to(str(shutil.which(tool)))
     for name, script in commands.items():
         (folder / name).write_text(f"#!{shutil.which('sh')}\n{script}\n")
@@ -138,6 +138,23 @@ def test_says_so_when_the_venv_module_is_missing(tmp_path: Path) -> None:
     done = _real_setup(tmp_path, _path_with(tmp_path / "bin", python3=python))
     assert done.returncode == 1
     assert "apt install python3-venv" in done.stderr
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_installer_is_heard_only_when_it_fails(tmp_path: Path, fails: bool) -> None:
+    uv = f"""case "$*" in
+        venv*) mkdir -p .venv/bin; printf '#!{shutil.which("sh")}\necho Python 3.11.7\n' >.venv/bin/python
+                PATH={os.environ["PATH"]} chmod +x .venv/bin/python;;
+        *--version*) echo uv 1.0;;
+        *) echo 'WARNING: Location is ignored' >&2; echo 'Collecting numpy'; exit {int(fails)};;
+    esac"""
+    done = _real_setup(tmp_path, _path_with(tmp_path / "bin", uv=uv, python3=f'exec {sys.executable} "$@"'))
+    assert done.returncode == int(fails)
+    assert ("WARNING: Location is ignored" in done.stderr) == fails
+    assert ("Collecting numpy" in done.stderr) == fails
+    assert ("the installation failed" in done.stderr) == fails
+    assert done.stdout == "setup: installing requirements-core.lock into .venv (Python 3.11.7, uv 1.0)\n"
+    assert (tmp_path / ".venv" / ".core").exists() != fails
 
 
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="open3d has no wheels for this Python")

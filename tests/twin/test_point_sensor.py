@@ -9,6 +9,7 @@ from errormotion.datasets import validate
 from errormotion.errors import BenchError
 from errormotion.kinematics.beams import tilt, tilt_vector
 from errormotion.kinematics.fits import fit_plane
+from errormotion.methods.beam_direction import simulation
 from errormotion.twin import VirtualMachine
 from errormotion.twin.planes import CheckBar, Plane
 from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
@@ -62,7 +63,7 @@ def test_a_sensor_may_be_mounted_in_another_direction() -> None:
 
 
 def test_the_truth_is_an_error_dataset_that_takes_the_nominal_beam_to_the_true_one(machine: VirtualMachine) -> None:
-    ds = machine.truth_beam()
+    ds = simulation.truth_beam(machine)
     validate(ds)
     assert ds.attrs["component"] == "beam"
     sensor = machine.point_sensor
@@ -93,7 +94,7 @@ def test_the_gradient_of_the_reading_is_minus_the_normal_over_its_part_along_the
 
 def test_readings_on_the_bar_lie_on_a_cylinder(sensor: PointSensor, machine: VirtualMachine) -> None:
     bar = machine.check_bar
-    places = machine.raw_check_bar(seed=0)["bar_stage"].values
+    places = simulation.raw_check_bar(machine, seed=0)["bar_stage"].values
     reading = sensor.still(bar, places, inclination_error=False)
     spots = places + sensor.true_origin + reading[:, None] * sensor.true_direction - bar.point
     across = spots - (spots @ bar.axis)[:, None] * bar.axis
@@ -287,7 +288,7 @@ def test_a_cold_sensor_warms_up() -> None:
 def test_a_plane_fitted_through_compensated_readings_is_the_face(machine: VirtualMachine) -> None:
     """All in one: who knows beam and slope finds the face as it stands."""
     sensor, face = machine.point_sensor, machine.sine_gauge.face(20 * DEG, 0.0)
-    places = machine.strokes(20 * DEG, 0.0)
+    places = simulation.strokes(machine, 20 * DEG, 0.0)
     reading = machine.point_readings(np.zeros(len(places)), places, face)
     k = float(sensor.slope(tilt(sensor.true_direction, sensor.triangulation_normal, face.normal)))
     spots = places + sensor.true_origin + (reading / (1 + k))[:, None] * sensor.true_direction

@@ -1,4 +1,4 @@
-"""Balls on the table of the virtual machine: contacts, the errors behind them, and the raw data."""
+"""Balls on the table of the virtual machine: contacts, and the errors behind them."""
 
 import numpy as np
 import pytest
@@ -33,47 +33,11 @@ def cframe():
     return warmed("cframe")
 
 
-def inverted(machine, raw):
-    """Where the centres of the balls must have been, given what the tip, its error and the surfaces truly are."""
-    tip = raw["touch"].values
-    there = tip + machine.probe_error(tip.reshape(-1, 3), raw["touch_time"].values.ravel()).reshape(tip.shape)
-    balls = machine.balls_on_table(raw.sizes["ball"])
-    centres = np.empty((raw.sizes["time"], len(balls), 3))
-    for ball in range(len(balls)):
-        centre = np.tile(balls.nominal[ball], (raw.sizes["time"], 1))
-        for _ in range(60):
-            way = there[:, ball] - centre[:, None]
-            normal = way / np.linalg.norm(way, axis=-1, keepdims=True)
-            flat = normal.reshape(-1, 3)
-            reach = machine._reach(balls, np.full(len(flat), ball), flat).reshape(normal.shape[:2])
-            left = np.einsum("cti,cti->ct", way, normal) - reach
-            step = np.stack([np.linalg.lstsq(n, x)[0] for n, x in zip(normal, left, strict=True)])
-            centre = centre + step
-        centres[:, ball] = centre
-    return centres
-
-
 # ---------------------------------------------------------------------- truth
 
 
 def test_axes_that_carry_the_tool_follow_from_the_chain(cframe, gantry):
     assert (cframe.tool_axes, gantry.tool_axes) == ("Z", "XYZ")
-
-
-def test_contacts_inverted_give_the_balls_where_they_stand(machine):
-    raw = machine.raw_normal_vector(HOURS, seed=1, touches=7, noise=0.0)
-    found = inverted(machine, raw)
-    # Newton's steps of a sphere of 15 mm settle to rounding; asked for was a nanometre
-    np.testing.assert_allclose(found, np.broadcast_to(machine.balls.centre, found.shape), atol=1e-9)
-
-
-def test_measured_centres_move_by_minus_the_error_of_the_tip(machine):
-    raw = machine.raw_normal_vector(HOURS, seed=1, variant="centres", noise=0.0, cycle=0.0)
-    moved = raw["centre"].values - raw["centre"].values[0]
-    error = np.array([machine.probe_error(machine.balls.centre, np.full(4, t)) for t in HOURS])
-    # roundness and lobes are met elsewhere when a ball appears moved by up to 0.1 mm: 1.5 um x 3 x 0.1 mm / 15 mm
-    np.testing.assert_allclose(moved, -(error - error[0]), atol=30e-9)
-    assert np.abs(moved).max() > 15e-6
 
 
 def test_on_a_gantry_the_balls_seem_to_move_as_a_rigid_body(gantry):
@@ -195,14 +159,6 @@ def test_pretravel_has_three_lobes_around_the_stylus(machine):
     assert machine.probe.pretravel([0, 0, 1])[0] == machine.probe.mean
 
 
-def test_spheres_come_out_smaller_by_the_pretravel(machine):
-    raw = machine.raw_normal_vector([0.0], seed=1, noise=0.0)
-    across = raw["touch"].values[0, :, 0, 0] - raw["touch"].values[0, :, 1, 0]  # from +x to -x
-    stylus = 2 * (machine.balls.radius + machine.probe.tip_radius)
-    # of 7.2 to 8.8 um; lobes cancel between opposite sides, roundness is 0.5 um, aiming beside takes 0.3^2/15/2 mm
-    np.testing.assert_allclose(across - stylus, -2 * machine.probe.mean, atol=4e-6)
-
-
 def test_balls_are_good_balls(machine):
     balls = machine.balls_on_table(8)
     assert np.abs(balls.radius - balls.nominal_radius).max() <= RADIUS_ERROR
@@ -228,7 +184,6 @@ def test_every_touch_is_within_the_travel_and_balls_stand_apart(kind, seed):
     heights = np.sort(balls.nominal[:4, 2])
     assert np.diff(heights).min() > 0.03  # a C-frame sees turns through heights alone
     assert np.abs(balls.centre - balls.nominal).max() < 0.31e-3
-    assert machine.raw_normal_vector([0.0], seed=0, balls=8, touches=9)["touch_flag"].values.max() == 0
 
 
 # ---------------------------------------------------------------------- determinism and noise
@@ -236,7 +191,7 @@ def test_every_touch_is_within_the_travel_and_balls_stand_apart(kind, seed):
 
 def test_the_same_touch_scatters_the_same_whatever_came_before(machine):
     other = warmed(machine.kind)
-    other.raw_normal_vector(HOURS, seed=5)
+    other.contact(other.balls.nominal[1] + [0.03, 0, 0], other.balls.nominal[1], 5.0)
     b = machine.balls.nominal
     ways = [(b[i] + [0, 0, 0.03], b[i], 600.0 * i) for i in range(4)]
     forwards = [machine.contact(*way)[0] for way in ways]
@@ -253,26 +208,6 @@ def test_triggers_scatter_along_the_normal_as_stated(cframe):
     assert abs(np.mean(scatter)) < 4 * NOISE / 20
 
 
-def test_raw_data_scatter_by_their_seed_alone(machine):
-    one, same, other = (machine.raw_normal_vector(HOURS, seed=s) for s in (1, 1, 2))
-    assert one.identical(same)
-    still = machine.raw_normal_vector(HOURS, seed=1, noise=0.0)
-    off = np.einsum("cbti,bti->cbt", (one["touch"] - still["touch"]).values, -one["approach"].values)
-    assert np.std(off) == pytest.approx(NOISE, rel=0.3)  # 100 of them: 7 % one sigma
-    assert not one["touch"].equals(other["touch"])
-    np.testing.assert_array_equal(one["touch_time"], other["touch_time"])
-
-
-def test_raw_contacts_are_those_of_the_machine(machine):
-    raw = machine.raw_normal_vector(HOURS, seed=1, noise=0.0)
-    for cycle, ball, touch in ((0, 0, 0), (3, 2, 4), (4, 3, 1)):
-        at = raw.isel(time=cycle, ball=ball, touch=touch)
-        start = machine.balls.nominal[ball] - 0.0205 * raw["approach"].values[ball, touch]
-        when = float(at["touch_time"])
-        found, _ = machine.contact(start, machine.balls.nominal[ball], when, noise=False)
-        np.testing.assert_allclose(found, at["touch"].values, atol=1e-15)
-
-
 def test_a_slow_approach_meets_the_ball_at_the_time_of_the_contact(gantry):
     ball = gantry.balls.nominal[3]
     place, way = gantry.contact(ball + np.array([0.03, 0, 0]), ball, 1000.0, 1e-5, noise=False)  # 25 min on its way
@@ -287,67 +222,6 @@ def test_sensors_read_the_temperature_with_a_noise_of_their_own(machine):
     assert np.std(off) == pytest.approx(0.02, rel=0.05)
     assert np.abs(np.corrcoef(off.T) - np.eye(off.shape[1])).max() < 0.25  # 360 of them: 5 % one sigma
     np.testing.assert_array_equal(machine.sensor_temperatures(t[7:8], seed=4)[0], (off + machine.temperatures(t))[7])
-
-
-# ---------------------------------------------------------------------- raw data
-
-
-@pytest.mark.parametrize("variant", ["touches", "centres"])
-@pytest.mark.parametrize("balls", [1, 4, 8])
-def test_raw_data_follow_their_schema(machine, variant, balls):
-    raw = machine.raw_normal_vector(HOURS, seed=1, variant=variant, balls=balls)
-    datasets.validate(raw)
-    assert raw.sizes["ball"] == balls
-    assert set(raw["sensor"].values) == set(machine.temperature_sensors)
-    np.testing.assert_allclose(raw["spindle_speed"][-1], 4000, rtol=1e-9)
-
-
-def test_centres_scatter_as_their_covariance_says(cframe):
-    still = cframe.raw_normal_vector(HOURS, seed=0, variant="centres", noise=0.0)["centre"].values
-    off = []
-    for seed in range(60):
-        raw = cframe.raw_normal_vector(HOURS, seed=seed, variant="centres")
-        off.append((raw["centre"].values - still).reshape(-1, 3))
-    stated = raw["centre_covariance"].values[0, 0]
-    found = np.cov(np.concatenate(off).T)
-    # 1200 centres: a variance to 4 % one sigma
-    np.testing.assert_allclose(found, stated, atol=0.2 * stated.max())
-
-
-def test_a_ball_that_is_pushed_is_elsewhere_from_then_on(machine):
-    shift = np.array([40e-6, 0.0, -25e-6])
-    still = machine.raw_normal_vector(HOURS, seed=1, variant="centres", noise=0.0)["centre"]
-    pushed = machine.raw_normal_vector(HOURS, seed=1, variant="centres", noise=0.0, moved=(2, 3000.0, shift))["centre"]
-    off = (pushed - still).values
-    assert not off[:, [0, 1, 3]].any()
-    assert not off[:2].any()
-    np.testing.assert_allclose(off[2:, 2], np.tile(shift, (3, 1)), atol=30e-9)  # lobes and roundness, met elsewhere
-
-
-def test_missing_touches_are_flagged_and_nan(machine):
-    raw = machine.raw_normal_vector(HOURS, seed=1, missing=0.3)
-    datasets.validate(raw)
-    lost = raw["touch_flag"].values == 1
-    assert np.mean(lost) == pytest.approx(0.3, abs=0.15)  # 100 of them
-    assert np.isnan(raw["touch"].values[lost]).all()
-    assert np.isfinite(raw["touch"].values[~lost]).all()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        ({"balls": 9}, "1 to 8 balls"),
-        ({"touches": 4}, "5 times or more"),
-        ({"times": [0.0, 60.0]}, "Cycles of 120 s"),
-        ({"cycle": -1.0}, "Cycles of -1 s"),
-        ({"missing": 1.5}, "from 0 to 1"),
-        ({"moved": (4, 0.0, (0, 0, 0))}, "one of 0 to 3"),
-        ({"variant": "balls"}, "'touches' and 'centres'"),
-    ],
-)
-def test_what_cannot_be_probed_is_refused_in_words(cframe, arguments, why):
-    with pytest.raises(BenchError, match=why):
-        cframe.raw_normal_vector(**{"times": HOURS, "seed": 1, **arguments})
 
 
 def test_balls_are_counted(cframe):

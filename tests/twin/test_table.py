@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import BenchError
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts import circular_pocket, swept
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -42,7 +43,7 @@ def test_lines_belong_to_the_piece_below_them(gantry: VirtualMachine) -> None:
 
 
 def test_a_scan_at_rest_in_time_is_that_of_the_raw_dataset(gantry: VirtualMachine) -> None:
-    raw = gantry.raw_crossbeam_scan([0.0, 5000.0], [0.1], seed=1, profiler=PERFECT, profiles=40, feed=1e-3)
+    raw = simulation.raw_scans(gantry, [0.0, 5000.0], [0.1], seed=1, profiler=PERFECT, profiles=40, feed=1e-3)
     table = set_table(gantry.crossbeam, 3, [0.1])
     for cycle, t in enumerate((0.0, 5000.0)):
         y = 0.1 + raw.y.values[cycle, 0]

@@ -18,3 +18,4 @@ class MonitorLog:
     )
     raw_schemas = RAW_SCHEMAS
     chapters = lazy("errormotion.campaign.monitor.report:chapters")
+    figures = lazy("errormotion.campaign.monitor.log:figures")

@@ -2,9 +2,11 @@
 
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, POSITION, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.monitor/1"
+
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.monitor/1",
+        SCHEMA,
         "",
         "gap",
         (

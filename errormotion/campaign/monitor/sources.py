@@ -1,4 +1,4 @@
-"""What a monitor listens to: an instrument with a thread of its own, which nobody else has to wait for."""
+"""Instruments of a monitor, each read by a thread of its own so that none delays the others."""
 
 from __future__ import annotations
 
@@ -12,28 +12,29 @@ from typing import Any
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchInstrument
+from errormotion.errors import ErrormotionError
 
-FIRST_WAIT, LONGEST_WAIT = 1.0, 30.0
-"""Before an instrument that did not come up is tried again, s; doubled each time up to the longest."""
+FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
+"""Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""
 
-PATIENCE = 3
-"""Failed readings in a row before the connection is made anew: a driver may mend it by itself."""
+FAILURES_BEFORE_RECONNECT = 3
+"""Consecutive failed readings after which the instrument is closed and opened again."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """The last thing that a source said.
+    """The last reading of a source.
 
     Attributes
     ----------
     at : float
-        ``time.monotonic()`` when it had come, s.
+        ``time.monotonic()`` when it was received, s.
     values : mapping
-        What the driver's ``read`` returned.
+        Result of the driver's ``read``.
     flags : mapping of str to str
-        Why a value of a thermometer is unknown; empty for the others.
+        Reasons of unknown temperatures; empty for other instruments.
     """
 
     at: float
@@ -42,21 +43,21 @@ class Reading:
 
 
 class Source:
-    """One instrument, read again and again; one that fails is tried for ever.
+    """One instrument that is read periodically; after a failure it is retried without limit.
 
     Parameters
     ----------
     instrument : BenchInstrument
-        What to open.
+        The instrument.
     interval : float
         Time from one reading to the next, s.
 
     Attributes
     ----------
     answer : Answer or None
-        What it said when it last came up.
+        Its identity when it was last opened.
     error : str
-        Why there is no reading now; empty while all is well.
+        Cause of a missing reading; empty while readings arrive.
     """
 
     def __init__(self, instrument: BenchInstrument, interval: float) -> None:
@@ -73,12 +74,12 @@ class Source:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the sensors of a thermometer, known before it is opened."""
+        """Names of the sensors of a thermometer; available before it is opened."""
         return tuple(self._unopened().channels)
 
     @property
     def places(self) -> dict[str, tuple[float, float, float] | None]:
-        """Places of the sensors of a thermometer on the machine, m; None where not known."""
+        """Positions of the sensors of a thermometer on the machine, m; None if unknown."""
         found = getattr(self._unopened(), "places", {})
         return {name: found.get(name) for name in self.channels}
 
@@ -86,15 +87,15 @@ class Source:
         return self.instrument.driver(self.instrument.address, self.instrument.settings)
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start reading."""
         self._thread.start()
 
     def wait(self, timeout: float) -> None:
-        """Wait for the first answer, be it a reading or a refusal."""
+        """Wait for the first reading or failure."""
         self._ready.wait(timeout)
 
     def stop(self) -> None:
-        """Ask the thread to end; `join` waits for it."""
+        """Request the thread to end; `join` waits for it."""
         self._stop.set()
 
     def join(self) -> None:
@@ -107,28 +108,30 @@ class Source:
         return reading if reading is not None and reading.at >= oldest else None
 
     def _work(self) -> None:
-        wait, failed = FIRST_WAIT, 0
+        wait, failed = FIRST_RETRY_INTERVAL, 0
         try:
             while not self._stop.is_set():
-                began = time.monotonic()
+                start = time.monotonic()
                 try:
                     self._open()
                     values = dict(self._driver.read())
                     self._reading = Reading(time.monotonic(), values, _flags(self._driver, values))
-                except Exception as error:  # noqa: BLE001 - told to the person at the machine, and tried again
+                except Exception as error:  # noqa: BLE001 - reported to the operator, and retried
                     failed += 1
-                    self._note(f"{type(error).__name__}: {error}")
-                    if self._driver is None or failed >= PATIENCE:
+                    self._note(
+                        str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
+                    )
+                    if self._driver is None or failed >= FAILURES_BEFORE_RECONNECT:
                         self._close()
                         self._ready.set()
                         self._stop.wait(wait)
-                        wait = min(2 * wait, LONGEST_WAIT)
+                        wait = min(2 * wait, LONGEST_RETRY_INTERVAL)
                         continue
                 else:
-                    wait, failed = FIRST_WAIT, 0
+                    wait, failed = FIRST_RETRY_INTERVAL, 0
                     self._note("")
                 self._ready.set()
-                self._stop.wait(max(0.0, began + self.interval - time.monotonic()))
+                self._stop.wait(max(0.0, start + self.interval - time.monotonic()))
         finally:
             self._close()
 
@@ -150,23 +153,23 @@ class Source:
             try:
                 driver.close()
             except Exception:
-                log.exception("instrument %s did not close", self.name)
+                log.exception("instrument %s could not be closed", self.name)
 
     def _note(self, error: str) -> None:
-        """Keep why there is no reading, and log each change once."""
+        """Store the cause of a missing reading, and log each change once."""
         if bool(error) != bool(self.error) or self._reading is None:
             if error:
-                log.warning("%s is silent: %s", self.name, error)
+                log.warning("%s does not answer: %s", self.name, error)
             else:
                 log.info("%s answers", self.name)
         self.error = error
 
 
 def _flags(driver: Any, values: Mapping[str, Any]) -> dict[str, str]:
-    """Return why values are unknown, by name; what the driver does not say is told as 'unknown'."""
-    said = getattr(driver, "flags", {})
+    """Return the reasons of unknown values by name; 'unknown' where the driver states none."""
+    flags = getattr(driver, "flags", {})
     return {
-        name: said.get(name) or "unknown"
+        name: flags.get(name) or "unknown"
         for name, value in values.items()
         if isinstance(value, float) and math.isnan(value)
     }

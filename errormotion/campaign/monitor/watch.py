@@ -1,8 +1,8 @@
-"""Watching a machine for hours or weeks: temperatures and working parameters on one clock, into a run folder.
+"""Monitoring of a machine for hours or weeks: temperatures and working parameters on one clock, into a run folder.
 
-Every instrument is read by a thread of its own. At each tick the newest reading of each goes into the log if it is
-fresh; one that is silent leaves NaN and a mark in ``gap``, and when it is back the log goes on with it. What has been
-logged is on disk within a second, and nothing but the last readings stays in memory.
+Every instrument is read by a thread of its own. At each interval the latest reading of each instrument is logged if it
+is recent; a missing reading is logged as NaN and marked in ``gap`` until the instrument answers again. Rows are on disk
+within a second, and only the last readings are kept in memory.
 """
 
 from __future__ import annotations
@@ -27,49 +27,49 @@ from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import RunFolder, now
 from errormotion.campaign.journal import journal
+from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.recorder import Recorder
 from errormotion.campaign.store import RawStore
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError
 
-SCHEMA = "errormotion.raw.monitor/1"
 TEST = "monitor"
 
 FLAGS = ("known", "open", "shorted", "out of range", "no answer", "unknown")
-"""Why a temperature is unknown; the log holds the number of the word in this list."""
+"""Reasons of unknown temperatures; the log contains the index in this list."""
 
-FRESH = 2.5
-"""Intervals after which a reading counts as old: one may be lost to the order of things, two may not."""
+OLDEST_READING = 2.5
+"""Greatest age of a reading that is logged, in intervals: one interval may pass without a new reading, two may not."""
 
-LONGEST_START = 10.0
-"""Wait for the first answer of each instrument, s; who takes longer is marked as a gap until it answers."""
+START_TIMEOUT = 10.0
+"""Time within which an instrument gives its first reading, s; then a gap is logged until it answers."""
 
 BLOCK = 4096
-"""Rows of one chunk on disk: an hour at one a second; the chunk under way is written anew with every commit."""
+"""Rows of one chunk on disk: about an hour at 1 s; every commit rewrites the last chunk."""
 
 NUMBERS = ("spindle_speed", "spindle_load", "feed")
-"""Working parameters that are logged beside the position, as a controller's state names them."""
+"""Working parameters that are logged in addition to the position, by their names in a controller's state."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a monitor knows at one tick.
+    """Readings of a monitor at one time.
 
     Attributes
     ----------
     time : float
-        Since the start, s.
+        Time since the start, s.
     temperatures : mapping of str to float
         degC; NaN = unknown.
     flags : mapping of str to str
-        Why those that are unknown are.
+        Reasons of the unknown ones.
     state : mapping
-        What the controller shows; empty without one, or while it is silent.
+        State of the controller; empty without one, or while it does not answer.
     silent : mapping of str to str
-        Instruments that gave no fresh reading, and why.
+        Instruments without a recent reading, and the cause.
     logged : int
         Rows in the log.
     gaps : mapping of str to int
@@ -86,23 +86,23 @@ class Snapshot:
 
 
 class Monitor:
-    """Listens to the thermometers and the controller of a bench; a context manager.
+    """Reads the thermometers and the controller of a bench; a context manager.
 
     Parameters
     ----------
     plan : BenchPlan
-        Its other instruments are left alone.
+        Its other instruments are not opened.
     runs : Path
-        Where the run folder goes.
+        Folder of the run folder.
     interval : float
-        Time between two rows of the log, s.
+        Interval of the rows of the log, s.
 
     Attributes
     ----------
     folder : RunFolder
-        Where the log is, once entered.
+        The run folder, once entered.
     sensors : tuple of str
-        Names of the temperatures: those of the thermometers, with the instrument before them where two are alike.
+        Names of the temperatures: those of the thermometers, preceded by the instrument where names are equal.
 
     Raises
     ------
@@ -136,7 +136,7 @@ class Monitor:
                 source.start()
             attrs = {"schema": SCHEMA, "machine": self.plan.machine, "start": now(), "interval": self.interval}
             attrs |= {"flag_meanings": json.dumps(list(FLAGS)), "instruments": "[]"}
-            # The store is made before the clock starts: that takes longer than a short interval.
+            # The store is created before the clock starts: this takes longer than a short interval.
             empty = self._row(
                 Snapshot(0.0, dict.fromkeys(self.sensors, math.nan), dict.fromkeys(self.sensors, ""), {}, {}, 0)
             )
@@ -150,7 +150,7 @@ class Monitor:
     ) -> None:
         status, reason = "finished", ""
         if error is not None and isinstance(error, Exception):
-            log.error("the monitor broke off", exc_info=error)
+            log.error("the monitor stopped", exc_info=error)
             status, reason = "failed", f"{kind.__name__ if kind else ''}: {error}"
         try:
             self._stack.__exit__(kind, error, trace)
@@ -167,35 +167,35 @@ class Monitor:
             self.folder.save(status=status, reason=reason, acquired=status == "finished")
 
     def watch(self, duration: float = math.inf) -> Iterator[Snapshot]:
-        """Log row by row, and yield each as a snapshot.
+        """Log rows, and yield each as a snapshot.
 
         Parameters
         ----------
         duration : float
-            When to end, s.
+            Duration, s.
 
         Raises
         ------
         RunError
-            The disk does not take it; what is committed stays whole.
+            The log cannot be written; committed rows remain complete.
         """
         for source in self.sources:
-            source.wait(LONGEST_START)
-        began, tick, rows = time.monotonic(), 0, 0
+            source.wait(START_TIMEOUT)
+        start, tick, rows = time.monotonic(), 0, 0
         while tick * self.interval <= duration:
-            due = began + tick * self.interval
+            due = start + tick * self.interval
             if (ahead := due - time.monotonic()) > 0:
                 time.sleep(ahead)
             rows += 1
-            snapshot = self._snapshot(time.monotonic() - began, rows)
+            snapshot = self._snapshot(time.monotonic() - start, rows)
             self._recorder.put(self._row(snapshot))
             self._note_instruments()
             yield snapshot
-            # Ticks that a sleeping computer has missed are no rows: the times of the log show it.
-            tick = max(tick + 1, math.ceil((time.monotonic() - began) / self.interval))
+            # Intervals missed by a suspended computer give no rows; the times of the log show them.
+            tick = max(tick + 1, math.ceil((time.monotonic() - start) / self.interval))
 
     def _note_instruments(self) -> None:
-        """Say in the log who measures, once all have come up and whenever one comes up anew."""
+        """Store the identities of the instruments in the log whenever one has been opened."""
         answers = tuple(source.answer for source in self.sources if source.answer)
         attrs = self._recorder.attrs  # those of the store, which the next commit writes
         if "instruments" in attrs and answers != self._noted:
@@ -203,7 +203,7 @@ class Monitor:
             self._noted = answers
 
     def _snapshot(self, at: float, logged: int) -> Snapshot:
-        oldest = time.monotonic() - FRESH * self.interval
+        oldest = time.monotonic() - OLDEST_READING * self.interval
         temperatures = dict.fromkeys(self.sensors, math.nan)
         flags = dict.fromkeys(self.sensors, "no answer")
         state: dict[str, Any] = {}
@@ -211,7 +211,7 @@ class Monitor:
         for source in self.sources:
             reading = source.fresh(oldest)
             if reading is None:
-                silent[source.name] = source.error or f"no answer for {FRESH * self.interval:g} s"
+                silent[source.name] = source.error or f"no answer for {OLDEST_READING * self.interval:g} s"
                 self._gaps[source.name] += 1
             elif source is self.controller:
                 state = dict(reading.values)

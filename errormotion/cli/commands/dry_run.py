@@ -65,7 +65,7 @@ def _text(name: str, found: Extent, limits: Limits) -> str:
     speed = "-" if limits.spindle_speed is None else f"{limits.spindle_speed:.0f}"
     rows.append(["feed/(mm/min)", f"up to {found.feed * MM * MINUTE:.0f}", feed])
     rows.append(["spindle/(1/min)", f"up to {found.spindle_speed:.0f}", speed])
-    head = f"{name}: {_duration(found.seconds)}, {found.moves} moves over {found.way:.1f} m, {found.touches} touches"
+    head = f"{name}: {_duration(found.seconds)}, {found.moves} moves over {found.path:.1f} m, {found.touches} touches"
     return "\n".join([head, table(["", "planned", "limits"], rows)])
 
 

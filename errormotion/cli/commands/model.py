@@ -72,7 +72,8 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
             {"ok": True, "errors": str(out), "times": predicted.sizes["time"], "outside": outside, "notes": notes}
         )
         return
-    show(f"{out}: errors of {predicted.attrs['component']} at {predicted.sizes['time']} times by thermal_model")
+    component, method = predicted.attrs["component"], predicted.attrs["method"]
+    show(f"{out}: errors of {component} at {predicted.sizes['time']} times by {method}")
     for note in notes:
         show(f"  note: {note}")
 

@@ -52,13 +52,13 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
 
 
 def _expected(errors: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the expanded uncertainty (k = 2) of every known freedom, the largest in the dataset."""
-    variances = np.diagonal(errors["covariance"].transpose(..., "dof", "dof_").values, axis1=-2, axis2=-1)
+    """Return the expanded uncertainty (k = 2) of every known estimate, the largest in the dataset."""
+    variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
     found = []
-    for k, name in enumerate(errors["dof"].values):
+    for k, name in enumerate(errors.em.names):
         seen = variances[..., k][np.isfinite(variances[..., k])]
         if seen.size:
-            factor, unit = FIELD_UNITS[errors[str(name)].attrs["units"]]
+            factor, unit = FIELD_UNITS[errors[name].attrs["units"]]
             largest = 2.0 * float(np.sqrt(seen.max())) * factor
-            found.append({"name": str(name), "expanded_uncertainty": largest, "unit": unit})
+            found.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
     return found

@@ -18,3 +18,4 @@ class ThermalModelDataset:
     )
     violations = lazy("errormotion.compensation.thermal_model.model:violations")
     chapters = lazy("errormotion.compensation.thermal_model.report:chapters")
+    figures = lazy("errormotion.compensation.thermal_model.figures:figures")

@@ -1,4 +1,4 @@
-"""Columns of a text log, read strictly: whatever is wrong is told with its line."""
+"""Columns of a text log, read strictly: every mistake is reported with its line."""
 
 from __future__ import annotations
 
@@ -20,31 +20,32 @@ from errormotion.errors import DatasetError
 
 T = TypeVar("T")
 
-_MOST = 20  # complaints that are told one by one
+_MOST = 20
+"""Mistakes that are reported one by one."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 @dataclass
 class Complaints:
-    """What is wrong with a log: the first ones in words, the others counted."""
+    """Mistakes in a file: the first ones with their text, the others counted."""
 
     path: Path
-    told: list[tuple[int, str]] = field(default_factory=list)
+    texts: list[tuple[int, str]] = field(default_factory=list)
     count: int = 0
 
     def add(self, line: int, text: str) -> None:
-        """Keep one complaint."""
+        """Keep one mistake; ``line`` 0 is the file as a whole."""
         self.count += 1
-        if len(self.told) < _MOST:
-            self.told.append((line, text))
+        if len(self.texts) < _MOST:
+            self.texts.append((line, text))
 
     def raise_any(self) -> None:
         """Raise DatasetError if there are any."""
         if self.count:
-            told = [f"line {line}: {text}" for line, text in sorted(self.told)]
-            more = [f"and {self.count - len(told)} more"] if self.count > len(told) else []
+            shown = [f"line {line}: {text}" if line else text for line, text in sorted(self.texts)]
+            more = [f"and {self.count - len(shown)} more"] if self.count > len(shown) else []
             number = "1 mistake" if self.count == 1 else f"{self.count} mistakes"
-            raise DatasetError(f"{self.path}: {number}; nothing was imported", [*told, *more])
+            raise DatasetError(f"{self.path}: {number}; nothing was imported", [*shown, *more])
 
 
 @dataclass(frozen=True)
@@ -89,17 +90,12 @@ def read_columns(
     DatasetError
         No file, wrong encoding, unbalanced quotes, missing columns, no lines.
     """
-    rows = _rows(complaints.path, form)
-    head = next(rows, None)
-    if head is None:
-        raise DatasetError(f"{complaints.path}: expected lines of numbers; found none")
-    places = _places(head[1], head[0], wanted, form, complaints)
-    complaints.raise_any()
-    width = len(head[1])
+    (_, titles), remaining, places = columns_of(wanted, form, complaints)
+    width = len(titles)
     cells = {key: array("d") for key in wanted}
     lines = array("q")
     start: datetime | None = None
-    for line, row in rows if form.header else _chain(head, rows):
+    for line, row in remaining:
         if len(row) != width:
             complaints.add(line, f"expected {width} fields; found {len(row)}")
             continue
@@ -107,7 +103,7 @@ def read_columns(
         for key, place in places.items():
             text = row[place].strip()
             if key == time and dates:
-                start, value = _seconds(text, start, f"{key}, field {place + 1}", line, complaints)
+                start, value = seconds(text, start, f"{key}, field {place + 1}", line, complaints)
             elif key == time and not text:
                 complaints.add(line, f"{key}, field {place + 1}: expected a number; found an empty cell")
                 value = np.nan
@@ -121,6 +117,43 @@ def read_columns(
         np.array(lines, dtype=np.int64),
         start.isoformat() if start else "",
     )
+
+
+def columns_of(
+    wanted: Mapping[str, str | int], form: Format, complaints: Complaints
+) -> tuple[tuple[int, list[str]], Iterator[tuple[int, list[str]]], dict[str, int]]:
+    """Find columns of the log ``complaints.path``.
+
+    Returns
+    -------
+    (int, list of str)
+        Line and fields of the header, or of the first line where the log has no header.
+    iterator of (int, list of str)
+        Lines of numbers.
+    dict of str to int
+        Number of the field of each wanted column, from 0.
+
+    Raises
+    ------
+    DatasetError
+        No file, wrong encoding, unbalanced quotes, missing columns, no lines.
+    """
+    remaining = _rows(complaints.path, form)
+    head = next(remaining, None)
+    if head is None:
+        raise DatasetError(f"{complaints.path}: expected lines of numbers; found none")
+    places = _places(head[1], head[0], wanted, form, complaints)
+    complaints.raise_any()
+    return head, remaining if form.header else _chain(head, remaining), places
+
+
+def top_lines(log: Path, form: Format) -> Iterator[str]:
+    """Yield the lines of a log above its header: those that are skipped, and comments."""
+    for number, line in _lines(log, form.encoding):
+        text = line.strip(" \r\n")
+        if number > form.skip and text and not (form.comment and text.startswith(form.comment)):
+            return
+        yield text
 
 
 def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
@@ -161,8 +194,8 @@ def _rows(log: Path, form: Format) -> Iterator[tuple[int, list[str]]]:
     def kept() -> Iterator[str]:
         nonlocal current
         for current, line in _lines(log, form.encoding):
-            told = line.strip(" \r\n")
-            if current > form.skip and told and not (form.comment and told.startswith(form.comment)):
+            text = line.strip(" \r\n")
+            if current > form.skip and text and not (form.comment and text.startswith(form.comment)):
                 yield line.strip(" ") if form.delimiter == " " else line
 
     lines = kept()
@@ -224,7 +257,7 @@ def _number(text: str, place: str, form: Format, line: int, complaints: Complain
     return np.nan
 
 
-def _seconds(
+def seconds(
     text: str, start: datetime | None, place: str, line: int, complaints: Complaints
 ) -> tuple[datetime | None, float]:
     """Return the first date of the log, and the seconds since then."""

@@ -16,7 +16,7 @@ from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 
 LINE_END = b"\n"
 
@@ -94,6 +94,13 @@ class VirtualController(Driver):
     Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
     settings: ControllerSettings
     _number = 0
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of the machine show when it moves, not when it is read.
+        harmless = ("split", "alarm", "estop", "no_trip", "tripped")
+        return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
     def identify(self) -> Identity:
         """Request the identity of the controller."""

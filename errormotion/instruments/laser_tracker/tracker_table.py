@@ -14,7 +14,7 @@ from pydantic import Field
 from errormotion.datasets.units import Length
 from errormotion.errors import DatasetError, InstrumentError, ReplayError
 from errormotion.instruments.laser_tracker.table_reader import AIR, Readings, Repeats, read_table
-from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 from errormotion.plugins.readings import Environment
 
 UNITS = {"displacement": "m", "temperature": "degC", "pressure": "Pa", "humidity": "%"}
@@ -54,6 +54,13 @@ class TrackerTable:
         status="simulated_only",
     )
     Settings: ClassVar[type[TrackerTableSettings]] = TrackerTableSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        from errormotion.instruments.laser_tracker.table_conformance import length_table
+
+        return InstrumentSubject(cls, str(length_table()))
 
     def __init__(
         self, address: str, settings: TrackerTableSettings | None = None, *, record: Path | None = None

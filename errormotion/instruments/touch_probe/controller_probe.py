@@ -26,7 +26,7 @@ from errormotion.instruments.touch_probe.touching import (
     StuckError,
     Toucher,
 )
-from errormotion.plugins import Contact, Identity, InstrumentInfo, Touch
+from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _SAME = 1e-9  # m
 _ROUNDING = 1e-6  # m
@@ -87,6 +87,13 @@ class ControllerProbe:
         simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
     Settings: ClassVar[type[ControllerProbeSettings]] = ControllerProbeSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of the machine show when it moves, not when it is read.
+        harmless = ("split", "alarm", "estop", "no_trip", "tripped")
+        return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
     def __init__(
         self, address: str, settings: ControllerProbeSettings | None = None, *, record: Path | None = None

@@ -17,6 +17,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.planning import design
+from errormotion.methods.beam_direction.schema import SCHEMA
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = Array
 
-SCHEMA = "errormotion.raw.beam_direction/1"
 NO_VALUE = "no value"
 _TRIES = 5
 _CLOSE = 0.05

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
+from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-SCHEMA = "errormotion.raw.beam_direction/1"
+    import xarray as xr
 
 
 class BeamDirection:
@@ -35,6 +33,10 @@ class BeamDirection:
     Settings: ClassVar[type[PluginSettings]] = BeamSettings
     raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.beam_direction.report:chapters")
+    figures = lazy("errormotion.methods.beam_direction.figures:figures")
+    calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
+    simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")
+    conformance = lazy("errormotion.methods.beam_direction.conformance:subjects")
 
     def acquire(
         self,
@@ -87,6 +89,7 @@ class BeamDirection:
         MethodError
             The data do not determine the answer.
         """
+        from errormotion.datasets import validate
         from errormotion.methods.beam_direction.identification.planes import identify_beam
 
         settings = settings or BeamSettings()

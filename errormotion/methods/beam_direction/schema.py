@@ -2,6 +2,9 @@
 
 from errormotion.datasets.schemas import DIRECTION, NOISE, POSITION, RADIUS, READING, UNIT_VECTOR, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.beam_direction/1"
+INCLINATION_SCHEMA = "errormotion.raw.inclination/1"
+
 _POINT_SENSOR = (
     Row(
         "triangulation_normal",
@@ -33,9 +36,11 @@ _POINT_SENSOR = (
     Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
 )
 
+_ALIASES = {"reading": "distance", "x": "stage_x", "y": "stage_y", "z": "stage_z"}
+
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.beam_direction/1",
+        SCHEMA,
         "planes",
         "stage",
         (
@@ -76,9 +81,10 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
+        aliases=_ALIASES,
     ),
     RawSchema(
-        "errormotion.raw.beam_direction/1",
+        SCHEMA,
         "check bar alone",
         "bar_distance",
         (
@@ -93,9 +99,10 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
+        aliases=_ALIASES,
     ),
     RawSchema(
-        "errormotion.raw.inclination/1",
+        INCLINATION_SCHEMA,
         "",
         "group",
         (

@@ -35,6 +35,9 @@ class CrossbeamScan:
     Settings: ClassVar[type[PluginSettings]] = ScanSettings
     raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
+    figures = lazy("errormotion.methods.crossbeam_scan.report.figures:figures")
+    simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
+    conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
 
     def acquire(
         self,

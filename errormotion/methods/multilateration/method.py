@@ -8,13 +8,12 @@ import xarray as xr
 
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
-
-SCHEMA = "errormotion.raw.multilateration/1"
 
 
 class Multilateration:
@@ -36,6 +35,9 @@ class Multilateration:
     Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
     raw_schemas = lazy("errormotion.methods.multilateration.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.multilateration.report:chapters")
+    figures = lazy("errormotion.methods.multilateration.figures:figures")
+    simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
+    conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
 
     def acquire(
         self,

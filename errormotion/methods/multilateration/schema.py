@@ -2,9 +2,11 @@
 
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, NOISE, POSITION, XYZ, RawSchema, Row
 
+SCHEMA = "errormotion.raw.multilateration/1"
+
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.multilateration/1",
+        SCHEMA,
         "",
         "displacement",
         (

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.acquisition.drift import SCHEMA
-from errormotion.methods.spindle_drift.identification.detection import identify_beams
-from errormotion.methods.spindle_drift.identification.drift import identify_drift
-from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+
+    import xarray as xr
 
 
 class SpindleDrift:
@@ -37,6 +33,10 @@ class SpindleDrift:
     Settings: ClassVar[type[PluginSettings]] = DriftSettings
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
+    log_readers = lazy("errormotion.methods.spindle_drift.log_import.importer:LOG_READERS")
+    figures = lazy("errormotion.methods.spindle_drift.figures:figures")
+    simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
+    conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
 
     def acquire(
         self,
@@ -65,6 +65,8 @@ class SpindleDrift:
     def progress(self, settings: DriftSettings) -> float:
         """Return the expected length of the record, s."""
         if settings.procedure == "beam_detection":
+            from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
+
             return 5 * 2 * len(settings.depths) * scan_seconds(settings.steps, settings.dwell)
         return settings.duration
 
@@ -92,19 +94,26 @@ class SpindleDrift:
         MethodError
             The data do not determine the answer.
         """
+        from errormotion.datasets import validate
+
         settings = settings or DriftSettings()
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
         validate(checked)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"spindle_drift reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        part = identify_beams if "sphere_radius" in raw else identify_drift
-        return part(checked, settings, self.info.id, self.info.version)
+        if "sphere_radius" in raw:
+            from errormotion.methods.spindle_drift.identification.detection import identify_beams
+
+            return identify_beams(checked, settings, self.info.id, self.info.version)
+        from errormotion.methods.spindle_drift.identification.drift import identify_drift
+
+        return identify_drift(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
         from errormotion.methods.spindle_drift.planning import plan
 
-        return plan(self, settings or DriftSettings())
+        return plan(settings or DriftSettings(), self.info.id, self.info.version)
 
 
 def _beam_text(chunk: xr.Dataset) -> str:

@@ -11,19 +11,20 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.kinematics.beams import beam_errors
 from errormotion.methods.spindle_drift.acquisition.beams import machine_axes
 from errormotion.methods.spindle_drift.identification.beams import fisher_bound
-from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.methods.spindle_drift.identification.drift import identify_drift
+from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.method import SpindleDrift
     from errormotion.methods.spindle_drift.settings import Settings
 
 _PLANNED = "planned, not measured"
 _TWIST = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])
 
 
-def plan(method: SpindleDrift, settings: Settings) -> xr.Dataset:
+def plan(settings: Settings, method: str, version: str) -> xr.Dataset:
     """Return an error dataset of zeros with the covariance to expect, of the procedure that the settings name."""
-    return _plan_beams(method, settings) if settings.procedure == "beam_detection" else _plan_drift(method, settings)
+    part = _plan_beams if settings.procedure == "beam_detection" else _plan_drift
+    return part(settings, method, version)
 
 
 def _frame(settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,7 +41,7 @@ def _frame(settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return origin, direction, np.array(bounds)
 
 
-def _plan_beams(method: SpindleDrift, settings: Settings) -> xr.Dataset:
+def _plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
     origin, direction, bounds = _frame(settings)
     errors, covariance = beam_errors(origin, direction, origin, direction, bounds)
     return build_errors(
@@ -53,13 +54,13 @@ def _plan_beams(method: SpindleDrift, settings: Settings) -> xr.Dataset:
         frame="machine",
         functional_point=origin.mean(axis=0),
         reference=_PLANNED,
-        method=method.info.id,
-        method_version=method.info.version,
+        method=method,
+        method_version=version,
         provenance=provenance.make(settings, None, None),
     )
 
 
-def _plan_drift(method: SpindleDrift, settings: Settings) -> xr.Dataset:
+def _plan_drift(settings: Settings, method: str, version: str) -> xr.Dataset:
     """Plan a drift: the reference state and one later instant.
 
     A bar of the stated radius stands in a frame as drawn in ISO 230-3, its readings mid-range; the beams come from a
@@ -88,9 +89,9 @@ def _plan_drift(method: SpindleDrift, settings: Settings) -> xr.Dataset:
             "level": ("height", zs),
         },
         coords={"channel": list(CHANNELS), "direction": xyz, "time": [0.0, 3600.0]},
-        attrs={"schema": method.needs.raw_schema, "machine": "plan"},
+        attrs={"schema": SCHEMA, "machine": "plan"},
     )
-    expected = method.identify(raw, settings.model_copy(update={"running_end": None}))
+    expected = identify_drift(raw, settings.model_copy(update={"running_end": None}), method, version)
     for name in ("EX", "EY", "EZ", "EA", "EB"):
         expected[name] = expected[name] * 0.0
     kept = ["EX", "EY", "EZ", "EA", "EB", "EC", "covariance", "influence"]

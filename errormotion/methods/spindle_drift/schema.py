@@ -13,6 +13,9 @@ from errormotion.datasets.schemas import (
     Row,
 )
 
+SCHEMA = "errormotion.raw.spindle_drift/1"
+"""Id of all raw schemas of the method."""
+
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 """Channels of the five-sensor frame."""
 
@@ -38,7 +41,7 @@ _STEPPED_SPHERE = (
 
 RAW_SCHEMAS = (
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "drift",
         "time",
         (
@@ -83,9 +86,10 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
         labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
+        aliases={"reading": "distance"},
     ),
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "beam detection as recorded",
         "scan",
         (
@@ -98,9 +102,10 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5},
         labels={**XYZ, "channel": CHANNELS},
+        aliases={"reading": "distance"},
     ),
     RawSchema(
-        "errormotion.raw.spindle_drift/1",
+        SCHEMA,
         "beam detection",
         "step",
         (
@@ -124,5 +129,6 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "channel": 5},
         labels={**XYZ, "channel": CHANNELS},
+        aliases={"reading": "distance"},
     ),
 )

@@ -9,7 +9,7 @@ from errormotion.datasets import load, provenance, save, validate
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction import BeamDirection, Settings
+from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
 from errormotion.methods.beam_direction.identification.direction import bound
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.twin import VirtualMachine
@@ -29,7 +29,9 @@ def machine():
 def calibration(machine, tmp_path_factory):
     """All rotations: what is published, with 0 to 10, 90 and 170 to 180 deg alone, leaves holes."""
     file = tmp_path_factory.mktemp("calibrations") / "sensor.nc"
-    raw = machine.raw_inclination(np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0)
+    raw = simulation.raw_inclination(
+        machine, np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0
+    )
     calibrate(raw).save(file)
     return str(file)
 
@@ -47,11 +49,11 @@ def angle(errors, machine, name="beam_direction"):
 
 
 def twist_error(errors, machine):
-    return np.asarray(errors.em.twist() - machine.truth_beam().em.twist())[0]
+    return np.asarray(errors.em.twist() - simulation.truth_beam(machine).em.twist())[0]
 
 
 def test_result_follows_its_schema_and_comes_back_from_a_file(machine, tmp_path):
-    errors = identify(machine.raw_beam_direction(FOUR, seed=0, inclination_error=False), beam="X1")
+    errors = identify(simulation.raw(machine, FOUR, seed=0, inclination_error=False), beam="X1")
     validate(errors)
     assert errors.attrs["component"] == "beam"
     assert errors["beam"].values.tolist() == ["X1"]
@@ -61,7 +63,7 @@ def test_result_follows_its_schema_and_comes_back_from_a_file(machine, tmp_path)
 
 
 def test_recovers_the_beam_within_the_stated_uncertainty(machine):
-    errors = identify(machine.raw_beam_direction(FOUR, seed=0, inclination_error=False, speckle=True))
+    errors = identify(simulation.raw(machine, FOUR, seed=0, inclination_error=False, speckle=True))
     u = np.sqrt(np.diag(errors["covariance"].values[0]))
     assert (np.abs(twist_error(errors, machine)) < 4 * u).all()
     # A beam leans by 0.3 deg and starts 0.1 mm off its drawing: seen hundreds of times better than that.
@@ -72,7 +74,7 @@ def test_recovers_the_beam_within_the_stated_uncertainty(machine):
 def test_covariance_holds_the_truth_as_often_as_it_says(machine):
     miss, nees = [], []
     for seed in range(120):
-        raw = machine.raw_beam_direction(FOUR, seed=seed, inclination_error=False, speckle=True, count=10)
+        raw = simulation.raw(machine, FOUR, seed=seed, inclination_error=False, speckle=True, count=10)
         errors = identify(raw)
         e, C = twist_error(errors, machine), errors["covariance"].values[0]
         miss.append(e / np.sqrt(np.diag(C)))
@@ -85,7 +87,7 @@ def test_covariance_holds_the_truth_as_often_as_it_says(machine):
 
 
 def test_direction_is_as_well_known_as_it_can_be(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=1, inclination_error=False, speckle=True)
+    raw = simulation.raw(machine, FOUR, seed=1, inclination_error=False, speckle=True)
     errors = identify(raw, noise="stated")
     sensor = machine.point_sensor
     normals = np.array([machine.sine_gauge.plane(*plane, 1)[0] for plane in FOUR])
@@ -95,7 +97,7 @@ def test_direction_is_as_well_known_as_it_can_be(machine):
 
 
 def test_compensation_makes_the_angle_ten_times_better(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=0)
+    raw = simulation.raw(machine, FOUR, seed=0)
     errors = identify(raw, compensation=calibration)
     assert angle(errors, machine) < 0.1 * angle(errors, machine, "uncompensated_direction")
     u = np.sqrt(np.diag(errors["covariance"].values[0]))
@@ -111,7 +113,7 @@ def test_compensation_makes_the_angle_ten_times_better(machine, calibration):
 
 
 def test_planes_stand_as_the_gauge_was_set(machine, calibration):
-    errors = identify(machine.raw_beam_direction(FOUR, seed=3), compensation=calibration)
+    errors = identify(simulation.raw(machine, FOUR, seed=3), compensation=calibration)
     normals = np.array([machine.sine_gauge.plane(*plane, 3)[0] for plane in FOUR])
     np.testing.assert_allclose(errors["normal"], normals, atol=1e-4)
     sensor = machine.point_sensor
@@ -122,7 +124,7 @@ def test_planes_stand_as_the_gauge_was_set(machine, calibration):
 
 
 def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=3)
+    raw = simulation.raw(machine, FOUR, seed=3)
     known = InclinationCalibration.load(calibration)
     told = provenance.of(identify(raw, compensation=calibration))["calibration"]
     assert told == known.told()
@@ -162,7 +164,7 @@ def test_calibration_without_a_serial_number_is_used_with_a_note(machine, calibr
 
 
 def test_calibration_is_part_of_the_uncertainty(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=0)
+    raw = simulation.raw(machine, FOUR, seed=0)
     errors = identify(raw, compensation=calibration)
     influence = errors["influence"].values[:, 0]
     total = errors["covariance"].values[0]
@@ -175,7 +177,7 @@ def test_calibration_is_part_of_the_uncertainty(machine, calibration):
 
 
 def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     scaled = raw.assign(distance=(raw["distance"] * 1.001).assign_attrs(units="m"))
     straight, errors = identify(raw), identify(raw, layout={"scale_uncertainty": 1e-3})
     moved = np.asarray(identify(scaled).em.twist() - straight.em.twist())[0]
@@ -184,17 +186,17 @@ def test_an_unsure_scale_turns_the_beam_and_moves_its_start(machine):
 
 
 def test_without_compensation_it_is_said_and_planes_contradict_one_another(machine):
-    told = notes(identify(machine.raw_beam_direction(FOUR, seed=0)))
+    told = notes(identify(simulation.raw(machine, FOUR, seed=0)))
     assert "No inclination compensation" in told
     assert "The planes contradict one another: chi-square" in told
     assert "The uncertainties are raised" in told
     assert "worst is plane" in told
-    told = notes(identify(machine.raw_beam_direction(FOUR[:3], seed=0)))
+    told = notes(identify(simulation.raw(machine, FOUR[:3], seed=0)))
     assert "three planes do not tell which of them is wrong" in told
 
 
 def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
-    errors = identify(machine.raw_beam_direction(FOUR[:2], seed=0, inclination_error=False))
+    errors = identify(simulation.raw(machine, FOUR[:2], seed=0, inclination_error=False))
     assert "Two directions fit the planes; the nominal direction decided" in notes(errors)
     assert "2 planes with a known point" in notes(errors)
     assert np.isnan(errors["beam_origin"]).all()
@@ -203,7 +205,7 @@ def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine
 
 
 def test_a_stage_that_carries_the_target_counts_the_other_way(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     straight, carried = identify(raw), raw.assign(stage=-raw["stage"])
     carried["stage"].attrs["units"] = "m"
     by_setting = identify(carried, moves="target")
@@ -213,7 +215,7 @@ def test_a_stage_that_carries_the_target_counts_the_other_way(machine):
 
 
 def test_planes_may_have_different_numbers_of_readings(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][2, 15:20] = np.nan
     raw["stage"][2, 15:20] = np.nan
     errors = identify(raw)
@@ -223,7 +225,7 @@ def test_planes_may_have_different_numbers_of_readings(machine):
 
 
 def test_outliers_are_named_by_plane_and_reading(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][1, 8] += 20e-6
     raw["distance"][3, 40] -= 5e-6
     errors = identify(raw)
@@ -233,7 +235,7 @@ def test_outliers_are_named_by_plane_and_reading(machine):
 
 
 def test_more_scatter_than_stated_raises_the_uncertainty(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     straight = identify(raw)
     raw["distance_noise"] = raw["distance_noise"] / 5
     raw["distance_noise"].attrs["units"] = "m"
@@ -249,35 +251,33 @@ def test_more_scatter_than_stated_raises_the_uncertainty(machine):
 
 
 def test_less_scatter_than_stated_is_said(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance_noise"] = raw["distance_noise"] * 3
     raw["distance_noise"].attrs["units"] = "m"
     assert "scatter only" in notes(identify(raw))
 
 
 def test_speckle_that_is_not_stated_is_noticed(machine):
-    raw = machine.raw_beam_direction(
-        FOUR, seed=0, inclination_error=False, speckle=True, half_length=0.5e-3, count=60
+    raw = simulation.raw(
+        machine, FOUR, seed=0, inclination_error=False, speckle=True, half_length=0.5e-3, count=60
     ).drop_vars(["speckle", "speckle_length"])
     assert "Residuals of neighbouring readings resemble each other" in notes(identify(raw))
 
 
 def test_sound_data_raise_no_alarm(machine):
-    alarms = [
-        notes(identify(machine.raw_beam_direction(FOUR, seed=seed, inclination_error=False))) for seed in range(25)
-    ]
+    alarms = [notes(identify(simulation.raw(machine, FOUR, seed=seed, inclination_error=False))) for seed in range(25)]
     assert set(alarms) == {"No inclination compensation: the readings are taken as they are."}
 
 
 def test_known_points_without_an_uncertainty_are_said_to_be_taken_as_exact(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     told = "the known points of the planes were taken as exact"
     assert told in notes(identify(raw.drop_vars("plane_point_uncertainty")))
     assert told in notes(identify(raw.assign(plane_point_uncertainty=((), np.nan, {"units": "m"}))))
 
 
 def test_missing_and_out_of_range_readings_are_counted(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][0, 3] = np.nan
     raw["distance"][0, 10] = 10.5e-3
     errors = identify(raw)
@@ -286,7 +286,7 @@ def test_missing_and_out_of_range_readings_are_counted(machine):
 
 
 def test_check_bar_is_seen_with_the_beam(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=0, check_bar=True)
+    raw = simulation.raw(machine, FOUR, seed=0, check_bar=True)
     errors = identify(raw, compensation=calibration)
     bar = machine.check_bar
     assert float(errors["bar_radius_fitted"]) == pytest.approx(bar.radius, abs=3 * float(errors["bar_radius_u"]) + 1e-7)
@@ -305,12 +305,12 @@ def refused(raw, match, kind=MethodError, **settings):
 
 
 def test_parallel_planes(machine):
-    raw = machine.raw_beam_direction([FOUR[0]] * 3, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, [FOUR[0]] * 3, seed=0, inclination_error=False)
     refused(raw, r"The planes are parallel .*leave open how far the beam is turned about it")
 
 
 def test_a_stroke_out_of_the_range(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"][1, 30:] = np.nan
     refused(
         raw, r"Plane 2: 30 of 60 readings are missing .*the first of them reading 31: the strokes leave the sensor's"
@@ -318,7 +318,7 @@ def test_a_stroke_out_of_the_range(machine):
 
 
 def test_a_stage_that_steps_back_along_a_stroke(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     order = np.arange(60)
     order[[7, 8]] = order[[8, 7]]
     swapped = raw.assign(stage=raw["stage"].isel(reading=order))
@@ -330,31 +330,31 @@ def test_a_stage_that_steps_back_along_a_stroke(machine):
 
 
 def test_a_stage_that_moves_along_two_directions(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False).isel(reading=slice(0, 40))
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False).isel(reading=slice(0, 40))
     refused(raw, r"Plane 1: the stage moves along 2 of three independent directions; along \(0.00, 0.00, 1.00\)")
 
 
 def test_a_direction_that_flips_sign(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     refused(raw, r"its sign is turned.*setting moves", moves="target")
 
 
 def test_readings_in_mm(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance"] = (raw["distance"] * 1e3).assign_attrs(units="m")
     raw["reading_range"] = (raw["reading_range"] * 1e3).assign_attrs(units="m")
     refused(raw, "is it in mm", DatasetError)
 
 
 def test_places_of_the_stage_in_mm(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False, half_length=5e-3)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False, half_length=5e-3)
     home = raw["stage"].mean("reading")
     raw["stage"] = ((raw["stage"] - home) * 1e3).assign_attrs(units="m")
     refused(raw, "Plane 1: .*Are readings and places of the stage in the same unit")
 
 
 def test_a_plane_that_the_beam_grazes(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, inclination_error=False)
+    raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     u = machine.point_sensor.true_direction
     side = np.cross(u, [0.0, 1.0, 0.0])
     n = side / np.linalg.norm(side) - 0.05 * u
@@ -366,9 +366,9 @@ def test_a_plane_that_the_beam_grazes(machine):
 
 
 def test_a_hole_in_the_calibration(machine, tmp_path):
-    holed = machine.raw_inclination(seed=0)  # rotations 0 to 10, 90 and 170 to 180 deg, as published
+    holed = simulation.raw_inclination(machine, seed=0)  # rotations 0 to 10, 90 and 170 to 180 deg, as published
     calibrate(holed).save(tmp_path / "holed.nc")
-    raw = machine.raw_beam_direction(FOUR, seed=0)
+    raw = simulation.raw(machine, FOUR, seed=0)
     file = str(tmp_path / "holed.nc")
     refused(raw, r"Plane 2: Calibration 'holed': .* leave a hole; nearest calibrated", compensation=file)
     errors = identify(raw, compensation=file, extrapolate=True)
@@ -379,23 +379,23 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
 
 
 def test_a_calibration_without_triangulation_plane(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=0).drop_vars("triangulation_normal")
+    raw = simulation.raw(machine, FOUR, seed=0).drop_vars("triangulation_normal")
     refused(raw, r"needs triangulation_normal", compensation=calibration)
 
 
 def test_a_calibration_that_is_not_there(machine):
-    refused(machine.raw_beam_direction(FOUR, seed=0), "not found", DatasetError, compensation="nowhere")
+    refused(simulation.raw(machine, FOUR, seed=0), "not found", DatasetError, compensation="nowhere")
 
 
 def test_a_noise_of_nothing(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0)
+    raw = simulation.raw(machine, FOUR, seed=0)
     refused(raw.assign(distance_noise=((), 0.0, {"units": "m"})), "distance_noise is 0")
 
 
 def test_speckle_without_its_length(machine):
-    raw = machine.raw_beam_direction(FOUR, seed=0, speckle=True).drop_vars("speckle_length")
+    raw = simulation.raw(machine, FOUR, seed=0, speckle=True).drop_vars("speckle_length")
     refused(raw, "speckle_length")
 
 
 def test_an_unknown_kind_of_stage(machine):
-    refused(machine.raw_beam_direction(FOUR, seed=0).assign_attrs(moves="table"), "expected 'sensor' or 'target'")
+    refused(simulation.raw(machine, FOUR, seed=0).assign_attrs(moves="table"), "expected 'sensor' or 'target'")

@@ -9,6 +9,7 @@ from errormotion.datasets import hash_dataset, provenance
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
+from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate
 from errormotion.methods.beam_direction.identification.inclination.surface import degrees_to
 from errormotion.twin import VirtualMachine
@@ -134,7 +135,9 @@ def test_a_setting_at_the_wrong_angle_is_left_out_and_named() -> None:
 
 def test_good_settings_are_not_left_out() -> None:
     machine = VirtualMachine("cframe", seed=4)
-    left_out = [int(calibrate(machine.raw_inclination(seed=k)).dataset["setting_left_out"].sum()) for k in range(3)]
+    left_out = [
+        int(calibrate(simulation.raw_inclination(machine, seed=k)).dataset["setting_left_out"].sum()) for k in range(3)
+    ]
     assert left_out == [0, 0, 0]
 
 
@@ -177,7 +180,7 @@ def test_one_side_of_the_triangulation_plane_says_nothing_of_the_other() -> None
 
 
 def test_the_uncertainty_grows_into_a_hole() -> None:
-    raw = VirtualMachine("cframe", seed=3).raw_inclination(seed=0)
+    raw = simulation.raw_inclination(VirtualMachine("cframe", seed=3), seed=0)
     found = calibrate(raw)
     u = found.slope(tilt_vector(np.radians(35.0), np.radians([5.0, 20.0, 45.0])))[1]
     assert u[1] > 3 * u[0]
@@ -190,7 +193,7 @@ def test_intervals_hold_the_truth_at_settings_that_were_not_used() -> None:
     held, rng = [], np.random.default_rng(0)
     for seed in range(12):
         machine = VirtualMachine("cframe", seed=seed)
-        found = calibrate(machine.raw_inclination(depths=DEPTHS, seed=seed, speckle=True))
+        found = calibrate(simulation.raw_inclination(machine, depths=DEPTHS, seed=seed, speckle=True))
         beta = np.radians(np.concatenate([rng.uniform(0, 10, 100), rng.uniform(170, 180, 100), [90.0] * 40]))
         q = tilt_vector(np.radians(rng.uniform(-43, 43, beta.size)), beta)
         assert found.supported(q).all()
@@ -206,7 +209,9 @@ def test_intervals_hold_the_truth_wherever_tilts_are_supported(inclinations) -> 
     rotations = np.radians(np.arange(0.0, 360.0, 10.0))
     for seed in range(5):
         machine = VirtualMachine("cframe", seed=seed)
-        raw = machine.raw_inclination(np.radians(list(inclinations)), rotations, DEPTHS, seed=seed, speckle=True)
+        raw = simulation.raw_inclination(
+            machine, np.radians(list(inclinations)), rotations, DEPTHS, seed=seed, speckle=True
+        )
         found = calibrate(raw)
         q = tilt_vector(np.arctan(np.sqrt(rng.uniform(0, 0.98, 300))), rng.uniform(0, 2 * np.pi, 300))
         q = q[found.supported(q)]
@@ -228,7 +233,7 @@ def test_intervals_hold_the_truth_in_holes() -> None:
     held, rng = [], np.random.default_rng(0)
     for seed in range(6):
         machine = VirtualMachine("cframe", seed=seed)
-        found = calibrate(machine.raw_inclination(depths=DEPTHS, seed=seed))
+        found = calibrate(simulation.raw_inclination(machine, depths=DEPTHS, seed=seed))
         q = tilt_vector(np.radians(rng.uniform(20, 44, 200)), np.radians(rng.uniform(25, 75, 200)))
         held.append(coverage(found, q, machine.point_sensor.slope(q)).mean())
     assert np.mean(held) > 0.9

@@ -10,7 +10,7 @@ from errormotion import datasets
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction import BeamDirection
+from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.methods.beam_direction.identification.direction import bound
 from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings as CalibrationSettings
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
@@ -168,8 +168,8 @@ def test_a_measurement_bears_the_plan_out():
     angles = np.array([(face.inclination, face.rotation) for face in chosen.planes])
     own = design.longest_strokes(design.plane_normals(angles), limits)
     stage = [machine.home() + design.stroke_points(lengths, np.full(3, 20)) for lengths in own]
-    raw = machine.raw_beam_direction(
-        [tuple(pair) for pair in angles], stage=np.array(stage), seed=7, inclination_error=False
+    raw = simulation.raw(
+        machine, [tuple(pair) for pair in angles], stage=np.array(stage), seed=7, inclination_error=False
     )
     found = BeamDirection().identify(raw, Settings(noise="stated"))
     u, expected = (np.sqrt(np.diagonal(ds["covariance"].values[0])[3:]) for ds in (found, planned))
@@ -203,7 +203,7 @@ def test_a_set_up_with_a_path_is_planned_as_it_is():
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory):
     """Return the path of a calibration with the holes of the published one: rotations 0 to 10, 90, 170 to 180 deg."""
-    raw = VirtualMachine("cframe", seed=3).raw_inclination(seed=1)
+    raw = simulation.raw_inclination(VirtualMachine("cframe", seed=3), seed=1)
     return calibrate(raw, CalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
 
 

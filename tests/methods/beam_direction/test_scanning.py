@@ -9,6 +9,7 @@ import xarray as xr
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
+from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.check_bar.measure import fit_bar, measure_bar
 from errormotion.methods.beam_direction.identification.check_bar.scanning import (
     Points,
@@ -35,12 +36,12 @@ def machine() -> VirtualMachine:
 @pytest.fixture(scope="module")
 def calibration(machine: VirtualMachine) -> InclinationCalibration:
     alphas, betas = np.radians(np.arange(-50, 51, 10)), np.radians(np.arange(0, 180, 22.5))
-    return calibrate(machine.raw_inclination(alphas, betas, np.linspace(-10e-3, 10e-3, 5), seed=1))
+    return calibrate(simulation.raw_inclination(machine, alphas, betas, np.linspace(-10e-3, 10e-3, 5), seed=1))
 
 
 @pytest.fixture(scope="module")
 def bar(machine: VirtualMachine) -> xr.Dataset:
-    return machine.raw_check_bar(seed=5)
+    return simulation.raw_check_bar(machine, seed=5)
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,10 @@
 """A gantry with a line profiler, and scans of the pocket that it has cut."""
 
-import numpy as np
 import pytest
 
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import circular_pocket
 from errormotion.twin.profiler import Disturbances, Profiler
-
-RADIUS = 12.496e-3
 
 
 @pytest.fixture(scope="session")
@@ -22,9 +19,8 @@ def scan_pocket(gantry):
 
     def scan(seed, disturbances=None, *, lifts=(0.166, 0.182), lines=80):
         profiler = Profiler(disturbances=Disturbances() if disturbances is None else disturbances)
-        along = (np.arange(lines) - (lines - 1) / 2) * 28e-3 / lines
-        pocket = circular_pocket(RADIUS)
-        height, stage, _ = gantry.crossbeam.pocket_scans(pocket, profiler, along, np.array(lifts), (seed,))
-        return profiler.x, height, stage
+        feed = 28e-3 / lines
+        raw = simulation.raw_pocket(gantry, seed=seed, lifts=lifts, profiler=profiler, profiles=lines, feed=feed)
+        return raw["x"].values, raw["height"].values.astype(float), raw["stage"].values
 
     return scan

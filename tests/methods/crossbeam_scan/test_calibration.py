@@ -6,6 +6,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import load, save, validate
 from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration, edges
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import Pocket, calibrate
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -145,7 +146,7 @@ def test_what_is_no_scan_of_a_pocket_is_refused_in_words(scan_pocket, change, me
 
 
 def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
-    raw = gantry.raw_pocket_scan(seed=1, profiles=80, feed=350e-6)
+    raw = simulation.raw_pocket(gantry, seed=1, profiles=80, feed=350e-6)
     save(raw, tmp_path / "pocket.nc")
     stored = load(tmp_path / "pocket.nc")
     validate(stored)
@@ -159,7 +160,7 @@ def test_a_raw_dataset_gives_what_its_arrays_give(gantry, truth, tmp_path):
 
 def test_scans_of_artefacts_are_no_calibration(gantry):
     profiler = Profiler(80, 0.4e-3, disturbances=Disturbances.white())
-    raw = gantry.raw_crossbeam_scan([0], [0], seed=1, profiler=profiler, profiles=3, feed=1e-3)
+    raw = simulation.raw_scans(gantry, [0], [0], seed=1, profiler=profiler, profiles=3, feed=1e-3)
     with pytest.raises(MethodError, match="needs scans of a pocket"):
         calibration.calibrate_dataset(raw)
 

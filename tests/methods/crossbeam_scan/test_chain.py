@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.datasets import build_errors, provenance, validate
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displaced, displacement, log
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification import chain
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.twin import VirtualMachine
@@ -73,7 +74,7 @@ def registered(gantry, raw, cycle, by_line=False, assumed=None):
 
 
 def test_errors_of_the_carriage_come_back_from_the_motion_of_the_profiler(gantry, H, lever):
-    truth = gantry.truth_crossbeam([0, 600, T], [-0.5, Y]).em.twist().values
+    truth = simulation.truth_axis(gantry, [0, 600, T], [-0.5, Y]).em.twist().values
     found = chain.carriage_errors(motions(truth, H, lever), np.zeros((3, 2, 6, 6)), H, lever)
     # second order: 2.2 m times (30 urad)^2
     assert found.values[..., :3] == pytest.approx(truth[..., :3], abs=2e-9)
@@ -83,8 +84,8 @@ def test_errors_of_the_carriage_come_back_from_the_motion_of_the_profiler(gantry
 
 def test_sign_and_direction_are_those_of_the_scans(gantry, H, lever):
     scans = {"seed": 1, "profiles": 40, "feed": 1e-3, "profiler": PERFECT, "motion": "rigid"}
-    raw = gantry.raw_crossbeam_scan([0, T], [Y], **scans)
-    truth = gantry.truth_crossbeam([T], [Y]).em.twist().values[0, 0]
+    raw = simulation.raw_scans(gantry, [0, T], [Y], **scans)
+    truth = simulation.truth_axis(gantry, [T], [Y]).em.twist().values[0, 0]
     assert np.abs(registered(gantry, raw, 0)).max() < 1e-9
     found = chain.carriage_errors(registered(gantry, raw, 1), np.zeros((6, 6)), H, lever)
     # float32 and second order
@@ -94,9 +95,9 @@ def test_sign_and_direction_are_those_of_the_scans(gantry, H, lever):
 def missed(machine, by_line):
     """Return what the chain misses of the true motion (6,), m and rad."""
     H, lever = RigidTransform.from_matrix(machine.crossbeam.pose), machine.crossbeam.lever
-    raw = machine.raw_crossbeam_scan([0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT)
+    raw = simulation.raw_scans(machine, [0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT)
     found = chain.carriage_errors(registered(machine, raw, 1, by_line), np.zeros((6, 6)), H, lever)
-    return found.values - machine.truth_crossbeam([T], [Y]).em.twist().values[0, 0]
+    return found.values - simulation.truth_axis(machine, [T], [Y]).em.twist().values[0, 0]
 
 
 def test_a_rigid_motion_takes_a_strained_scan_for_yaw(gantry):
@@ -140,7 +141,7 @@ def test_effect_of_a_wrong_pose_is_that_of_running_again(H, lever):
 @pytest.mark.parametrize("by_line", [False, True])
 def test_scans_put_together_by_a_wrong_pose_add_no_more_than_the_chain(gantry, H, lever, by_line):
     # 10 mrad against errors of 33 um and 10 urad: products of the two, some of them on the lever of 2.2 m
-    raw = gantry.raw_crossbeam_scan([0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT, motion="rigid")
+    raw = simulation.raw_scans(gantry, [0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT, motion="rigid")
     right = chain.carriage_errors(registered(gantry, raw, 1, by_line), np.zeros((6, 6)), H, lever).values
     for change in 0.01 * np.eye(3, 6):
         wrong = calibration.pose(*(calibration.parameters(H) + change))
@@ -181,7 +182,7 @@ def test_lever_counts_as_a_source_of_its_own(H, lever):
 
 
 def test_truth_lies_within_the_stated_covariance(gantry, H, lever):
-    truth = gantry.truth_crossbeam([T], [-0.5, Y]).em.twist().values[0]
+    truth = simulation.truth_axis(gantry, [T], [-0.5, Y]).em.twist().values[0]
     M = motions(truth, H, lever)
     root = np.diag([50e-9] * 3 + [0.5e-6] * 3) @ np.array(np.eye(6) + 0.3)
     C = np.tile(root @ root.T, (2, 1, 1))
@@ -198,7 +199,7 @@ def test_truth_lies_within_the_stated_covariance(gantry, H, lever):
 
 
 def test_results_make_a_valid_error_dataset_with_a_gap(gantry, H, lever):
-    truth = gantry.truth_crossbeam([0, T], [-0.5, Y]).em.twist().values
+    truth = simulation.truth_axis(gantry, [0, T], [-0.5, Y]).em.twist().values
     M = motions(truth, H, lever)
     M[1, 0] = np.nan
     C = np.tile(np.diag([50e-9] * 3 + [0.5e-6] * 3) ** 2, (2, 2, 1, 1))

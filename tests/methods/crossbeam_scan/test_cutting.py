@@ -8,6 +8,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import Interruption, Scans, interruption, interruptions
 
 PITCH, POINTS, COUNT = 70e-6, 3, 1e-6
@@ -214,7 +215,7 @@ def test_a_broken_pass_says_where_it_broke_and_why():
 
 
 def test_scans_that_are_cut_already_are_handed_over_one_by_one(gantry):
-    raw = gantry.raw_crossbeam_scan([0.0, 600.0], [0.1, 0.3], seed=1, profiles=100)
+    raw = simulation.raw_scans(gantry, [0.0, 600.0], [0.1, 0.3], seed=1, profiles=100)
     raw["y"][1, 0, 90:] = np.nan
     raw["height"][1, 1] = np.nan
     scans = Scans(raw)
@@ -228,7 +229,7 @@ def test_scans_that_are_cut_already_are_handed_over_one_by_one(gantry):
 
 
 def test_cut_scans_whose_y_turns_are_refused(gantry):
-    raw = gantry.raw_crossbeam_scan([0.0], [0.1], seed=1, profiles=100)
+    raw = simulation.raw_scans(gantry, [0.0], [0.1], seed=1, profiles=100)
     raw["y"][0, 0, 50] = -0.002
     with pytest.raises(MethodError, match="1 of 100 lines lie behind"):
         Scans(raw).scan(0, 0)
@@ -238,4 +239,4 @@ def test_cut_scans_whose_y_turns_are_refused(gantry):
 
 def test_what_is_no_campaign_of_scans_is_refused(gantry):
     with pytest.raises(MethodError, match="Expected scans"):
-        Scans(gantry.raw_pocket_scan(seed=1, profiles=20))
+        Scans(simulation.raw_pocket(gantry, seed=1, profiles=20))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
 from errormotion.datasets import provenance
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.settings import Settings
@@ -38,7 +38,7 @@ def campaign(machine, seed, *, times=TIMES, places=PLACES, **options):
     true = calibration.parameters(RigidTransform.from_matrix(machine.crossbeam.pose))
     pose = calibration.pose(*(true + rng.multivariate_normal(np.zeros(6), POSE_COVARIANCE))).as_matrix()
     given = {"profiles": 400, "feed": 70e-6, "profiler": PROFILER} | options
-    raw = machine.raw_crossbeam_scan(times, places, seed=seed, pose=pose, **given)
+    raw = simulation.raw_scans(machine, times, places, seed=seed, pose=pose, **given)
     return raw.assign(
         lever=("direction", raw["lever"].values + rng.normal(0, LEVER_UNCERTAINTY, 3), {"units": "m"}),
         lever_uncertainty=("direction", np.full(3, LEVER_UNCERTAINTY), {"units": "m"}),
@@ -83,7 +83,7 @@ def misses(found, machines):
 
 
 def miss(ds, machine):
-    truth = machine.truth_crossbeam(ds["time"].values, ds["y"].values).em.twist().values
+    truth = simulation.truth_axis(machine, ds["time"].values, ds["y"].values).em.twist().values
     return ds.em.twist().values[1:] - truth[1:]
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics.poses import displaced
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification import chain
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
 from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, judge
@@ -31,7 +31,7 @@ def _quiet(caplog):
 
 
 def scan(machine, times, places, seed=3):
-    return machine.raw_crossbeam_scan(times, places, seed=seed, profiles=400, feed=70e-6, profiler=PROFILER)
+    return simulation.raw_scans(machine, times, places, seed=seed, profiles=400, feed=70e-6, profiler=PROFILER)
 
 
 def knocked(machine, step):
@@ -118,7 +118,7 @@ def test_an_artefact_that_moved_is_named_and_left_out(machine, raw, clean, artef
 def test_a_guide_does_not_hand_it_on_to_the_neighbours(machine, raw, step):
     ds = identify(replaced(raw, machine, slice(4, None), 3, step), strain="guided")
     assert np.flatnonzero(ds["moved"].values).tolist() == [3]
-    miss = ds.em.twist().values - machine.truth_crossbeam(ds["time"].values, PLACES).em.twist().values
+    miss = ds.em.twist().values - simulation.truth_axis(machine, ds["time"].values, PLACES).em.twist().values
     u = np.sqrt(np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1))
     there = np.isfinite(miss)
     assert np.all(np.abs(miss[there]) <= 4 * u[there])

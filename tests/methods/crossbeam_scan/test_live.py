@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.acquisition.live import LONGEST_QUEUE, LiveScans
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -16,7 +17,9 @@ SETTINGS = Settings(positions=POSITIONS, warm_up=(7200.0,), cold_repeats=0, scan
 def scans(gantry):
     """A cold and a warm pass over two artefacts, cut."""
     profiler = Profiler(800, 50e-6, disturbances=Disturbances.white())
-    return gantry.raw_crossbeam_scan([0.0, 7200.0], POSITIONS, seed=2, profiles=400, profiler=profiler, motion="rigid")
+    return simulation.raw_scans(
+        gantry, [0.0, 7200.0], POSITIONS, seed=2, profiles=400, profiler=profiler, motion="rigid"
+    )
 
 
 def chunks(scans, size=150):
@@ -91,5 +94,5 @@ def test_a_line_that_marks_something_is_no_scan(scans):
 
 
 def test_of_the_pocket_it_tells_the_lift(gantry):
-    raw = gantry.raw_pocket_scan(seed=1, profiles=20)
+    raw = simulation.raw_pocket(gantry, seed=1, profiles=20)
     assert LiveScans(Settings(procedure="profiler_pose")).update(raw) == "pocket, scan at a lift of 182 mm"

@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
@@ -72,7 +72,7 @@ def pose(machine):
 )
 def test_a_plan_says_what_identification_will_state(machine, pose, wrong, strain):
     motion = "rigid" if strain == "rigid" else "axis"
-    raw = machine.raw_crossbeam_scan(
+    raw = simulation.raw_scans(machine,
         [0.0, 7200.0], [0.0], seed=1, profiles=400, feed=70e-6, motion=motion,
         profiler=Profiler(800, 25e-6, disturbances=wrong), artefact=freeform(waves),
     )  # fmt: skip
@@ -142,7 +142,7 @@ def test_twice_the_noise_is_twice_the_uncertainty():
 
 
 def test_a_plan_of_the_pose_says_what_calibration_will_state(machine):
-    raw = machine.raw_pocket_scan(seed=1)
+    raw = simulation.raw_pocket(machine, seed=1)
     stated = uncertainty(CrossbeamScan().identify(raw))[0]
     planned = plan(procedure="profiler_pose", profiler_pose={"dz": -0.174})
     datasets.validate(planned)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displacement
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given, given_covariance
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
@@ -26,7 +26,7 @@ def identify(raw, settings=SETTINGS):
 def raws():
     """Scans of the pocket on a few machines, with those."""
     machines = [VirtualMachine("gantry", seed=seed) for seed in SEEDS]
-    return [(machine, machine.raw_pocket_scan(seed=machine.seed)) for machine in machines]
+    return [(machine, simulation.raw_pocket(machine, seed=machine.seed)) for machine in machines]
 
 
 @pytest.fixture(scope="module")
@@ -100,13 +100,15 @@ def test_dataset_is_valid_and_outlives_a_file(found, tmp_path):
 
 def test_the_pose_found_serves_the_scans(raws, found):
     machine, _ = raws[0]
-    raw = machine.raw_crossbeam_scan([0.0, 7200.0], [0.0], seed=1, profiles=200, pose=found[0]["profiler_pose"].values)
+    raw = simulation.raw_scans(
+        machine, [0.0, 7200.0], [0.0], seed=1, profiles=200, pose=found[0]["profiler_pose"].values
+    )
     raw["pose_covariance"] = found[0]["pose_covariance"]
     ds = identify(raw)
     covariance = found[0]["pose_covariance"].values
     assert ds["pose_u"].values == pytest.approx(np.sqrt(np.diag(covariance)))
     assert ds["pose_u"]["pose_parameter"].values.tolist() == ["a", "b", "g", "dx", "dy", "dz"]
-    miss = ds.em.twist().values[1, 0] - machine.truth_crossbeam([7200.0], [0.0]).em.twist().values[0, 0]
+    miss = ds.em.twist().values[1, 0] - simulation.truth_axis(machine, [7200.0], [0.0]).em.twist().values[0, 0]
     assert np.all(np.abs(miss) < 4 * np.sqrt(np.diag(ds["covariance"].values[1, 0])))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registration import prepare
 from errormotion.methods.crossbeam_scan.identification.registrations import register_all
@@ -20,7 +21,7 @@ def test_bending_of_a_block_is_that_of_its_parabola():
 @pytest.mark.parametrize(("pitch", "notes"), [(25e-6, 0), (50e-6, 1)])
 def test_points_too_far_apart_for_the_relief_are_told(gantry, pitch, notes):
     profiler = Profiler(400, pitch)
-    raw = gantry.raw_crossbeam_scan([0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
+    raw = simulation.raw_scans(gantry, [0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
     found = register_all(Scans(raw), [0], 0.5e-6, Settings())
     assert len(found.notes) == notes
     assert all("closer to one another" in note for note in found.notes)

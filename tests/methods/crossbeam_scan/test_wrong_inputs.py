@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import DatasetError, MethodError
-from errormotion.methods.crossbeam_scan import CrossbeamScan
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.artefacts import freeform, plane
@@ -23,8 +23,8 @@ CYCLE, ARTEFACT = 2, 1
 
 def scan(gantry, times=TIMES, places=PLACES, *, seed=1, lines=LINES, artefact=None):
     """Return scans of the twin."""
-    return gantry.raw_crossbeam_scan(
-        times, places, seed=seed, profiles=lines, feed=FEED, profiler=PROFILER, artefact=artefact
+    return simulation.raw_scans(
+        gantry, times, places, seed=seed, profiles=lines, feed=FEED, profiler=PROFILER, artefact=artefact
     )
 
 
@@ -123,7 +123,7 @@ def test_half_a_scan_is_worth_less_and_says_so(gantry, raw, errors):
     assert not (found["reason"] != "").any()
     worse = found["registration_u"][1, 1].values / errors["registration_u"][1, 1].values
     assert np.all(worse > 1.3)  # half the lines: sqrt(2), and more for what needs a long scan
-    truth = gantry.truth_crossbeam([1800.0], [0.0]).em.twist().values[0, 0]
+    truth = simulation.truth_axis(gantry, [1800.0], [0.0]).em.twist().values[0, 0]
     assert np.all(np.abs(found.em.twist().values[1, 1] - truth) < 4 * found["registration_u"][1, 1].values)
 
 
@@ -169,7 +169,7 @@ def test_a_cold_repeat_takes_the_place_of_a_broken_cold_scan(gantry, raw, errors
     assert not (found["reason"] != "").any()
     assert not found.em.twist().values[0].any()
     np.testing.assert_array_equal(found.em.twist().values[:, [0, 2]], errors.em.twist().values[:, [0, 2]])
-    truth = gantry.truth_crossbeam([1800.0, 7200.0], [0.0]).em.twist().values[:, 0]
+    truth = simulation.truth_axis(gantry, [1800.0, 7200.0], [0.0]).em.twist().values[:, 0]
     u = np.sqrt(np.diagonal(found["covariance"].values[1:, 1], axis1=-2, axis2=-1))
     assert np.all(np.abs(found.em.twist().values[1:, 1] - truth) < 4 * u)
 

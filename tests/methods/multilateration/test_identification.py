@@ -6,7 +6,7 @@ from scipy import stats
 
 from errormotion import datasets
 from errormotion.errors import DatasetError, MethodError
-from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.methods.multilateration.identification.refraction import refractive_index
 from errormotion.methods.multilateration.identification.volume import diagonals, grid, volumetric_errors
 from errormotion.twin import VirtualMachine
@@ -21,7 +21,7 @@ def machine():
 
 @pytest.fixture(scope="module")
 def raw(machine):
-    return machine.raw_multilateration(seed=1)
+    return simulation.raw(machine, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def notes(ds):
 
 
 def test_targets_are_where_they_truly_are_within_their_uncertainty(machine, errors):
-    truth = machine.truth_multilateration(machine.target_grid())
+    truth = simulation.true_errors(machine, simulation.target_grid(machine))
     left = vectors(errors) - vectors(truth)
     chi2 = sum(e @ np.linalg.solve(C[:3, :3], e) for e, C in zip(left, errors["covariance"].values, strict=True))
     # 300 values of which stations share ten directions: the mean of chi-square to 3 sigma of some 60 freedoms.
@@ -66,6 +66,22 @@ def test_the_result_is_an_error_dataset_with_all_that_a_report_needs(raw, errors
     assert errors["EYX"].attrs["includes"] == ""
 
 
+def test_the_figures_are_the_volumetric_error_and_the_squareness(errors):
+    size = np.linalg.norm(vectors(errors), axis=1)
+    largest, rms, *square = Multilateration.figures(errors)
+    assert largest.value == size.max()
+    assert str(errors["target"].values[size.argmax()]) in largest.name
+    assert rms.value == pytest.approx(np.sqrt(np.mean(size**2)))
+    assert 0 < rms.expanded_uncertainty < largest.expanded_uncertainty
+    found = {figure.name: (figure.value, figure.expanded_uncertainty, figure.unit) for figure in square}
+    expected = {
+        f"squareness {name}": (float(errors[name]), 2 * float(errors[f"{name}_u"]), "rad")
+        for name in ("EA0Z", "EB0Z", "EC0Y")
+    }
+    assert found == expected
+    assert Multilateration.figures(volumetric_errors(errors, [[0.0, 0.0, 0.2]]))[0].value > 0
+
+
 def test_the_datum_has_no_motion_of_the_whole(raw, errors):
     e, place = vectors(errors), raw["target_nominal"].values
     place = place - place.mean(axis=0)
@@ -75,12 +91,12 @@ def test_the_datum_has_no_motion_of_the_whole(raw, errors):
 
 
 def test_stations_and_dead_paths_are_found(machine, raw, errors):
-    off = errors["station_place"].values - machine.tracker_places()
+    off = errors["station_place"].values - simulation.stations(machine)
     u = np.sqrt(np.einsum("sii->si", errors["station_covariance"].values))
     # The datum is that of the targets: their true errors turn the stations by some 10 um.
     assert np.abs(off).max() < 60e-6
     assert np.all(u < 5e-6)
-    assert np.all(np.abs(raw["station_nominal"].values - machine.tracker_places()).max(axis=1) > 1e-3)
+    assert np.all(np.abs(raw["station_nominal"].values - simulation.stations(machine)).max(axis=1) > 1e-3)
 
 
 def test_stations_need_no_rough_places(raw, errors):
@@ -95,9 +111,9 @@ def test_covariance_and_spread_over_seeds_agree():
     squares, held = [], []
     for seed in range(25):
         virtual = VirtualMachine("cframe", seed=seed)
-        q = virtual.target_grid((4, 4, 3))
-        found = Multilateration().identify(virtual.raw_multilateration(q, seed=seed), Settings(parametric=False))
-        left = vectors(found) - vectors(virtual.truth_multilateration(q))
+        q = simulation.target_grid(virtual, (4, 4, 3))
+        found = Multilateration().identify(simulation.raw(virtual, q, seed=seed), Settings(parametric=False))
+        left = vectors(found) - vectors(simulation.true_errors(virtual, q))
         C = found["covariance"].values[:, :3, :3]
         squares.append(left[7] @ np.linalg.solve(C[7], left[7]))
         held.append(np.abs(left) < 1.96 * spread(found))
@@ -113,8 +129,8 @@ def test_the_volume_between_the_targets_follows_from_the_axes(machine, errors):
     q = grid(errors["axes_low"].values, errors["axes_high"].values, (4, 3, 3))
     volume = volumetric_errors(errors, q)
     datasets.validate(volume)
-    measured, both = machine.target_grid(), np.concatenate([machine.target_grid(), q])
-    truth = vectors(machine.truth_multilateration(both))
+    measured, both = simulation.target_grid(machine), np.concatenate([simulation.target_grid(machine), q])
+    truth = vectors(simulation.true_errors(machine, both))
     # The truth of both sets, brought into the datum of the measured one.
     place = both + errors.attrs["functional_point"]
     shift = _motion(place[: len(measured)], truth[: len(measured)], place)
@@ -210,11 +226,11 @@ def test_scales_are_brought_to_20_degrees(raw, errors):
 
 
 def test_drift_during_the_set_ups_is_taken_off(machine):
-    q = machine.target_grid((4, 4, 3))
+    q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[::3]])
     rate = np.array([(2e-8, 0, 0, 0), (0, 6e-8, 0, 0), (0, 0, 0, -6e-8), (3e-8, 0, 0, 0)])
-    truth = vectors(machine.truth_multilateration(q))
-    raw = machine.raw_multilateration(q, seed=5, drift=rate)
+    truth = vectors(simulation.true_errors(machine, q))
+    raw = simulation.raw(machine, q, seed=5, drift=rate)
     found = Multilateration().identify(raw)
     left = vectors(found) - truth
     assert np.mean(np.abs(left) < 1.96 * spread(found)) > 0.85
@@ -225,10 +241,10 @@ def test_drift_during_the_set_ups_is_taken_off(machine):
 
 
 def test_repeatability_of_the_machine_is_noise_where_set_ups_follow_one_another(machine):
-    raw = machine.raw_multilateration(seed=6, repeatability=2e-6)
+    raw = simulation.raw(machine, seed=6, repeatability=2e-6)
     stated = Multilateration().identify(raw, Settings(repeatability="2 um"))
     raised = Multilateration().identify(raw)
-    truth = vectors(machine.truth_multilateration(machine.target_grid()))
+    truth = vectors(simulation.true_errors(machine, simulation.target_grid(machine)))
     for found in (stated, raised):
         assert np.mean(np.abs(vectors(found) - truth) < 1.96 * spread(found)) > 0.88
     assert "times as much as stated" in notes(raised)
@@ -239,11 +255,11 @@ def test_repeatability_of_the_machine_is_noise_where_set_ups_follow_one_another(
 
 
 def _returning(machine, seed, true, returns=6, **told):
-    q = machine.target_grid((4, 4, 3))
+    q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[:: 48 // returns][:returns]])
-    raw = machine.raw_multilateration(q, seed=seed, repeatability=true)
+    raw = simulation.raw(machine, q, seed=seed, repeatability=true)
     left = Multilateration().identify(raw, Settings(parametric=False, **told))
-    return left, vectors(left) - vectors(machine.truth_multilateration(q))
+    return left, vectors(left) - vectors(simulation.true_errors(machine, q))
 
 
 def test_returns_tell_the_repeatability_and_the_intervals_hold():
@@ -291,14 +307,14 @@ def test_a_stated_repeatability_is_weighed_against_returns_by_its_uncertainty(ma
 
 
 def test_where_all_stations_read_at_once_repeatability_moves_the_target_itself(machine):
-    q = machine.target_grid((4, 4, 3))
+    q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[::4]])
-    truth, d = vectors(machine.truth_multilateration(q)), []
-    raw = machine.raw_multilateration(q, seed=13)
+    truth, d = vectors(simulation.true_errors(machine, q)), []
+    raw = simulation.raw(machine, q, seed=13)
     rng = np.random.default_rng(1)
-    U = machine.tracker_places()
+    U = simulation.stations(machine)
     moved = 2e-6 * rng.normal(size=(len(q), 3))
-    way = machine.reflector_places(q) - U[:, None]
+    way = simulation.reflector_positions(machine, q) - U[:, None]
     d = np.einsum("jta,ta->jt", way / np.linalg.norm(way, axis=2)[..., None], moved)
     raw["displacement"] = (raw["displacement"] + d).assign_attrs(units="m")
     found = Multilateration().identify(raw, Settings(together=True, parametric=False))
@@ -343,7 +359,7 @@ def test_millimetres_for_metres_are_told(raw):
 
 
 def test_one_distance_off_by_a_fringe_is_found_where_the_noise_allows(machine):
-    raw = machine.raw_multilateration(seed=2, station=_five(machine), noise=20e-9)
+    raw = simulation.raw(machine, seed=2, station=_five(machine), noise=20e-9)
     sound = Multilateration().identify(raw)
     raw["displacement"][1, 41] += 633e-9 / 2
     found = Multilateration().identify(raw)
@@ -354,7 +370,7 @@ def test_one_distance_off_by_a_fringe_is_found_where_the_noise_allows(machine):
 
 
 def _five(machine):
-    return np.concatenate([machine.tracker_places(), [(0.4, 0.3, 0.6)]])
+    return np.concatenate([simulation.stations(machine), [(0.4, 0.3, 0.6)]])
 
 
 @pytest.mark.parametrize("moved", [30e-6, 1e-3])
@@ -388,7 +404,7 @@ def test_one_reading_in_millimetres_is_left_out_and_a_station_in_millimetres_is_
 
 
 def test_a_fringe_among_four_stations_gives_the_target_up_and_spoils_no_other(machine):
-    raw = machine.raw_multilateration(seed=2, noise=20e-9)
+    raw = simulation.raw(machine, seed=2, noise=20e-9)
     sound = Multilateration().identify(raw, Settings(parametric=False))
     raw["displacement"][1, 41] += 633e-9 / 2
     found = Multilateration().identify(raw, Settings(parametric=False))
@@ -398,7 +414,7 @@ def test_a_fringe_among_four_stations_gives_the_target_up_and_spoils_no_other(ma
 
 
 def test_fringes_lost_for_good_look_like_a_station_that_moved(machine):
-    raw = machine.raw_multilateration(seed=2, station=_five(machine), noise=20e-9)
+    raw = simulation.raw(machine, seed=2, station=_five(machine), noise=20e-9)
     raw["displacement"][1, 41:] += 633e-9 / 2
     with pytest.raises(MethodError, match="station S2 stood elsewhere from target T042 on"):
         Multilateration().identify(raw, Settings(parametric=False))
@@ -469,9 +485,9 @@ def test_a_station_without_readings_is_named(raw):
 
 
 def test_a_target_in_one_plane_with_its_stations_does_not_spoil_the_others(machine):
-    station = machine.tracker_places()
+    station = simulation.stations(machine)
     station[:3, 2] = -0.011  # the height of the lowest reflectors
-    raw = machine.raw_multilateration(seed=4, station=station)
+    raw = simulation.raw(machine, seed=4, station=station)
     raw["displacement"][3, 40] = np.nan  # T041 is among them
     assert raw["target_nominal"].values[40, 2] == pytest.approx(-0.011)
     found = Multilateration().identify(raw)

@@ -7,6 +7,7 @@ from numpy.polynomial.legendre import leggauss
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import cross_matrix, move
+from errormotion.methods.multilateration import simulation
 from errormotion.methods.multilateration.identification.parameters import fit_machine
 from errormotion.twin import VirtualMachine
 
@@ -17,7 +18,7 @@ NOISE = 0.3e-6
 def targets(seed, count=(6, 6, 5), noise=NOISE, reflectors=(REFLECTOR,), kind="cframe"):
     """Return machine, axis positions, reflectors, and errors with their covariances."""
     machine = VirtualMachine(kind, seed=seed)
-    q = np.concatenate([machine.target_grid(count)] * len(reflectors))
+    q = np.concatenate([simulation.target_grid(machine, count)] * len(reflectors))
     at = np.repeat(np.array(reflectors), len(q) // len(reflectors), axis=0)
     twist = machine.geometry.twist(q)
     error = twist[:, :3] + np.cross(twist[:, 3:], at)

@@ -5,7 +5,7 @@ import pytest
 
 from errormotion import datasets
 from errormotion.errors import DatasetError
-from errormotion.methods.multilateration import Multilateration, Settings
+from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.methods.multilateration.identification import assembly, uncertainty
 from errormotion.methods.multilateration.identification.uncertainty import Scatter, responses
 from errormotion.methods.multilateration.network.solver import solve
@@ -15,8 +15,8 @@ from errormotion.twin import VirtualMachine
 @pytest.fixture(scope="module")
 def raw():
     machine = VirtualMachine("cframe", seed=3)
-    q = machine.target_grid((4, 4, 3))
-    return machine.raw_multilateration(np.concatenate([q, q[::4]]), seed=1, missing=0.04, repeatability=1e-6)
+    q = simulation.target_grid(machine, (4, 4, 3))
+    return simulation.raw(machine, np.concatenate([q, q[::4]]), seed=1, missing=0.04, repeatability=1e-6)
 
 
 def test_blocks_make_no_difference(raw, monkeypatch):

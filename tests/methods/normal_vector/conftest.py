@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from errormotion.kinematics.iso import DOF
+from errormotion.methods.normal_vector import simulation
 from errormotion.twin import Event, VirtualMachine
 
 #: The cold cycle takes two minutes; then the spindle starts.
@@ -20,7 +21,7 @@ def probed() -> Callable[..., tuple[VirtualMachine, xr.Dataset]]:
     def make(kind: str = "gantry", seed: int = 1, cycles: int = 7, **options) -> tuple[VirtualMachine, xr.Dataset]:
         machine = VirtualMachine(kind, seed=seed)
         machine.start([Event(time=CYCLE, spindle_speed=SPEED)])
-        raw = machine.raw_normal_vector(600.0 * np.arange(cycles), **({"seed": seed, "cycle": CYCLE} | options))
+        raw = simulation.raw(machine, 600.0 * np.arange(cycles), **({"seed": seed, "cycle": CYCLE} | options))
         return machine, raw
 
     return make

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, Settings, simulation
 
 METHOD = NormalVector()
 
@@ -105,7 +105,7 @@ def test_cold_cycle_in_which_all_is_wrong_is_refused(probed):
 def test_touches_that_are_missing_make_no_ball_move(probed, off, draw):
     """A cycle that shows next to nothing of a ball along an axis accuses it of no shift of millimetres along it."""
     machine, raw = probed("cframe", seed=1)
-    raw = machine.raw_normal_vector(raw["time"].values, seed=draw, cycle=120.0, missing=0.2)
+    raw = simulation.raw(machine, raw["time"].values, seed=draw, cycle=120.0, missing=0.2)
     errors = METHOD.identify(raw)
     assert not moves(errors)
     assert np.isfinite(errors["EX"].values).all()

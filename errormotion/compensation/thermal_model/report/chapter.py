@@ -7,10 +7,10 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.crossbeam_scan.report.view import remarks
 from errormotion.report import budget, provenance, quality, sensors, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
+from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
 from errormotion.report.text import fixed, integer, listed, percent
 

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.compensation.thermal_model.report import chapter as thermal_model
-from errormotion.methods.crossbeam_scan.report.view import remarks
 from errormotion.report import canvas, provenance, sensors, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
@@ -28,6 +27,7 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
+from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
 from errormotion.report.text import DASH, fixed, integer, listed, significant
 

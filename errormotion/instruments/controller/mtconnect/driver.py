@@ -22,7 +22,7 @@ from errormotion.instruments.controller.mtconnect.codec import (
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports.http.client import HttpTransport
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 OUT_OF_RANGE = "OUT_OF_RANGE"
 _MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
@@ -80,6 +80,13 @@ class MTConnect(Driver):
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
     settings: MTConnectSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        # Faults of observations do not affect the state, in which an alarm is a word.
+        harmless = ("split", "overrun", "jump", "restart", "alarm")
+        return InstrumentSubject(cls, "sim://cframe/mtconnect", harmless=harmless)
 
     def __init__(self, address: str, settings: MTConnectSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)

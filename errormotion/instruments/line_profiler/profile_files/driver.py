@@ -16,7 +16,7 @@ import numpy as np
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.line_profiler.profile_files.readers import READERS, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Profiles, Scan
 
 FORMAT = "errormotion-scans/1"
@@ -43,6 +43,13 @@ class ProfileFiles:
         status="simulated_only",
     )
     Settings: ClassVar[type[ProfileFileSettings]] = ProfileFileSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        from errormotion.instruments.line_profiler.profile_files.conformance import scan_file
+
+        return InstrumentSubject(cls, str(scan_file()))
 
     def __init__(
         self, address: str, settings: ProfileFileSettings | None = None, *, record: Path | None = None

@@ -295,7 +295,7 @@ class Motion(SampleClock):
     def warm_time(self, times: ArrayLike) -> Array:
         """Return how long the axes have been warming up at times of the world's clock, s; 0 before they started.
 
-        This is the time for which the gantry's `truth_crossbeam` reports the errors. It starts with the first move of
+        This is the time on which the thermal errors of the gantry's crossbeam depend. It starts with the first move of
         a program that warms up (`Path.warm_up`) and then counts on.
         """
         times = np.asarray(times, dtype=float)

@@ -18,7 +18,7 @@ from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Contact, Identity, InstrumentInfo, Touch
+from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _LINE_END = b"\n"
 _LONGEST = 1024
@@ -56,6 +56,13 @@ class Dprnt(Driver):
     )
     Settings: ClassVar[type[DprntSettings]] = DprntSettings
     settings: DprntSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(
+            cls, "sim://cframe/printer", faults=()
+        )  # they show in lines, and no program prints any
 
     def __init__(self, address: str, settings: DprntSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)

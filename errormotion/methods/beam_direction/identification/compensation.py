@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from errormotion.datasets.calibrations.inclination import InclinationCalibration
 
-    Array = Array
 
 CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
 """What all planes share: the first two where the inclination error is compensated, the last one where it is not."""

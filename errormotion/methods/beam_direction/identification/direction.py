@@ -32,7 +32,6 @@ from errormotion.methods.beam_direction.identification.slopes import gradient_co
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Array = Array
 
 GRAZING = 10.0
 """Largest gradient: the beam meets the plane at 6 degrees, and a micrometre across it is ten along the beam."""

@@ -22,7 +22,6 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.direction import Direction
 
-    Array = Array
 
 INDEPENDENT = 0.02
 """Least singular value of the normals, over the root of their number, at which they fix a point."""

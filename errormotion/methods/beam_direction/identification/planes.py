@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy.special import gammaincinv, ndtri
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
@@ -31,7 +31,6 @@ from errormotion.methods.beam_direction.identification.slopes import UNKNOWNS, P
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 
@@ -151,6 +150,10 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     )
 
 
+def _chi2_quantile(p: float, degrees: int) -> float:
+    return 2.0 * float(gammaincinv(degrees / 2, p))
+
+
 def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, notes: list[str]) -> float:
     """Return by how much the stated noise is raised; note outliers, other scatter than stated, and correlation."""
     for name, fit in zip(data.names, fits, strict=True):
@@ -163,7 +166,7 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
         return 1.0
     chi2 = float(sum(w @ w for w in used))
     factor = 1.0
-    low, high = (float(stats.chi2.ppf(p, freedom)) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
+    low, high = (_chi2_quantile(p, freedom) for p in (FALSE_ALARM, 1 - FALSE_ALARM))
     times = float(np.sqrt(chi2 / freedom))
     if chi2 > high:
         raised = settings.noise == "auto"
@@ -174,7 +177,7 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
         notes.append(f"The readings scatter only {times:.3g} times as much as stated; the stated noise was kept.")
     pairs = sum(float(w[1:] @ w[:-1]) for w in used) / (chi2 / sum(len(w) for w in used) or 1.0)
     count = sum(len(w) - 1 for w in used)
-    if pairs / np.sqrt(count) > stats.norm.ppf(1 - FALSE_ALARM):
+    if pairs / np.sqrt(count) > ndtri(1 - FALSE_ALARM):
         notes.append(
             f"Residuals of neighbouring readings resemble each other (correlation {pairs / count:.2f}), so the "
             "uncertainties are too small: speckle that is not stated (speckle, speckle_length), a plane that is not "
@@ -189,7 +192,7 @@ def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: 
     if freedom < 1:
         return 1.0
     chi2 = closure_chi2(found)
-    if chi2 <= stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if chi2 <= _chi2_quantile(1 - FALSE_ALARM, freedom):
         return 1.0
     times = float(np.sqrt(chi2 / freedom))
     cause = (
@@ -244,7 +247,7 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
         notes.append("No plane_point_uncertainty in the data: the known points of the planes were taken as exact.")
     if not np.isfinite(data.nominal_origin).all():
         notes.append("No nominal_origin in the data: the zero point is in beam_origin, its error is unknown.")
-    if known > 3 and origin.chi2 > stats.chi2.ppf(1 - FALSE_ALARM, known - 3):
+    if known > 3 and origin.chi2 > _chi2_quantile(1 - FALSE_ALARM, known - 3):
         worst = int(np.nanargmax(np.abs(origin.misfit)))
         notes.append(
             f"The known points of the planes contradict one another: chi-square {origin.chi2:.4g} with {known - 3} "

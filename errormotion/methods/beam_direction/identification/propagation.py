@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.compensation import Settled
     from errormotion.methods.beam_direction.identification.origin import Origin
 
-    Array = Array
-
 
 @dataclass(frozen=True)
 class Propagated:

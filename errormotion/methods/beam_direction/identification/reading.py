@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 LOST = 0.3
 """Largest share of a plane's readings that may be missing."""

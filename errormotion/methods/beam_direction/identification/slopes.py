@@ -20,7 +20,6 @@ from errormotion.errors import MethodError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
     Mask = NDArray[np.bool_]
 
 UNKNOWNS = 4

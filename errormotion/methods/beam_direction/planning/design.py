@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 LEAST_READINGS = 3
 """A stroke has so many readings at least, so that it shows whether it is straight."""

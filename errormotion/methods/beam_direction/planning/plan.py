@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.settings import Settings
     from errormotion.plugins import Method
 
-    Array = Array
 
 PAPER = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
 """Two faces turned by 90 deg, the widest of the pairs in table 1 of Lu et al.; the inclination is not printed there."""

@@ -15,9 +15,9 @@ from errormotion.arrays import Array
 from errormotion.kinematics.beams import across
 from errormotion.methods.beam_direction.report.drawings import number, round_down
 from errormotion.methods.beam_direction.report.view import STROKES
-from errormotion.methods.crossbeam_scan.report.view import field
 from errormotion.report import canvas
 from errormotion.report.document import Block, Cell, Figure, Source, Table, Text, estimate, or_dash
+from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer
 
 _DRAWN = 0.25  # of the radius: how far the largest residual is drawn from the circle

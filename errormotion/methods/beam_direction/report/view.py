@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import field
+from errormotion.report.fields import field
 
 STROKES = "XYZ"
 _BEYOND = 2  # in `left_out`: out of range

@@ -1,13 +1,17 @@
-"""Report chapters: a campaign of crossbeam scans, and the pose of the profiler."""
+"""Report chapters and figures of merit: a campaign of crossbeam scans, and the pose of the profiler."""
 
 from __future__ import annotations
 
-from errormotion.methods.crossbeam_scan.report import chapter, pose, view
-from errormotion.report.document import Part, Source
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from errormotion.report.document import Part, Source
 
 
 def chapters(source: Source) -> list[Part]:
     """Return the chapter of a campaign or of a profiler pose; none for other results."""
+    from errormotion.methods.crossbeam_scan.report import chapter, pose, view
+
     if view.is_campaign(source.errors):
         return [chapter.part(source, source.key)]
-    return [pose.part(source, source.key)] if pose.is_pose(source.errors) else []
+    return [pose.part(source, source.key)] if view.is_pose(source.errors) else []

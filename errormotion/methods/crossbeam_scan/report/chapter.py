@@ -12,21 +12,12 @@ from errormotion.methods.crossbeam_scan.report import drawings as crossbeam_figu
 from errormotion.methods.crossbeam_scan.report import quality as crossbeam_quality
 from errormotion.methods.crossbeam_scan.report import registration as crossbeam_registration
 from errormotion.methods.crossbeam_scan.report import setup_drawing as crossbeam_setup
-from errormotion.methods.crossbeam_scan.report.view import (
-    Campaign,
-    after,
-    at_y,
-    campaign,
-    is_campaign,
-    millimetres,
-    unit_of,
-)
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y, campaign, millimetres
 from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
+from errormotion.report.fields import unit_of
 from errormotion.report.text import decimals_of, fixed, integer, listed
-
-__all__ = ["is_campaign", "part"]
 
 _INDEPENDENT = "noise of the warm scan, independent from scan to scan"
 

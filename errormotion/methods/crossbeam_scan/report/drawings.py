@@ -14,11 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import Campaign, after, field, millimetres, unit_of
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, millimetres
 from errormotion.report import canvas
 from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Figure
+from errormotion.report.fields import field, unit_of
 from errormotion.report.text import finite, fixed
 
 _MOST = 10  # curves in one panel

@@ -9,9 +9,9 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import field, remarks
 from errormotion.report import provenance, quality
 from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, estimate
+from errormotion.report.fields import field, remarks
 from errormotion.report.text import fixed, integer
 
 #: Parameter of the pose: its name, what it is; mrad for angles and mm for shifts.
@@ -24,11 +24,6 @@ PARAMETERS = {
     "dz": "shift in z, lift included",
 }
 CONVENTION = "T · Rx(a) · Ry(b) · Rz(g)"
-
-
-def is_pose(errors: xr.Dataset) -> bool:
-    """Return whether a dataset is the pose of a profiler."""
-    return errors.attrs.get("method") == "crossbeam_scan" and "profiler_pose" in errors and "beam" in errors.dims
 
 
 def part(source: Source, _key: str) -> Part:

@@ -7,18 +7,10 @@ import math
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import (
-    NO_REASON,
-    Campaign,
-    after,
-    at_y,
-    field,
-    remarks,
-    trimmed,
-    unit_of,
-)
+from errormotion.methods.crossbeam_scan.report.view import NO_REASON, Campaign, after, at_y, trimmed
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Table, Text, estimate, or_dash
+from errormotion.report.fields import field, remarks, unit_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, significant
 
 _MOST = 240  # rows of single registrations; of more, each cycle is one row

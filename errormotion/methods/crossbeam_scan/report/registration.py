@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y, field
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y
 from errormotion.report import canvas
 from errormotion.report import maps as crossbeam_maps
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Figure, Text
+from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer, significant
 
 _WRONG = 10  # times its standard uncertainty: how wrong a pose is taken to be, to see what that does to the residual

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +11,21 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import iso_names
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.text import SECOND_OF_ARC, UM, fixed
+from errormotion.report.fields import field
+from errormotion.report.text import fixed
 
 AXES = ("time", "position")
 NO_REASON = "no value, and the result states no reason"
-_ABSENT = ("missing", "no scan", "not scanned", "not recorded", "no line")
 
 
 def is_campaign(errors: xr.Dataset) -> bool:
     """Return whether a dataset is the result of a campaign of crossbeam scans, and not of a step before it."""
     return errors.attrs.get("method") == "crossbeam_scan" and set(AXES) <= set(errors["EX"].dims)
+
+
+def is_pose(errors: xr.Dataset) -> bool:
+    """Return whether a dataset is the pose of a profiler."""
+    return errors.attrs.get("method") == "crossbeam_scan" and "profiler_pose" in errors and "beam" in errors.dims
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,10 @@ class Campaign:
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """Where there was no scan to register, (t, p)."""
-        holes: NDArray[np.bool_] = ~self.known
-        if "scan_time" in self.errors:
-            taken = np.isfinite(field(self.errors, "scan_time", *AXES))
-            if taken.any():
-                return np.asarray(holes & ~taken)
-        said = np.array([[any(word in text.lower() for word in _ABSENT) for text in row] for row in self.reason])
-        return np.asarray(holes & said.reshape(holes.shape))
+        """Where there was no scan to register, (t, p); nowhere if the dataset does not state scan times."""
+        if "scan_time" not in self.errors:
+            return np.zeros_like(self.known)
+        return np.asarray(~self.known & ~np.isfinite(field(self.errors, "scan_time", *AXES)))
 
     def get(self, name: str, *dims: str) -> Array:
         """Return a variable over (time, position, and these dims); all NaN where the dataset does not hold it."""
@@ -117,11 +116,6 @@ class Campaign:
     def where(self, cycle: int, artefact: int) -> str:
         """Return place and time of one registration in words."""
         return f"{at_y(self.position[artefact])}, {after(self.time[cycle])}"
-
-
-def field(errors: xr.Dataset, name: str, *dims: str) -> Array:
-    """Return a variable as floats in the order of these dims."""
-    return np.asarray(errors[name].transpose(*dims).values, dtype=float)
 
 
 def campaign(errors: xr.Dataset) -> Campaign:
@@ -158,11 +152,6 @@ def _reasons(errors: xr.Dataset, values: Array) -> NDArray[np.str_]:
     return np.where(holes, np.array(text, dtype=str).reshape(holes.shape), "")
 
 
-def unit_of(freedom: int) -> tuple[str, float]:
-    """Return the field unit of a freedom by its index, and its size in SI."""
-    return UM if freedom < 3 else SECOND_OF_ARC
-
-
 def millimetres(position: float) -> str:
     """Return a position in mm, with decimals where it has any."""
     return trimmed(fixed(1e3 * position, 3))
@@ -181,16 +170,3 @@ def after(seconds: float) -> str:
 def trimmed(number: str) -> str:
     """Return a number without zeros behind its decimal point."""
     return number.rstrip("0").rstrip(".") if "." in number else number
-
-
-def remarks(errors: xr.Dataset) -> list[str]:
-    """Return the method's own sentences; they are kept as a JSON list."""
-    found = errors.attrs.get("notes", [])
-    if isinstance(found, str):
-        try:
-            found = json.loads(found)
-        except ValueError:
-            found = [found]
-    if isinstance(found, str) or not isinstance(found, Sequence | np.ndarray):
-        found = [found]
-    return [str(note) for note in found if str(note).strip() and not isinstance(note, Mapping)]

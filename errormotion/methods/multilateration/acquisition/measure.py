@@ -20,7 +20,9 @@ from errormotion.arrays import Array
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.acquisition.scales import Scales
+from errormotion.methods.multilateration.names import station_names, target_names
 from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.plugins import PluginSettings
 
 if TYPE_CHECKING:
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
 
     Array = Array
 
-SCHEMA = "errormotion.raw.multilateration/1"
 NO_VALUE = "no value"
 _AIR = ("air_temperature", "air_pressure", "relative_humidity", "refractive_index")
 _UNITS = {"displacement": "m", "reading_time": "s", **dict(zip(_AIR, ("degC", "Pa", "1", "1"), strict=True))}
@@ -171,7 +172,7 @@ class Stand:
         self.position = np.concatenate([position, position[again]])
         self.target = np.concatenate([target, target[again]])
         self.station = np.array(settings.layout.stations, np.float64)
-        self.names = layout.station_names(len(self.station))
+        self.names = station_names(len(self.station))
         wanted = measuring.sequence or tuple(range(1, len(self.station) + 1))
         if strange := [k for k in wanted if not 1 <= k <= len(self.station)]:
             raise MethodError(f"expected numbers of stations from 1 to {len(self.station)}; found {strange}")
@@ -285,7 +286,7 @@ class Stand:
             attrs["chain"] = self.settings.chain
         coords = {
             "station": [self.names[number]],
-            "target": layout.target_names(size),
+            "target": target_names(size),
             "direction": list("xyz"),
         }
         return xr.Dataset(variables, coords, attrs)

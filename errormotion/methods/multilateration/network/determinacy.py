@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 
 LOOSE = 0.05
@@ -107,37 +106,18 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     )
 
 
-@compiled()
 def _freedoms(
     information: Array, basis: Array, place: Array, target: Array
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:  # pragma: no cover - compiled
-    """Return eigenvalues of the information, its diagonal made 1; what a deviation of each does, how far, and if loose.
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return eigenvalues of the information with its diagonal made 1, and for each the motion by one deviation.
 
-    How far is that of places and dead paths.
+    Also the size of the motion (positions and dead paths), and whether it is loose.
     """
-    distance = 0.0
-    for k in range(3):
-        middle = np.mean(target[:, k])
-        distance += np.mean((place[:, k] - middle) ** 2)
-    far = LOOSE * np.sqrt(distance)
-    p = len(information)
-    scale, scaled = np.empty(p), np.empty((p, p))
-    for i in range(p):
-        scale[i] = 1.0 / np.sqrt(max(information[i, i], _NOTHING * np.trace(information)))
-    for i in range(p):
-        for j in range(p):
-            scaled[i, j] = information[i, j] * scale[i] * scale[j]
-    values, vectors = np.linalg.eigh(scaled)
-    factor = np.empty((p, p))
-    for j in range(p):
-        size = 1.0 / np.sqrt(max(values[j], _NOTHING * values[-1]))
-        for i in range(p):
-            factor[i, j] = scale[i] * vectors[i, j] * size
-    motions, sigma = basis @ factor, np.zeros(p)
-    for j in range(p):
-        for i in range(4 * len(place)):
-            sigma[j] += motions[i, j] ** 2
-    sigma = np.sqrt(sigma)
+    far = LOOSE * np.sqrt(np.mean((place - target.mean(axis=0)) ** 2, axis=0).sum())
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _NOTHING * np.trace(information)))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    motions = basis @ (scale[:, None] * vectors / np.sqrt(np.maximum(values, _NOTHING * values[-1])))
+    sigma = np.linalg.norm(motions[: 4 * len(place)], axis=0)
     return values, motions, sigma, (values < DIGITS * values[-1]) | (sigma > far)
 
 

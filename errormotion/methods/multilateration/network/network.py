@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.network import determinacy, outliers
-from errormotion.methods.multilateration.network.kernels.examination import datum_sums, examine, residuals
+from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
 
@@ -128,7 +128,9 @@ class Network:
     datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
 
     def _reckoned_datum(self) -> Datum:
-        GG, GDG, GF = datum_sums(self.weight, self.station, self.extra, self.target, self.carries, self.centre)
+        GG, GDG, GF = loops(len(self.target)).datum_sums(
+            self.weight, self.station, self.extra, self.target, self.carries, self.centre
+        )
         H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
         return Datum(self.centre, self.factor, H @ GF @ self.factor, H, H @ GDG @ H)
 
@@ -157,7 +159,7 @@ class Network:
         shows its whole error.
         """
         s = self.stations
-        return residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
+        return loops(len(self.target)).residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
@@ -174,7 +176,7 @@ class Network:
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
-        return examine(
+        return loops(len(self.target)).examine(
             self.weight, self.station, self.extra, self.target, self.carries,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.general import screen_targets
+from errormotion.methods.multilateration.network.loops import COMPILED_FROM, loops
 from errormotion.methods.multilateration.network.model import directions
 
 if TYPE_CHECKING:
@@ -87,10 +87,10 @@ def _least_gate(checks: int) -> float:
 
 
 def _clean(network: Network) -> bool:
-    """Whether no reading is above the lowest gate there is, with noise as it was stated."""
-    if len(network.station) != 4 or len(network.extra):
+    """Whether no reading is above the lowest gate there is, with noise as it was stated: a quick look at large ones."""
+    if len(network.target) < COMPILED_FROM or len(network.station) != 4 or len(network.extra):
         return False
-    checks, worst = screen_targets(
+    checks, worst = loops(len(network.target)).screen_targets(
         network.reading, network.weight, network.station, network.dead_path, np.ascontiguousarray(network.target.T),
         network.factor, _WEAK,
     )  # fmt: skip

@@ -14,6 +14,7 @@ from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification.refraction import index_uncertainty, sensitivities
 from errormotion.methods.multilateration.identification.uncertainty import Scatter
+from errormotion.methods.multilateration.names import station_names, target_names
 from errormotion.methods.multilateration.network.model import motions
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
@@ -99,8 +100,8 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
         dims=("target",),
         coords={
             **coords,
-            "target": layout.target_names(len(target)),
-            "station": layout.station_names(len(own)),
+            "target": target_names(len(target)),
+            "station": station_names(len(own)),
             "direction": list("xyz"),
             "setup": list(SETUPS),
         },

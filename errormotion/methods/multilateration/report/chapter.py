@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.crossbeam_scan.report.view import remarks
 from errormotion.methods.multilateration.report import axes as multilateration_axes
 from errormotion.methods.multilateration.report import drawings as multilateration_figures
 from errormotion.methods.multilateration.report import plan as multilateration_plan
@@ -16,6 +15,7 @@ from errormotion.methods.multilateration.report import quality as multilateratio
 from errormotion.methods.multilateration.report.view import Network, is_multilateration, network, scalar
 from errormotion.report import budget, provenance
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
+from errormotion.report.fields import remarks
 from errormotion.report.text import DASH, finite, fixed, integer, significant
 
 __all__ = ["is_multilateration", "part"]

@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.report.view import AXES, Network, enlargement, thinned
+from errormotion.methods.multilateration.report.view import AXES, Network, thinned
 from errormotion.report import canvas
 from errormotion.report.document import Block, Figure, Text
 from errormotion.report.text import finite, fixed, integer, listed, significant
-from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
+from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
 _VECTORS, _SIGHTS, _ELLIPSOIDS = 400, 60, 150
 _ARROW = 0.12  # longest arrow, share of the diagonal of the volume

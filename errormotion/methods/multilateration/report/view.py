@@ -148,14 +148,6 @@ def _names(errors: xr.Dataset, dim: str, size: int) -> list[str]:
     return [str(i + 1) for i in range(size)]
 
 
-def enlargement(longest: float, wanted: float) -> int:
-    """Return 1, 2 or 5 times a power of ten that draws a length at most as long as wanted; 1 at least."""
-    if not (math.isfinite(longest) and longest > 0 and math.isfinite(wanted) and wanted > longest):
-        return 1
-    power = 10 ** math.floor(math.log10(wanted / longest))
-    return int(max(step * power for step in (1, 2, 5) if step * power <= wanted / longest))
-
-
 def thinned(indices: NDArray[np.intp], most: int, always: int | None = None) -> NDArray[np.intp]:
     """Return at most so many of the indices, drawn by chance, with one that is always among them."""
     # By chance and not by a step: no row or layer falls out whole.

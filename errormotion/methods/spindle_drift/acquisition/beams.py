@@ -15,17 +15,15 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.kinematics.beams import across
-from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS, SCHEMA
+from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
-from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from errormotion.methods.spindle_drift.settings import Settings
-
-    Array = Array
 
 
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:

@@ -17,7 +17,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench, Samples
 
 if TYPE_CHECKING:
@@ -27,11 +27,9 @@ if TYPE_CHECKING:
 
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 
-SCHEMA = "errormotion.raw.spindle_drift/1"
 HAND_OVER_SECONDS = 0.4
 """A chunk is handed over at least this often, so that a crash loses little."""
 HAND_OVER_SAMPLES = 1 << 18

@@ -16,7 +16,6 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 _ARCSEC = np.degrees(1.0) * 3600.0
 

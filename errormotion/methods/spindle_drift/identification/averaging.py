@@ -1,8 +1,7 @@
-"""Averages of fixed length over records of any length, at the speed of memory.
+"""Averages of fixed length over records of any length.
 
-A drift record is billions of samples that become one mean every half second. The kernels here add up in double
-precision and turn back to a window only where its sum shows that a NaN is in it; the loops around them hand out slices,
-so that a record larger than memory passes through in constant space.
+A drift record is billions of samples that become one mean every half second. It is read in slices, so that a record
+larger than memory needs constant space. Large slices are added up by `averaging_kernels`, small ones by numpy.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numba
 import numpy as np
 import xarray as xr
+from xarray.indexes import RangeIndex
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -21,73 +20,17 @@ from errormotion.errors import MethodError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Reassociation lets the compiler add in vectors; NaN keeps its meaning, since the kernels test for it.
-_FAST = {"reassoc", "contract", "nsz", "arcp"}
 _SLICE_BYTES = 32 << 20
-# A last window that is shorter is left out: run-out does not average away in a part of it.
+"""Size of the slices in which a record is read."""
+_COMPILED_SIZE = 1 << 22
+"""Values from which on the compiled sums are faster, the time to load them included."""
 _LEAST_WINDOW = 0.5
+"""Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
-@numba.njit(cache=True, nogil=True, fastmath=_FAST)
-def _valid_sum(x: NDArray[Any], start: int, end: int, step: int) -> tuple[float, int]:  # pragma: no cover - compiled
-    """Sum and count what is not NaN."""
-    total, valid = 0.0, 0
-    for i in range(start, end, step):
-        if not np.isnan(x[i]):
-            total += np.float64(x[i])
-            valid += 1
-    return total, valid
-
-
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def _sum_rows(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
-) -> None:  # pragma: no cover - compiled
-    """Sum ``x`` (channel, sample) between consecutive ``edges``."""
-    channels, windows = sums.shape
-    for job in numba.prange(channels * windows):
-        channel, window = job // windows, job % windows
-        row = x[channel, edges[window] : edges[window + 1]]
-        total, valid = 0.0, row.size
-        for i in range(row.size):
-            total += np.float64(row[i])
-        if np.isnan(total):
-            total, valid = _valid_sum(row, 0, row.size, 1)
-        sums[channel, window] = total
-        counts[channel, window] = valid
-
-
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_FAST)
-def _sum_columns(
-    x: NDArray[Any], edges: NDArray[np.int64], sums: Array, counts: NDArray[np.int64]
-) -> None:  # pragma: no cover - compiled
-    """Sum ``x`` (sample, channel) between consecutive ``edges``.
-
-    The samples are taken as one long row in pieces of 16 samples, so that every lane of a vector keeps its channel.
-    """
-    channels, windows = sums.shape
-    piece = 16 * channels
-    flat = x.reshape(x.size)
-    for window in numba.prange(windows):
-        total = np.zeros(piece)
-        begin, end = edges[window] * channels, edges[window + 1] * channels
-        whole = begin + (end - begin) // piece * piece
-        pieces = flat[begin:whole].reshape(-1, piece)
-        for k in range(pieces.shape[0]):
-            for i in range(piece):
-                total[i] += np.float64(pieces[k, i])
-        for i in range(end - whole):
-            total[i] += np.float64(flat[whole + i])
-        for channel in range(channels):
-            sums[channel, window] = total[channel::channels].sum()
-            counts[channel, window] = edges[window + 1] - edges[window]
-            if np.isnan(sums[channel, window]):
-                kept, valid = _valid_sum(flat, begin + channel, end, channels)
-                sums[channel, window] = kept
-                counts[channel, window] = valid
-
-
-def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def window_sums(
+    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None
+) -> tuple[Array, NDArray[np.int64]]:
     """Return sums and numbers of the values that are not NaN, between consecutive edges.
 
     Parameters
@@ -96,19 +39,33 @@ def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> 
         In either memory order: the transposed view of a (sample, channel) array is read as it lies.
     edges : ndarray, int64, (window + 1,)
         Sample indices, not decreasing.
+    threads : int, optional
+        Number of threads of the compiled sums; default all cores.
 
     Returns
     -------
     sums, counts : ndarray (channel, window)
     """
-    sums = np.empty((values.shape[0], edges.size - 1))
-    counts = np.empty(sums.shape, np.int64)
     if values.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
         values = values.astype(np.float64)
-    if values.T.flags.c_contiguous and not values.flags.c_contiguous:
-        _sum_columns(values.T, edges, sums, counts)
-    else:
-        _sum_rows(np.ascontiguousarray(values), edges, sums, counts)
+    if values.size < _COMPILED_SIZE:
+        return _small_window_sums(values, edges)
+    from errormotion.methods.spindle_drift.identification import averaging_kernels
+
+    return averaging_kernels.sums(values, edges, threads)
+
+
+def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    valid = ~np.isnan(values)
+    # Numpy adds contiguous rows pairwise, which keeps the rounding error small. Empty windows are not its concern.
+    filled = np.where(valid, values, 0.0).astype(np.float64, order="C")
+    full = np.flatnonzero(np.diff(edges) > 0)
+    sums, counts = np.zeros((len(values), edges.size - 1)), np.zeros((len(values), edges.size - 1), np.int64)
+    if full.size:
+        inside = slice(edges[full[0]], edges[full[-1] + 1])
+        starts = edges[full] - edges[full[0]]
+        sums[:, full] = np.add.reduceat(filled[:, inside], starts, axis=1)
+        counts[:, full] = np.add.reduceat(valid[:, inside], starts, axis=1, dtype=np.int64)
     return sums, counts
 
 
@@ -141,7 +98,8 @@ class Averager:
     further apart than half a window, every sample is a window of its own.
     """
 
-    def __init__(self, channels: int, length: float, minimum: float = 0.5) -> None:
+    def __init__(self, channels: int, length: float, minimum: float = 0.5, threads: int | None = None) -> None:
+        self._threads = threads
         self._length, self._minimum = length, minimum
         self._start = np.nan
         self._own: bool | None = None
@@ -176,7 +134,7 @@ class Averager:
         last = int(np.floor((time[-1] - self._start) / self._length + self._slack))
         bounds = self._start + (np.arange(first + 1, last + 1) - self._slack) * self._length
         edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
-        sums, counts = window_sums(values, edges)
+        sums, counts = window_sums(values, edges, self._threads)
         samples = np.diff(edges)
         # Times are summed relative to the slice's first one: a day in seconds would cost digits.
         moments = np.add.reduceat(time - time[0], np.minimum(edges[:-1], time.size - 1)) * (samples > 0)
@@ -246,9 +204,14 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     chunk = distance.encoding.get("preferred_chunks", {}).get("time", 1)
     if chunk > 1:
         step = max(1, step // chunk) * chunk
+    positions = np.arange(min(step, samples), dtype=np.float64)
     for begin in range(0, samples, step):
         part = raw.isel(time=slice(begin, begin + step))
-        if "time" in raw.variables:
+        clock = part.xindexes.get("time")
+        if isinstance(clock, RangeIndex):  # its own values, without its integers
+            time = positions[: part.sizes["time"]] * clock.step
+            time += clock.start
+        elif "time" in raw.variables:
             time = np.asarray(part["time"].values, np.float64)
         elif "sample_rate" in raw.attrs:
             index = np.arange(begin, min(begin + step, samples))

@@ -16,93 +16,48 @@ Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives our own.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
 
 from errormotion.arrays import Array
-
-if TYPE_CHECKING:
-    Array = Array
 
 SIDE = 4
 """Number of side channels: X1, X2, Y1, Y2 come first, Z last."""
 PARAMETERS = 36
 """Columns of a state Jacobian: five distances, then (origin, direction) of five beams, then the bar radius."""
 MAX_STEPS = 30
-# Newton's method squares the error: what is left after a step s is about s * s / radius, here below 1e-17 m.
 _LAST_STEP = 1e-10
+"""Step at which Newton's method ends, m: the remaining error is about its square by the radius, below 1e-17 m."""
+_SINGULAR = 1e-12
+"""Determinant of the derivatives below which the beams do not determine the axis."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _solve4(m: Array, b: Array) -> bool:  # pragma: no cover - compiled
-    """Solve m x = b in place (x replaces b) by elimination with row exchange; False where m is singular."""
-    for k in range(4):
-        pivot = k
-        for i in range(k + 1, 4):
-            if abs(m[i, k]) > abs(m[pivot, k]):
-                pivot = i
-        if not abs(m[pivot, k]) > 1e-12:
-            return False
-        if pivot != k:
-            for j in range(k, 4):
-                m[k, j], m[pivot, j] = m[pivot, j], m[k, j]
-            b[k], b[pivot] = b[pivot], b[k]
-        inverse = 1.0 / m[k, k]
-        for i in range(k + 1, 4):
-            f = m[i, k] * inverse
-            for j in range(k + 1, 4):
-                m[i, j] -= f * m[k, j]
-            b[i] -= f * b[k]
-    for k in range(3, -1, -1):
-        for j in range(k + 1, 4):
-            b[k] -= m[k, j] * b[j]
-        b[k] /= m[k, k]
-    return True
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _fit(
-    distance: Array, origin: Array, direction: Array, radius: float, z1: float, z2: float, start: Array, q: Array
-) -> None:  # pragma: no cover - compiled
-    instants = distance.shape[1]
+def _fit(distance: Array, origin: Array, direction: Array, radius: float, z1: float, z2: float, start: Array) -> Array:
+    """Return the axes (instant, 4) by Newton's method from ``start``, all instants at the same time."""
     height = z2 - z1
-    chunk = 256
-    for part in numba.prange((instants + chunk - 1) // chunk):
-        m = np.empty((4, 4))
-        g = np.empty(4)
-        x1, y1, x2, y2 = start[0], start[1], start[2], start[3]
-        for t in range(part * chunk, min(instants, (part + 1) * chunk)):
-            done = False
-            for _ in range(MAX_STEPS):
-                ax, ay = (x2 - x1) / height, (y2 - y1) / height
-                norm2 = 1.0 + ax * ax + ay * ay
-                for i in range(4):
-                    d = distance[i, t]
-                    wx = origin[i, 0] + direction[i, 0] * d - x1
-                    wy = origin[i, 1] + direction[i, 1] * d - y1
-                    wz = origin[i, 2] + direction[i, 2] * d - z1
-                    s = (wx * ax + wy * ay + wz) / norm2
-                    nx, ny, nz = wx - s * ax, wy - s * ay, wz - s
-                    length = np.sqrt(nx * nx + ny * ny + nz * nz)
-                    tau = s / height
-                    nx, ny = nx / length, ny / length
-                    m[i, 0], m[i, 1] = (1.0 - tau) * nx, (1.0 - tau) * ny
-                    m[i, 2], m[i, 3] = tau * nx, tau * ny
-                    g[i] = length - radius
-                if not _solve4(m, g):
-                    break
-                x1, y1, x2, y2 = x1 + g[0], y1 + g[1], x2 + g[2], y2 + g[3]
-                step = max(max(abs(g[0]), abs(g[1])), max(abs(g[2]), abs(g[3])))
-                if not step > _LAST_STEP:
-                    done = step == step
-                    break
-            if done:
-                q[t, 0], q[t, 1], q[t, 2], q[t, 3] = x1, y1, x2, y2
-            else:
-                q[t] = np.nan
-                x1, y1, x2, y2 = start[0], start[1], start[2], start[3]
+    found = np.full((distance.shape[1], 4), np.nan)
+    instant = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
+    q = np.tile(start, (instant.size, 1))
+    surface = origin[:SIDE] + direction[:SIDE] * distance[:SIDE, instant].T[:, :, None]  # (instant, beam, 3)
+    for _ in range(MAX_STEPS):
+        slope = (q[:, 2:] - q[:, :2]) / height
+        w = surface - np.concatenate([q[:, :2], np.full((len(q), 1), z1)], axis=1)[:, None]
+        s = ((w[..., :2] * slope[:, None]).sum(axis=2) + w[..., 2]) / (1.0 + (slope**2).sum(axis=1))[:, None]
+        flat = w[..., :2] - s[..., None] * slope[:, None]
+        length = np.sqrt((flat**2).sum(axis=2) + (w[..., 2] - s) ** 2)
+        n, tau = flat / length[..., None], (s / height)[..., None]
+        m = np.concatenate([(1.0 - tau) * n, tau * n], axis=2)
+        regular = np.abs(np.linalg.det(m)) > _SINGULAR
+        step = np.full_like(q, np.nan)
+        step[regular] = np.linalg.solve(m[regular], (length - radius)[regular, :, None])[..., 0]
+        q = q + step
+        size = np.abs(step).max(axis=1)
+        done = size <= _LAST_STEP
+        found[instant[done]] = q[done]
+        going = size > _LAST_STEP  # False for NaN: no cylinder there
+        instant, q, surface = instant[going], q[going], surface[going]
+        if not instant.size:
+            break
+    return found
 
 
 def start_axis(origin: Array, direction: Array, distance: Array, radius: float, levels: Array) -> Array:
@@ -145,24 +100,15 @@ def fit_axis(
     ndarray (instant, 4)
         x and y of the axis at L1, then at L2, m; NaN where a reading is NaN or no cylinder fits.
     """
-    q = np.full((distance.shape[1], 4), np.nan)
+    unknown = np.full((distance.shape[1], 4), np.nan)
     if start is None:
         known = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
         if known.size == 0:
-            return q
+            return unknown
         start = start_axis(origin, direction, distance[:, known[0]], radius, levels)
-    if np.isfinite(start).all():
-        _fit(
-            np.ascontiguousarray(distance),
-            np.ascontiguousarray(origin),
-            np.ascontiguousarray(direction),
-            float(radius),
-            float(levels[0]),
-            float(levels[1]),
-            start,
-            q,
-        )
-    return q
+    if not np.isfinite(start).all():
+        return unknown
+    return _fit(distance, origin, direction, radius, float(levels[0]), float(levels[1]), start)
 
 
 def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:

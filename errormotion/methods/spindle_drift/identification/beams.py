@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -26,7 +25,6 @@ from errormotion.kinematics.beams import across, turned
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
 
 UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""
@@ -231,6 +229,8 @@ def circles_and_line(
         touched = point + crossing(point, u)[:, None] * u
         return np.asarray(np.sum((touched - C) * V, axis=1) / radius)
 
+    from scipy.optimize import least_squares
+
     solution = least_squares(gaps, np.zeros(4), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     point, u = line(solution.x)
     along = crossing(point, u) - np.array(lowest)
@@ -246,6 +246,8 @@ def _arc(s: Array, readings: Array, radius: float) -> tuple[float, float]:
     def misfit(p: Array) -> Array:
         s0, y0, R = p * unit
         return np.asarray((y0 + R - np.sqrt(np.maximum(R * R - (s - s0) ** 2, 0.0)) - readings) * 1e6)
+
+    from scipy.optimize import least_squares
 
     s0, y0, _ = least_squares(misfit, start / unit, xtol=1e-14, ftol=1e-14, gtol=1e-14).x * unit
     return float(s0), float(y0)

@@ -18,7 +18,6 @@ from errormotion.methods.spindle_drift.identification.segmentation import scan_s
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 

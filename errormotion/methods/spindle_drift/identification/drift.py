@@ -11,6 +11,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.hashing import DatasetHasher
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis
@@ -25,9 +26,10 @@ from errormotion.methods.spindle_drift.identification.record import (
     count_unknown,
     noise,
     reference_windows,
+    run_out_at_rest,
     sensors,
+    settling,
 )
-from errormotion.methods.spindle_drift.identification.turning import run_out_at_rest, settling
 from errormotion.methods.spindle_drift.identification.uncertainty import (
     Frame,
     State,
@@ -46,7 +48,6 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.record import Record
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,9 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
-    record = average_record(raw, settings)
+    with DatasetHasher(raw) as hasher:
+        record = average_record(raw, settings, hasher)
+        raw_hash = hasher.value()
     measured, raw = raw, raw.drop_vars("distance").sel(channel=list(CHANNELS))
     averages = record.averages
     count_unknown(averages, notes)
@@ -140,7 +143,11 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         method=method,
         method_version=version,
         provenance=provenance.make(
-            settings, measured, None, steps=["average", "fit bar", "propagate covariance", "ISO 230-3"]
+            settings,
+            measured,
+            None,
+            steps=["average", "fit bar", "propagate covariance", "ISO 230-3"],
+            raw_hash=raw_hash,
         ),
         influence=influence,
         sources=[name for name, _ in names],

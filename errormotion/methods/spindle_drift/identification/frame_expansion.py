@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.identification.uncertainty import State
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 _MOST_KNOTS = 32
 

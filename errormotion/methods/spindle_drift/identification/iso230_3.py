@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from scipy.optimize import minimize_scalar
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift.identification.turning import turns
+from errormotion.methods.spindle_drift.identification.record import turns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    Array = Array
     Index = NDArray[np.int64]
 
 QUANTITIES = ("X1", "X2", "Y1", "Y2", "Z", "A", "B")
@@ -226,5 +224,7 @@ def _time_constant(time: Array, y: Array) -> float:
     best = int(np.argmin([rest(g) for g in grid]))
     if best in (0, grid.size - 1) or total == 0:
         return np.nan
+    from scipy.optimize import minimize_scalar
+
     found = minimize_scalar(rest, bounds=(grid[best - 1], grid[best + 1]), method="bounded")
     return float(np.exp(found.x)) if found.fun < 0.1 * total else np.nan

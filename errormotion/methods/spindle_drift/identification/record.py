@@ -11,19 +11,20 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.averaging import Averager, Averages, join, slices
-from errormotion.methods.spindle_drift.identification.turning import turns
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from errormotion.datasets.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
-    Array = Array
 
 # Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
 _CHANCE = 3.3
 _ENOUGH = 30
+_SAME_SPEED = 0.02
+"""Share of the highest speed within which two speeds count as the same: a measured speed is never quite steady."""
 
 
 @dataclass(frozen=True)
@@ -49,31 +50,39 @@ class Record:
     scatter: Array | None
 
 
-def average_record(raw: xr.Dataset, settings: Settings) -> Record:
-    """Bring a record down to means in one pass and constant memory."""
+def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -> Record:
+    """Average a record in one pass and constant memory; the hasher of ``raw`` takes part in it."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # Put in order after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
-    averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
+    # One thread: the hasher uses the other cores.
+    averager = Averager(len(CHANNELS), settings.average, settings.min_valid, threads=1)
     slow_averagers = {name: Averager(raw[name].sizes.get("sensor", 1), settings.average, minimum=0.0) for name in slow}
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
-    last = -np.inf
+    last, done = -np.inf, 0
     for time, part in slices(raw):
-        if not (np.isfinite(time).all() and (np.diff(time, prepend=last) > 0).all()):
+        increasing = last < time[0] and (time[1:] > time[:-1]).all()
+        if not (increasing and np.isfinite(time[[0, -1]]).all()):
             raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
         last = float(time[-1])
-        readings = _with_time_last(part["distance"])
-        readings = readings if order == [0, 1, 2, 3, 4] else readings[order]
+        read: dict[str, NDArray[Any]] = {}
+        for name in ("distance", *slow):
+            values = np.asarray(part[name].values)
+            hasher.update(name, values, time=slice(done, done + time.size))
+            # The axis is moved after reading: a lazy transposition reads sample by sample.
+            read[name] = np.moveaxis(values, part[name].get_axis_num("time"), -1)
+        done += time.size
+        readings = read["distance"] if order == [0, 1, 2, 3, 4] else read["distance"][order]
         parts.append(averager.update(time, readings))
         for name in slow:
-            values = _with_time_last(part[name]).astype(np.float64)
+            values = read[name].astype(np.float64)
             slow_parts[name].append(slow_averagers[name].update(time, values.reshape(-1, time.size)))
             if name == "spindle_speed" and scatter is None:
                 scatter = _scatter(time, readings, values, settings)
     parts.append(averager.finish())
-    means = {name: join([*done, slow_averagers[name].finish()]).mean for name, done in slow_parts.items()}
+    means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
     return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
 
@@ -89,11 +98,6 @@ def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, set
     if np.isnan(part).all(axis=1).any():
         return None
     return np.asarray(np.nanstd(part, axis=1, ddof=1))
-
-
-def _with_time_last(variable: xr.DataArray) -> NDArray[np.floating[Any]]:
-    """Return the values with time as the last axis; read first, since a lazy transposition reads sample by sample."""
-    return np.moveaxis(np.asarray(variable.values), variable.get_axis_num("time"), -1)
 
 
 def count_unknown(averages: Averages, notes: list[str]) -> None:
@@ -173,3 +177,66 @@ def sensors(raw: xr.Dataset) -> list[str]:
         if "sensor" in raw.coords
         else [f"T{k + 1}" for k in range(raw.sizes.get("sensor", 0))]
     )
+
+
+def turns(speed: Array) -> NDArray[np.bool_]:
+    """Return where a spindle turns, either way round; a speed that is not known (NaN) is the one before it."""
+    known = np.isfinite(speed)
+    if not known.any():
+        return np.zeros(speed.shape, bool)
+    size = np.abs(held(speed))
+    return np.asarray((size > _SAME_SPEED * size.max()) & (size > 0))
+
+
+def held(speed: Array) -> Array:
+    """Return speeds with unknown ones replaced by the last known one, at the beginning by the first."""
+    known = np.isfinite(speed)
+    if not known.any():
+        return np.zeros(speed.shape)
+    place = np.maximum.accumulate(np.where(known, np.arange(speed.size), -1))
+    return np.asarray(speed[np.where(place < 0, int(np.argmax(known)), place)])
+
+
+def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
+    """Return the means that hold a change of speed, or follow one within ``spin_up`` seconds.
+
+    A record that begins with a turning spindle counts as begun by its start. Readings that came as means already
+    (one sample each) are taken as they are.
+    """
+    time, speed = record.averages.time, record.spindle_speed
+    found = np.zeros(time.size, bool)
+    if speed is None or time.size < 2 or record.averages.expected[0] <= 1 or spin_up == 0 or np.ptp(time) <= spin_up:
+        return found
+    steady = held(speed)
+    length = float(np.median(np.diff(time)))
+    for k in np.flatnonzero(np.abs(np.diff(steady, prepend=0.0)) > _SAME_SPEED * np.abs(steady).max()):
+        found |= (time > time[k] - 0.6 * length) & (time < time[k] + spin_up - 1e-6)
+    return found
+
+
+def run_out_at_rest(record: Record, reference: NDArray[np.int64], noise: float) -> list[tuple[str, str, Array]]:
+    """Return, per channel and rest, what stopping anywhere in a turn may do to the errors, as readings (5, instant), m.
+
+    Each rest is one draw. Where the reference state rests, its own draw is in everything outside of that rest. Empty
+    where the spindle always turns, always rests, or its speed is not known.
+    """
+    if record.scatter is None or record.spindle_speed is None:
+        return []
+    rests = ~turns(record.spindle_speed)
+    if rests.all() or not rests.any():
+        return []
+    spread = np.sqrt(np.maximum(record.scatter**2 - noise**2, 0.0))
+    found = []
+    edges = np.flatnonzero(np.diff(rests, prepend=False, append=False)).reshape(-1, 2)
+    for number, (begin, end) in enumerate(edges, start=1):
+        if begin <= reference[0] < end:
+            effect = -np.ones(rests.size)
+            effect[begin:end] = 0.0
+        else:
+            effect = np.zeros(rests.size)
+            effect[begin:end] = 1.0
+        for i in np.flatnonzero(spread > 0):
+            change = np.zeros((len(CHANNELS), rests.size))
+            change[i] = effect * spread[i]
+            found.append((f"run-out {CHANNELS[i]}, rest {number}", "run-out at rest", change))
+    return found

@@ -20,7 +20,6 @@ from errormotion.errors import MethodError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
 
 _TICK = 0.01
 # The moves out and back change the reading by tens of micrometres, noise and single steps by a hundredth of that.

@@ -27,7 +27,6 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Array = Array
 
 _BLOCK = 1024
 

@@ -1,4 +1,4 @@
-"""Logs that a lab already has: columns of text become a raw dataset of ``spindle_drift``."""
+"""Logs of a drift: columns of text become a raw dataset."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets.storage import save
 from errormotion.datasets.text.log_format import TIMESTAMP
 from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
 from errormotion.datasets.tomlfile import load_model
 from errormotion.datasets.units import convert
-from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.log_import.import_map import (
+    MAP_SCHEMA,
     Channel,
     ImportMap,
     SpeedColumn,
@@ -36,42 +35,28 @@ _VARIABLE = {
 }
 
 
-def import_log(log: str | Path, map_file: str | Path, out: str | Path, *, overwrite: bool = False) -> xr.Dataset:
-    """Turn a CSV or TSV log into a raw dataset, and write it.
+def read_log(log: Path, map_file: Path) -> xr.Dataset:
+    """Return the raw dataset of a drift from a log and a map of the schema ``errormotion.map/1``.
 
-    Parameters
-    ----------
-    log : str or Path
-        Text with one line an instant. Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON,
-        key of the map to count).
-    map_file : str or Path
-        TOML; see `errormotion.methods.spindle_drift.log_import.import_map.ImportMap`.
-    out : str or Path
-        ``.nc`` or ``.zarr``.
-    overwrite : bool
-        Replace what is at ``out``.
-
-    Returns
-    -------
-    Dataset
-        Schema ``errormotion.raw.spindle_drift/1``, drift.
+    Empty cells are NaN, and counted in the attribute ``missing_values`` (JSON, key of the map to count).
 
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all complaints at once, each with its line. Nothing is written then.
+        The map or the log is wrong; all mistakes at once, each with its line.
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
-    complaints = Complaints(Path(log))
+    complaints = Complaints(log)
     dates = settings.time.unit == TIMESTAMP
     columns = read_columns(_wanted(settings), "time", settings.format, complaints, dates=dates)
     _check_times(columns, complaints)
     _check_magnitudes(columns, settings, complaints)
     complaints.raise_any()
-    raw = _raw_dataset(columns, settings).assign_attrs(log=Path(log).name, map=Path(map_file).name)
-    validate(raw)
-    save(raw, out, overwrite=overwrite)
-    return raw
+    return _raw_dataset(columns, settings)
+
+
+LOG_READERS = {MAP_SCHEMA: read_log}
+"""Formats of maps that the method reads."""
 
 
 def _wanted(settings: ImportMap) -> dict[str, str | int]:

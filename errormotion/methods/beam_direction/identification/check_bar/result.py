@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.compensation import Sensor
     from errormotion.methods.beam_direction.settings import Settings
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 

@@ -25,9 +25,7 @@ from errormotion.methods.beam_direction.identification.inclination import lines 
 from errormotion.methods.beam_direction.identification.inclination import surface as inclination_surface
 from errormotion.methods.beam_direction.identification.inclination.lines import Lines, MidRange, Readings
 from errormotion.methods.beam_direction.identification.inclination.surface import Surface
-
-SCHEMA = "errormotion.raw.inclination/1"
-"""Schema of the readings."""
+from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA
 
 GAP = 0.6
 """Widest empty circle between calibrated tilts that counts as surrounded, in tilts of the steepest: half a wave of a k
@@ -92,8 +90,10 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
         Readings that cannot be meant, or too few settings.
     """
     settings = settings or Settings()
-    if raw.attrs.get("schema") != SCHEMA:
-        raise MethodError(f"Expected readings of the schema {SCHEMA}; found {raw.attrs.get('schema', 'none')}.")
+    if raw.attrs.get("schema") != INCLINATION_SCHEMA:
+        raise MethodError(
+            f"Expected readings of the schema {INCLINATION_SCHEMA}; found {raw.attrs.get('schema', 'none')}."
+        )
     validate(raw)
     raw = raw.load()
     readings = inclination_lines.read(raw)

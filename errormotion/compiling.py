@@ -1,0 +1,102 @@
+"""Functions that numba compiles when they are first called, and a line on the terminal while that takes time.
+
+A module declares its functions with a `Compiler`:
+
+    compiled = Compiler("the loops for large networks", seconds=20)
+
+    @compiled(fastmath=True)
+    def add(x, y): ...
+
+Nothing is compiled and numba is not imported before the first call. Compiled functions may call one another. What is
+compiled is kept in numba's cache on disk, so that it is compiled once for each installation.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cached_property, update_wrapper
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class Compiler:
+    """A decorator for a group of functions that are compiled: cached on disk, without the interpreter's lock.
+
+    Parameters
+    ----------
+    what : str
+        The group, as the terminal shows it while it is compiled: ``the loops for large networks``.
+    seconds : float
+        Typical time that this takes, s.
+    **options
+        Of ``numba.njit`` for all functions of the group, such as ``error_model="numpy"``.
+    """
+
+    def __init__(self, what: str, seconds: float, **options: Any) -> None:
+        self.what, self.seconds, self.options = what, seconds, options
+        self._reported = False
+
+    def __call__(self, **options: Any) -> Callable[[Function], Function]:
+        """Return the decorator with further options of ``numba.njit``."""
+
+        def declare(function: Function) -> Function:
+            return cast(Function, _Compiled(self, function, {**self.options, **options}))
+
+        return declare
+
+    def report(self) -> None:
+        """Write on the terminal that the group is compiled, once a process; nothing where stderr is no terminal."""
+        if not self._reported and sys.stderr.isatty():
+            print(f"Compiling {self.what}, once: about {self.seconds:g} s", file=sys.stderr, flush=True)
+        self._reported = True
+
+
+class _Compiled:
+    """A function that is compiled at its first call."""
+
+    def __init__(self, compiler: Compiler, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        self._compiler, self._function, self._options = compiler, function, options
+        update_wrapper(self, function)
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """The function as numba sees it."""
+        import numba
+
+        made = numba.njit(cache=True, nogil=True, **self._options)(self._function)
+        _reporters()[made] = self._compiler
+        return made
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Its type where another compiled function calls it."""
+        return self.dispatcher._numba_type_
+
+    def __call__(self, *args: Any) -> Any:
+        return self.dispatcher(*args)
+
+
+_REPORTERS: dict[Any, Compiler] = {}
+
+
+def _reporters() -> dict[Any, Compiler]:
+    """Return the group of each function that numba knows; numba reports to them before it compiles one."""
+    if not _REPORTERS:
+        from numba.core import event
+
+        class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
+            def on_start(self, event: Any) -> None:
+                compiler = _REPORTERS.get(event.data["dispatcher"])
+                if compiler is not None:
+                    compiler.report()
+
+            def on_end(self, event: Any) -> None:
+                """Nothing to report."""
+
+        event.register("numba:compile", Listener())  # type: ignore[no-untyped-call, unused-ignore]
+    return _REPORTERS

@@ -1,0 +1,297 @@
+"""What an error dataset must be.
+
+A ballbar, a diagonal or a line of sight shows one number at each position: the deviation ``h . E`` of the six freedoms
+E along a known direction. No freedom follows from it alone, so all six are unknown; the deviation and its sensitivity h
+hold all that was measured.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets.checks import (
+    dims as dims_text,
+)
+from errormotion.datasets.checks import (
+    label_violations,
+    magnitude_violations,
+    number,
+    storable_violations,
+    time_violations,
+    unit_violations,
+)
+from errormotion.datasets.schemas import (
+    COMPONENTS,
+    DOF,
+    ERROR_ATTRIBUTES,
+    ERROR_DIMS,
+    ERROR_ROWS,
+    ERROR_UNITS,
+    SCHEMA,
+    SIGN,
+    Row,
+)
+
+ROUNDING = 1e-8
+"""Rounding of a 6x6 covariance relative to its diagonal, after moves over some metres and back."""
+
+FARTHEST = 50.0
+"""Largest plausible coordinate of a functional point, m; one beyond is written in mm."""
+
+UNIT_LENGTH = 1e-6
+"""Tolerance of the length of a unit vector."""
+
+_DEVIATION = ("deviation", "deviation_variance", "sensitivity", "deviation_influence")
+_ROWS = {row.name: row for row in ERROR_ROWS}
+
+
+def error_violations(ds: xr.Dataset) -> list[str]:
+    """Return every violation of the error schema, one sentence each."""
+    found = [*_attribute_violations(ds), *storable_violations(ds)]
+    missing = [name for name in DOF if name not in ds.data_vars]
+    if missing:
+        return [*found, f"{' '.join(missing)}: missing; expected all of {' '.join(DOF)}, NaN where not seen"]
+    dims = ds["EX"].dims
+    found += _dim_violations(ds, dims)
+    complaints = []
+    for name, unit in zip(DOF, ERROR_UNITS, strict=True):
+        variable = ds.variables[name]
+        if variable.dims != dims:
+            complaints.append(f"{name}: expected the dims of EX {dims_text(ds.variables['EX'])}; found {variable.dims}")
+        if variable.attrs.get("units") is None:
+            complaints.append(f"{name}: expected the attribute units = '{unit}'; found none")
+        complaints += magnitude_violations(name, variable, _ROWS[name])
+    found += complaints + _coordinate_violations(ds)
+    shape_complaints = _shape_violations(ds, dims)
+    found += shape_complaints
+    if not complaints and not shape_complaints:
+        found += _covariance_violations(ds)
+        found += _deviation_violations(ds, dims)
+    return found
+
+
+def _attribute_violations(ds: xr.Dataset) -> list[str]:
+    found = []
+    for name, meaning in ERROR_ATTRIBUTES.items():
+        value = ds.attrs.get(name)
+        if value is None:
+            found.append(f"attribute '{name}': missing; expected {meaning}")
+        elif name == "functional_point":
+            found += _point_violations(value)
+        elif not isinstance(value, str) or not value.strip():
+            found.append(f"attribute '{name}': expected {meaning}; found {value!r}")
+        elif name == "sign" and value != SIGN:
+            found.append(f"attribute 'sign': expected '{SIGN}'; found '{value}'. Turn the values and set it")
+        elif name == "schema" and value != SCHEMA:
+            found.append(f"attribute 'schema': expected '{SCHEMA}'; found '{value}'")
+        elif name == "component" and value not in COMPONENTS and not str(ds.attrs.get("component_description", "")):
+            found.append(
+                f"attribute 'component': expected one of {', '.join(COMPONENTS)}; found '{value}'. Describe another "
+                "one in the attribute 'component_description'"
+            )
+        elif name == "provenance" and not _is_json_object(value):
+            found.append("attribute 'provenance': expected a JSON object; found other text")
+    return found
+
+
+def _point_violations(value: Any) -> list[str]:
+    try:
+        point = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        return [f"attribute 'functional_point': expected three finite coordinates in m; found {value!r}"]
+    if np.abs(point).max() > FARTHEST:
+        far = number(float(point[np.argmax(np.abs(point))]))
+        return [f"attribute 'functional_point': {far} m: expected within {FARTHEST:g} m; is it in mm?"]
+    return []
+
+
+def _is_json_object(text: str) -> bool:
+    try:
+        return isinstance(json.loads(text), dict)
+    except ValueError:
+        return False
+
+
+def _coordinate_violations(ds: xr.Dataset) -> list[str]:
+    found = []
+    if "time" in ds.sizes:
+        if "time" not in ds.variables:
+            found.append("time: missing; expected seconds since the reference state")
+        else:
+            found += unit_violations("time", ds.variables["time"].attrs, "s")
+            found += time_violations("time", ds.variables["time"])
+    for name in ("x", "y", "z"):
+        if name in ds.variables:
+            if not set(ds.variables[name].dims) <= {"position", "target"}:
+                found.append(f"{name}: expected dims position or target; found {dims_text(ds.variables[name])}")
+            found += magnitude_violations(name, ds.variables[name], _ROWS[name])
+    if "temperature" in ds.coords and "sensor" in ds["temperature"].dims:
+        row = Row("temperature", ("...", "sensor"), "degC", -60.0, 200.0, "")
+        found += magnitude_violations("temperature", ds.variables["temperature"], row)
+    return found
+
+
+def _shape_violations(ds: xr.Dataset, dims: tuple[Any, ...]) -> list[str]:
+    found = []
+    for dim in ("dof", "dof_"):
+        if dim in ds.sizes:
+            found += label_violations(ds, dim, DOF)
+    expected = {"covariance": (*dims, "dof", "dof_"), "influence": ("source", *dims, "dof")}
+    for name, names in expected.items():
+        if name not in ds.variables:
+            if name == "covariance":
+                found.append(f"covariance({', '.join(names)}): missing; expected the total covariance")
+            continue
+        variable = ds.variables[name]
+        if variable.dims != names:
+            found.append(f"{name}: expected dims ({', '.join(names)}); found {dims_text(variable)}")
+        elif variable.dtype.kind != "f":
+            found.append(f"{name}: expected float64; found {variable.dtype}")
+    if {"influence", "deviation_influence"} & set(ds.variables):
+        for name in ("source", "source_group"):
+            if name not in ds.variables or ds.variables[name].dims != ("source",):
+                found.append(f"{name}(source): missing; expected a text for each source")
+    return found
+
+
+def _covariance_violations(ds: xr.Dataset) -> list[str]:
+    """Return what is wrong with covariance and influence; vectorised over all places."""
+    unseen = np.stack([np.isnan(ds.variables[name].values) for name in DOF], axis=-1).reshape(-1, 6)
+    C = np.asarray(ds.variables["covariance"].values, dtype=float).reshape(-1, 6, 6)
+    unknown = unseen[:, :, None] | unseen[:, None, :]
+    found = []
+    if not np.array_equal(np.isnan(C), unknown):
+        found.append(_pattern("covariance", np.isnan(C) != unknown))
+    if np.isinf(C).any():
+        found.append("covariance: expected finite numbers; found an infinite one")
+    if found:
+        return found
+    C = np.where(unknown, 0.0, C)
+    variance = np.diagonal(C, axis1=1, axis2=2)
+    if (variance < 0).any():
+        name = DOF[int(np.argwhere(variance < 0)[0, 1])]
+        return [f"covariance: expected variances of 0 or more; found {number(float(variance.min()))} of {name}"]
+    scale = np.sqrt(variance)
+    scale = np.where(scale == 0, 1.0, scale)
+    correlation = C / scale[:, :, None] / scale[:, None, :]
+    if np.abs(correlation - np.swapaxes(correlation, 1, 2)).max(initial=0.0) > ROUNDING:
+        return ["covariance: expected symmetric matrices; found one that is not"]
+    if not _is_positive(correlation):
+        return ["covariance: expected no negative variance in any direction (positive semidefinite); found one"]
+    if "influence" in ds.variables:
+        found += _influence_violations(ds, unseen, correlation, scale)
+    return found
+
+
+def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
+    F = np.asarray(ds.variables["influence"].values, dtype=float)
+    F = F.reshape(F.shape[0], -1, 6)
+    if not np.array_equal(np.isnan(F), np.broadcast_to(unseen, F.shape)):
+        return [_pattern("influence", np.isnan(F) != unseen)]
+    F = np.where(unseen, 0.0, F) / scale
+    shared = np.einsum("spi,spj->pij", F, F, optimize=True)
+    excess = np.diagonal(shared - correlation, axis1=1, axis2=2)
+    if excess.max(initial=0.0) > ROUNDING:
+        name = DOF[int(np.argwhere(excess == excess.max())[0, 1])]
+        return [
+            f"influence: expected squares that sum to no more than the variance; for {name} they exceed it by "
+            f"{number(100 * float(excess.max()))} %"
+        ]
+    if not _is_positive(correlation - shared):
+        return ["influence: expected the covariance less the influences to be a covariance; found one that is not"]
+    return []
+
+
+def _pattern(name: str, wrong: NDArray[np.bool_]) -> str:
+    names = sorted({DOF[k] for k in np.argwhere(wrong)[:, -1]}, key=DOF.index)
+    return f"{name}: expected NaN exactly where the value is NaN; not so for {' '.join(names)}"
+
+
+def _is_positive(matrices: Array) -> bool:
+    """Whether no eigenvalue is below rounding; by Cholesky first, which is fast and mostly enough."""
+    try:
+        np.linalg.cholesky(matrices + ROUNDING * np.eye(6))
+    except np.linalg.LinAlgError:
+        return bool(np.linalg.eigvalsh(matrices).min(initial=0.0) >= -ROUNDING)
+    return True
+
+
+def _dim_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
+    """Return what is wrong with the dimensions of the errors beyond the usual ones: each needs a coordinate."""
+    found = []
+    for dim in (str(dim) for dim in dims if dim not in ERROR_DIMS):
+        if dim not in ds.coords or not str(ds.coords[dim].attrs.get("long_name", "")).strip():
+            found.append(
+                f"EX: expected dims from {', '.join(ERROR_DIMS)}, or declared by a coordinate of the same name with "
+                f"the attribute long_name; found {dim}"
+            )
+            continue
+        values = ds.coords[dim].values
+        if values.dtype.kind in "iuf":
+            if not ds.coords[dim].attrs.get("units"):
+                found.append(f"{dim}: expected the attribute units; found none")
+            if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
+                found.append(f"{dim}: expected finite values that increase")
+        elif len(set(values.tolist())) < values.size:
+            found.append(f"{dim}: expected labels that differ; found one twice")
+    return found
+
+
+def _deviation_violations(ds: xr.Dataset, dims: tuple[Hashable, ...]) -> list[str]:
+    """Return what is wrong with `deviation` and what belongs to it; nothing where the dataset has none of them.
+
+    Parameters
+    ----------
+    dims : tuple
+        Of the errors.
+    """
+    present = [name for name in _DEVIATION if name in ds.variables]
+    if not present:
+        return []
+    missing = [name for name in _DEVIATION[:3] if name not in ds.variables]
+    if missing:
+        return [f"{' '.join(missing)}: missing beside {present[0]}"]
+    found = []
+    for name in present:
+        variable = ds.variables[name]
+        expected = {"deviation_influence": ("source", *dims)}.get(name, dims)
+        if name == "sensitivity":
+            if variable.dims[-1:] != ("dof",) or not set(variable.dims[:-1]) <= set(dims):
+                found.append(f"sensitivity: expected dims of deviation, and dof; found {dims_text(variable)}")
+        elif variable.dims != expected:
+            found.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {dims_text(variable)}")
+        found += magnitude_violations(name, variable, _ROWS[name])
+    return found or _value_violations(ds)
+
+
+def _value_violations(ds: xr.Dataset) -> list[str]:
+    found = []
+    unknown = np.isnan(ds.variables["deviation"].values)
+    known_freedoms = [name for name in DOF if np.isfinite(ds.variables[name].values).any()]
+    if known_freedoms:
+        found.append(f"{' '.join(known_freedoms)}: expected NaN beside deviation, which is their combination")
+    for name in ("deviation_variance", "deviation_influence"):
+        if name in ds.variables:
+            gaps = np.isnan(ds.variables[name].values)
+            if not np.array_equal(gaps, np.broadcast_to(unknown, gaps.shape)):
+                found.append(f"{name}: expected NaN exactly where deviation is NaN")
+    length = np.linalg.norm(ds.variables["sensitivity"].values[..., :3], axis=-1)
+    if not (np.abs(length - 1) <= UNIT_LENGTH).all():
+        worst = float(length.ravel()[np.argmax(np.abs(length.ravel() - 1))])
+        found.append(f"sensitivity: expected a unit vector for EX EY EZ; found one of length {number(worst)}")
+    if found or "deviation_influence" not in ds.variables:
+        return found
+    shared = (ds.variables["deviation_influence"].values ** 2).sum(axis=0)
+    total = ds.variables["deviation_variance"].values
+    if (shared > total * (1 + ROUNDING)).any():
+        found.append("deviation_influence: expected squares that sum to no more than deviation_variance")
+    return found

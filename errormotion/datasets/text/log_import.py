@@ -1,0 +1,252 @@
+"""Logs with a map for any raw schema: columns of text become a raw dataset."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets.schemas import RawSchema, Row, variants
+from errormotion.datasets.text.csv_text import Table
+from errormotion.datasets.text.log_format import TIMESTAMP
+from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
+from errormotion.datasets.text.log_reader import Complaints, columns_of, seconds, top_lines
+from errormotion.datasets.text.table_reader import (
+    NUMBER,
+    Column,
+    Found,
+    Names,
+    converted,
+    incomplete,
+    plausible,
+    read_table,
+    unit_vectors,
+    units_of,
+)
+from errormotion.datasets.tomlfile import load_model, nearest
+from errormotion.datasets.units import convert
+from errormotion.errors import DatasetError
+
+
+def read_log(log: Path, map_file: Path) -> xr.Dataset:
+    """Return the raw dataset of a log with a map whose schema is a raw schema.
+
+    Raises
+    ------
+    DatasetError
+        The map or the log is wrong; all mistakes at once.
+    """
+    settings = load_model(map_file, LogMap)
+    mistakes = Complaints(map_file)
+    names = Names.of(_tables(settings, mistakes), _free_labels(settings))
+    columns = {key: _column(key, entry, names, mistakes) for key, entry in settings.columns.items()}
+    dims = {dim for row in names.rows.values() for dim in names.record_dims(row)}
+    for dim in settings.labels:
+        if dim not in dims:
+            mistakes.add(0, f"labels.{dim}: unknown dimension; {nearest(dim, dims)}")
+    found = Found()
+    for name, value in settings.values.items():
+        _read_value(name, value, settings, log, names, found, mistakes)
+    mistakes.raise_any()
+    known = {key: column for key, column in columns.items() if column is not None}
+    complaints = Complaints(log)
+    table, start = _table(settings, complaints)
+    for part, columns_of_part, keys in _parts(table, known, settings, names, complaints):
+        for text in incomplete(columns_of_part, keys, names):
+            complaints.add(0, text)
+        if not complaints.count:
+            read_table(part, columns_of_part, keys, names, found, complaints)
+    complaints.raise_any()
+    stated = {"machine": settings.machine, "start": start}
+    attrs = {**settings.attributes, **{name: text for name, text in stated.items() if text}}
+    return found.dataset({"schema": settings.schema_, **attrs}, names)
+
+
+def _tables(settings: LogMap, mistakes: Complaints) -> Sequence[RawSchema]:
+    tables = variants(settings.schema_)
+    if not settings.variant:
+        return tables
+    chosen = [table for table in tables if table.variant == settings.variant]
+    if not chosen:
+        mistakes.add(0, f"variant: unknown; {nearest(settings.variant, (table.variant for table in tables))}")
+    return chosen or tables
+
+
+def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
+    """Return the labels of the last dimension of variables whose components the map names, such as sensors."""
+    rows_of = {row.name: row for table in reversed(variants(settings.schema_)) for row in table.rows}
+    found: dict[str, tuple[str, ...]] = {}
+    for key in settings.columns:
+        name, dot, label = key.partition(".")
+        if dot and name in rows_of and rows_of[name].dims:
+            dim = rows_of[name].dims[-1]
+            found[dim] = (*(each for each in found.get(dim, ()) if each != label), label)
+    return found
+
+
+def _column(key: str, entry: MappedColumn, names: Names, mistakes: Complaints) -> Column | None:
+    """Return a column of the map with its variable; None and a mistake where there is no such variable."""
+    name, dot, label = key.partition(".")
+    row = names.rows.get(name)
+    if row is None:
+        mistakes.add(0, f"columns.{key}: unknown variable; {nearest(name, names.rows)}")
+        return None
+    dim = names.component_dim(row)
+    labels = names.labels[dim] if dim else ()
+    if (dim is None) == bool(dot) or (dot and label not in labels):
+        expected = " ".join(f"columns.{name}.{each}" for each in labels) or f"columns.{name}"
+        mistakes.add(0, f"columns.{key}: expected {expected}")
+        return None
+    unit = row.unit if entry.unit == TIMESTAMP and row.unit == "s" else entry.unit
+    where = f"columns.{key}"
+    if converted(np.ones(1), unit, row, f"{where}.unit", 0, mistakes) is None:
+        return None
+    offset = _quantity(entry.offset, row, f"{where}.offset", mistakes) if entry.offset else 0.0
+    component = labels.index(label) if dot else None
+    return Column(row, component, unit, entry.scale, offset, component is None or row.missing)
+
+
+def _quantity(text: str, row: Row, where: str, mistakes: Complaints) -> float:
+    """Return a difference with its unit in the unit of a variable."""
+    number, _, unit = text.strip().partition(" ")
+    try:
+        zero, value = (float(convert(each, unit.strip(), row.unit or "1")) for each in (0.0, float(number)))
+    except (DatasetError, ValueError):
+        mistakes.add(0, f"{where}: expected a number and a unit of the kind of {row.unit or '1'}; found '{text}'")
+        return 0.0
+    return value - zero
+
+
+def _read_value(
+    name: str, entry: MappedValue, settings: LogMap, log: Path, names: Names, found: Found, mistakes: Complaints
+) -> None:
+    """Read a variable that the map states, or that it names in the first lines of the log."""
+    row, where = names.rows.get(name), f"values.{name}"
+    if row is None:
+        mistakes.add(0, f"{where}: unknown variable; {nearest(name, names.rows)}")
+        return
+    stated = entry.value if not entry.key else _header_text(log, entry.key, settings)
+    if stated is None:
+        mistakes.add(0, f"{where}: no line with '{entry.key}' and a value at the top of {log.name}")
+        return
+    parsed = _numbers(stated, entry.unit)
+    if parsed is None or parsed[0].ndim != len(row.dims):
+        kind = f"an array with the dims ({', '.join(row.dims)})" if row.dims else "one number"
+        mistakes.add(0, f"{where}: expected {kind}; found {stated!r}")
+        return
+    numbers, unit = parsed
+    for dim, size in zip(row.dims, numbers.shape, strict=True):
+        expected = names.sizes.get(dim, len(names.labels.get(dim, ())) or size)
+        if size != expected:
+            mistakes.add(0, f"{where}: expected {expected} along {dim}; found {size}")
+            return
+    inside = converted(numbers, unit, row, where, 0, mistakes)
+    if inside is not None and plausible(inside.ravel(), np.zeros(inside.size, np.int64), row, where, unit, mistakes):
+        values = unit_vectors(inside, row, np.zeros(1, np.int64), mistakes) if row.dims else inside
+        found.variables[name] = xr.Variable(row.dims, values, units_of(row))
+
+
+def _numbers(stated: Any, unit: str) -> tuple[Array, str] | None:
+    """Return numbers and their unit from numbers, texts such as '5 mm', and arrays of them; None for anything else."""
+    units: set[str] = set()
+
+    def number(value: Any) -> Any:
+        if isinstance(value, list):
+            return [number(each) for each in value]
+        if isinstance(value, str):
+            words = value.split()
+            count = next((k for k, word in enumerate(words) if not NUMBER.fullmatch(word)), len(words))
+            units.add(" ".join(words[count:]) or unit)
+            figures = [float(word) for word in words[:count]]
+            return figures[0] if len(figures) == 1 else figures
+        units.add(unit)
+        return None if isinstance(value, bool) else value
+
+    try:
+        values = np.array(number(stated), dtype=float)
+    except (TypeError, ValueError):
+        return None
+    return (values, units.pop()) if len(units) == 1 and values.size and np.isfinite(values).all() else None
+
+
+def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
+    """Return the text behind a key in the first lines of a log."""
+    for line in top_lines(log, settings.format):
+        match = re.fullmatch(rf"\W*{re.escape(key)}\"?\s*[:=;,\t ]\s*(.+)", line.strip())
+        if match:
+            text = match[1].strip('";, \t')
+            return text.replace(",", ".") if settings.format.decimal == "," else text
+    return None
+
+
+def _table(settings: LogMap, complaints: Complaints) -> tuple[Table, str]:
+    """Return the wanted columns of a log as a table with points as decimal signs, and its first date."""
+    form = settings.format
+    wanted = {f"labels.{dim}": column for dim, column in settings.labels.items()}
+    wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
+    dated = {f"columns.{key}" for key, entry in settings.columns.items() if entry.unit == TIMESTAMP}
+    (line, titles), lines, places = columns_of(wanted, form, complaints)
+    start: datetime | None = None
+    cells = []
+    for number, row in lines:
+        if len(row) != len(titles):
+            complaints.add(number, f"expected {len(titles)} fields; found {len(row)}")
+            continue
+        texts = []
+        for key, place in places.items():
+            text = row[place].strip()
+            if text in form.missing:
+                text = ""
+            elif key in dated and text:
+                start, value = seconds(text, start, f"column '{titles[place]}'", number, complaints)
+                text = repr(value)
+            elif form.decimal == "," and key.startswith("columns") and "." not in text:
+                text = text.replace(",", ".")
+            texts.append(text)
+        cells.append((number, texts))
+    heads = [titles[place] if form.header else str(place + 1) for place in places.values()]
+    return Table((line, heads), cells), start.isoformat() if start else ""
+
+
+def _parts(
+    table: Table, columns: Mapping[str, Column], settings: LogMap, names: Names, complaints: Complaints
+) -> Iterator[tuple[Table, dict[int, Column], dict[str, int]]]:
+    """Yield the table once for each set of dimensions, with the columns of its variables and the label columns.
+
+    Variables with fewer dimensions than others repeat their values from line to line; one line of each is kept.
+    """
+    first = len(settings.labels)
+    keys = {dim: number for number, dim in enumerate(settings.labels)}
+    groups: dict[tuple[str, ...], dict[int, Column]] = {}
+    for number, key in enumerate(settings.columns, start=first):
+        record = names.record_dims(columns[key].row)
+        groups.setdefault(record, {})[number] = columns[key]
+    widest = max(groups, key=len)
+    for record, group in groups.items():
+        own = {dim: number for dim, number in keys.items() if dim in record}
+        repeats = record != widest and set(record) <= set(keys) and bool(record)
+        part = _without_repetition(table, list(own.values()), list(group), complaints) if repeats else table
+        yield part, group, own
+    for dim in set(keys) - {dim for record in groups for dim in record}:
+        complaints.add(0, f"labels.{dim}: no variable of the map has this dimension")
+
+
+def _without_repetition(table: Table, keys: Sequence[int], values: Sequence[int], complaints: Complaints) -> Table:
+    """Return the first line for each combination of labels; other values in a later line are mistakes."""
+    kept: dict[tuple[str, ...], tuple[int, list[str]]] = {}
+    for line, texts in table.rows:
+        before = kept.setdefault(tuple(texts[number] for number in keys), (line, texts))
+        for number in values:
+            if texts[number] != before[1][number]:
+                complaints.add(
+                    line,
+                    f"column '{table.head[1][number]}': expected {before[1][number] or 'nothing'} as in line "
+                    f"{before[0]}, which has the same labels; found {texts[number] or 'nothing'}",
+                )
+    return Table(table.head, list(kept.values()))

@@ -1,0 +1,48 @@
+"""Simulated campaigns with which the conformance kit examines the method."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from errormotion.methods.crossbeam_scan.method import CrossbeamScan
+from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.simulation import POSITIONS, simulate
+from errormotion.plugins import MethodSubject
+
+NOMINAL_LIFT = -0.17
+"""Nominal height of the profiler in the tool frame, m."""
+
+
+def subjects() -> tuple[MethodSubject, ...]:
+    """Return the two procedures: scans of three artefacts in three cycles, and the pose of the profiler.
+
+    The scans have a quarter of the points of a real profiler at twice their distance. The axis is Y of every frame: the
+    frame of the scans is turned about Y, that of the pocket not at all.
+    """
+    small = {"scan_length": 28e-3, "layout": {"points": 800, "width": 20e-3}}
+    scan = {"positions": POSITIONS, "warm_up": (1800.0, 7200.0)}
+    pose = {"procedure": "profiler_pose", "profiler_pose": {"dz": NOMINAL_LIFT}}
+    return (
+        MethodSubject(
+            CrossbeamScan,
+            partial(simulate, Settings.model_validate(scan | small)),
+            name="scan",
+            settings={"positions": POSITIONS},
+            raw_vectors={"profiler_pose": "pose", "lever": "direction"},
+            optional=("lever_uncertainty",),
+            measured=("height",),
+            motion=((0.0, 0.3, 0.0), (0.0, 0.0, 0.0)),
+            seeds=40,
+        ),
+        MethodSubject(
+            CrossbeamScan,
+            partial(simulate, Settings.model_validate(pose)),
+            name="profiler_pose",
+            settings=pose,
+            raw_vectors={},
+            optional=("pocket_radius_uncertainty",),
+            measured=("height",),
+            motion=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            seeds=40,
+        ),
+    )

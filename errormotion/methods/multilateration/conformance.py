@@ -1,0 +1,37 @@
+"""What the conformance kit examines: one tracker at four stations in turn, 48 targets, some beams broken."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from errormotion.methods.multilateration import simulation
+from errormotion.methods.multilateration.method import Multilateration
+from errormotion.plugins import MethodSubject
+from errormotion.twin import VirtualMachine
+
+TRACKER_SCALE = 0.5e-6
+"""Relative error of the tracker's lengths, one standard deviation."""
+
+
+def subjects() -> tuple[MethodSubject, ...]:
+    """Return the subjects of the kit."""
+    subject = MethodSubject(
+        Multilateration,
+        tracker_readings,
+        settings={"scale_uncertainty": TRACKER_SCALE, "planning": {"minimise": "mean"}},
+        raw_vectors={"target_nominal": "point", "station_nominal": "point", "reflector": "point"},
+        optional=("station_nominal", "reflector", "reading_time"),
+        measured=("displacement",),
+        seeds=100,
+    )
+    return (subject,)
+
+
+def tracker_readings(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return distances of a reflector from four stations, and the true errors less the motion that they do not show."""
+    machine = VirtualMachine("cframe", seed=seed)
+    position = simulation.target_grid(machine, (4, 4, 3))
+    scale = TRACKER_SCALE * np.random.default_rng([seed, 3]).normal()
+    raw = simulation.raw(machine, position, seed=seed, scale=scale, missing=0.02)
+    return raw, simulation.true_errors(machine, position)

@@ -1,0 +1,47 @@
+"""Figures of merit: the errors at the end of a drift and its ISO 230-3 ranges, or the errors of the detected beams."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.datasets.merit import beam_errors, final_errors, is_planned
+from errormotion.plugins import FigureOfMerit
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_RANGES = {
+    "range_60min": "within the first 60 min",
+    "range_running": "to the end of running",
+    "range_total": "over the whole record",
+}
+"""Measures of `iso_value`, in the order of preference."""
+
+
+def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the figures of a drift or of a beam detection; none for a plan.
+
+    The ISO 230-3 range of each quantity is that of the first 60 min. For a shorter record it is the range to the end
+    of running, or over the whole record.
+    """
+    if is_planned(errors):
+        return []
+    return [*beam_errors(errors), *final_errors(errors), *_ranges(errors)]
+
+
+def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
+    if "iso_value" not in errors:
+        return []
+    value, uncertainty = errors["iso_value"], errors["iso_uncertainty"]
+    found = []
+    for quantity in value["quantity"].values:
+        unit = "rad" if quantity in ("A", "B") else "m"
+        for measure, interval in _RANGES.items():
+            size = float(value.sel(quantity=quantity, measure=measure))
+            if np.isfinite(size):
+                u = float(uncertainty.sel(quantity=quantity, measure=measure))
+                found.append(FigureOfMerit(f"d({quantity}) {interval}, range (ISO 230-3)", size, 2.0 * u, unit))
+                break
+    return found

@@ -1,0 +1,89 @@
+"""The point sensor on the stage of the machine, and its targets: a sine gauge on a turntable, and a check bar."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.twin import kernels
+from errormotion.twin.planes import CheckBar, SineGauge, Target, seeded_check_bar
+from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
+
+PIVOT, BAR_POSITION = (0.10, 0.05, 0.12), (-0.10, 0.05, 0.10)
+"""A point on every face of the sine gauge, and a point on the axis of the check bar, m."""
+NOISE, TEXTURE = 1, 2
+"""Keys of the random streams of noise and speckle."""
+
+
+class StageSensor:
+    """A point sensor on the stage.
+
+    Attributes
+    ----------
+    point_sensor : PointSensor
+        A seeded individual. Its nominal beam leans by 20 deg from -Z towards +X.
+    sine_gauge : SineGauge
+        On a turntable.
+    check_bar : CheckBar
+        Along Y.
+    """
+
+    seed: int
+    sensors_on_for: float
+    point_sensor: PointSensor
+    sine_gauge: SineGauge
+    check_bar: CheckBar
+
+    def _set_up_point_sensor(self, rng: np.random.Generator) -> None:
+        """Mount the sensor, and place gauge and bar on the table."""
+        self.point_sensor = seeded_point_sensor(rng)
+        self.sine_gauge = SineGauge(self.seed, np.array(PIVOT))
+        self.check_bar = seeded_check_bar(rng, np.array(BAR_POSITION))
+
+    def home(self, sensor: PointSensor | None = None) -> Array:
+        """Return the place of the stage, m, (3,), at which the nominal beam has the gauge's pivot at mid-range."""
+        sensor = sensor or self.point_sensor
+        return np.asarray(self.sine_gauge.pivot - sensor.nominal_origin - sensor.mid_range * sensor.nominal_direction)
+
+    def point_readings(
+        self,
+        t: ArrayLike,
+        stage: ArrayLike,
+        target: Target,
+        *,
+        sensor: PointSensor | None = None,
+        first: int = 0,
+        key: tuple[int, ...] = (),
+        beyond: bool = False,
+    ) -> Array:
+        """Return what the point sensor reads, with all that is wrong with it.
+
+        Parameters
+        ----------
+        t : (n,)
+            Times of the world's clock, s.
+        stage : (n, 3) or (3,)
+            Where the stage is then, m.
+        target : Plane or CheckBar
+            What it looks at.
+        sensor : PointSensor, optional
+            ``point_sensor`` where not given.
+        first : int
+            Number of the first reading: the same number, the same noise.
+        key : tuple of int
+            Another sensor, another noise; another target, another texture.
+        beyond : bool
+            Whether out of range reads as minus or plus infinity, and not as NaN.
+
+        Returns
+        -------
+        ndarray, (n,)
+            m; NaN out of range, and where the beam misses.
+        """
+        sensor = sensor or self.point_sensor
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        places = np.atleast_2d(np.asarray(stage, dtype=float))
+        still = sensor.still(target, places, beyond=beyond) + sensor.speckles((self.seed, TEXTURE, *key), places)
+        noise = sensor.noise * kernels.normals(kernels.stream_key(self.seed, NOISE, *key), first, times.size)
+        return np.asarray(still + sensor.warm_up_offset(self.sensors_on_for + times) + noise)

@@ -1,0 +1,128 @@
+"""The raw dataset as arrays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballbar_test.path import DIRECTIONS, SENSES, TAU
+from errormotion.errors import MethodError
+
+PLANES = ("XY", "YZ", "ZX")
+REFERENCE_TEMPERATURE = 20.0  # degC
+
+
+@dataclass(frozen=True)
+class Circles:
+    """Readings in the order of ``DIRECTIONS``, (2, run, sample), SI.
+
+    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where it is
+    not given. ``expansion`` is the effect of the bar's temperature on its length, (2, run), ``shared`` that of one
+    standard uncertainty of each source that all readings share.
+    """
+
+    length: np.ndarray
+    angle: np.ndarray
+    time: np.ndarray | None
+    expansion: np.ndarray
+    shared: dict[str, np.ndarray]
+    radius: float
+    feed: float
+    noise: float
+    centre: np.ndarray
+    plane: str
+    axes: np.ndarray
+
+    @property
+    def sense(self):
+        """+1 or -1 at each reading."""
+        return np.broadcast_to(np.array(list(SENSES.values()))[:, None, None], self.length.shape)
+
+
+def read(raw, notes):
+    """Return the readings of a raw dataset that follows its schema.
+
+    Raises
+    ------
+    MethodError
+        Directions of travel, axes or constants that do not fit together.
+    """
+    dims = ("direction_of_travel", "run", "sample")
+    labels = sorted(map(str, raw["direction_of_travel"].values)) if "direction_of_travel" in raw.coords else []
+    if labels != sorted(DIRECTIONS):
+        raise MethodError(f"direction_of_travel: expected the labels CCW and CW; found {', '.join(labels) or 'none'}")
+    sorted_raw = raw.sel(direction_of_travel=list(DIRECTIONS))
+    plane, axes = _plane(raw)
+
+    def over_readings(name):
+        return np.array(sorted_raw[name].transpose(*dims).values, float)
+
+    radius, feed = _positive(raw, "nominal_radius"), _positive(raw, "feed")
+    length, angle = over_readings("length"), over_readings("angle")
+    length[~np.isfinite(angle)] = np.nan
+    time = None
+    if "reading_time" in raw:
+        time = over_readings("reading_time")
+        length[~np.isfinite(time)] = np.nan
+    if not np.isfinite(length).any(axis=(1, 2)).all():
+        raise MethodError("length: expected readings in both directions of travel; found one or both without any")
+    expansion, shared = _temperature(sorted_raw, radius, length.shape[:2], notes)
+    return Circles(
+        length=length,
+        angle=np.mod(angle, TAU),
+        time=time,
+        expansion=expansion,
+        shared={"calibration of the bar": np.full(length.shape[:2], _scalar(raw, "length_uncertainty", 0.0)), **shared},
+        radius=radius,
+        feed=feed,
+        noise=_scalar(raw, "length_noise", np.nan),
+        centre=np.array(_xyz(raw["centre"]), float),
+        plane=plane,
+        axes=axes,
+    )
+
+
+def _plane(raw):
+    names = [str(name) for name in raw["axis"].values] if "axis" in raw.coords else []
+    plane = "".join(names)
+    axes = np.array(_xyz(raw["axis_direction"].transpose("axis", "direction")), float)
+    if plane not in PLANES:
+        raise MethodError(
+            f"axis: expected the two axes of the circle in the order X Y, Y Z or Z X; found {' '.join(names) or 'none'}"
+        )
+    if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-3):
+        raise MethodError("axis_direction: expected two unit vectors at right angles to one another")
+    return plane, axes
+
+
+def _xyz(array):
+    return (array.sel(direction=["x", "y", "z"]) if "direction" in array.coords else array).values
+
+
+def _scalar(raw, name, default):
+    return float(raw[name]) if name in raw else default
+
+
+def _positive(raw, name):
+    value = float(raw[name])
+    if not value > 0:
+        raise MethodError(f"{name}: expected a value above 0; found {value:g}")
+    return value
+
+
+def _temperature(raw, radius, shape, notes):
+    """Return how much longer the bar was than its reading states, (2, run), and the shared uncertainties of that."""
+    if "temperature" not in raw:
+        return np.zeros(shape), {}
+    if "expansion" not in raw:
+        notes.append("The temperature of the bar is not corrected: its expansion coefficient is not given.")
+        return np.zeros(shape), {}
+    excess = raw["temperature"].transpose("direction_of_travel", "run").values - _scalar(
+        raw, "calibration_temperature", REFERENCE_TEMPERATURE
+    )
+    if not np.isfinite(excess).all():
+        raise MethodError("temperature: expected one of the bar for each circle; found NaN. Leave the variable out")
+    coefficient = float(raw["expansion"])
+    return coefficient * radius * excess, {
+        "expansion coefficient of the bar": radius * excess * _scalar(raw, "expansion_uncertainty", 0.0),
+        "temperature of the bar": np.full(shape, coefficient * radius * _scalar(raw, "temperature_uncertainty", 0.0)),
+    }

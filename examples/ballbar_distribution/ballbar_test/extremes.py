@@ -1,0 +1,129 @@
+"""The figures of ISO 230-4, with an uncertainty that allows for the noise in extreme values.
+
+The actual path enters as its radial deviation F(direction of travel, angle), positive outward. The set-up error, which
+is the offset of the centre, is removed by the least-squares circle. The figures follow clause 3 of ISO 230-4:2005:
+
+``G(CCW)``, ``G(CW)``
+    Circular deviation: radial separation of the two circles that enclose the path of one direction of travel,
+    concentric with its least-squares circle.
+``G(b)``
+    Bi-directional circular deviation: the same for both paths together, around their common least-squares circle.
+``H``
+    Circular hysteresis: the largest radial difference between the paths of both directions at one angle.
+``Fmax``, ``Fmin``
+    Radial deviation: the largest and the smallest deviation of the actual paths from the nominal path, whose centre
+    is that of the least-squares circle and whose radius is nominal.
+``D``
+    Mean bi-directional radial deviation: radius of the least-squares circle of both paths, less the nominal radius.
+
+A maximum of noisy values is too large on average: it takes the noise that points outward. How much depends on the shape
+of the path. SIMEX (Cook, Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314) finds it from the path itself. Noise of the
+same size is added once more, which raises a figure from g_0 to g_1 = g_0 + d on average. The bias grows with the
+standard deviation of the noise where the path is flat about its extremes, and with its variance where it is pointed.
+Extrapolated to no noise, this gives::
+
+    flat      g = g_0 - d / (sqrt(2) - 1)
+    pointed   g = g_0 - d
+
+The value is the first, without bias on flat paths. The standard uncertainty combines the standard deviation of the
+figure under noise with the difference of the two, taken as the standard uncertainty of the extrapolation: with that,
+intervals of two standard uncertainties hold the true figure in about 95 % of tests, on flat and on pointed paths.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballbar_test.path import circle, middles
+
+NAMES = ("G(CCW)", "G(CW)", "G(b)", "H", "Fmax", "Fmin", "D")
+MEANINGS = (
+    "circular deviation, counterclockwise",
+    "circular deviation, clockwise",
+    "bi-directional circular deviation",
+    "circular hysteresis",
+    "largest radial deviation",
+    "smallest radial deviation",
+    "mean bi-directional radial deviation",
+)
+POSITIVE = ("G(CCW)", "G(CW)", "G(b)", "H")
+DRAWS = 1000
+FLAT, POINTED = 1 / (np.sqrt(2) - 1), 1.0
+"""Bias of a figure over the difference that as much noise again makes, for the two shapes of a path."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The figures in the order of ``NAMES``, m; ``covariance`` is (7, 7), m^2."""
+
+    value: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def u(self):
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def centred(deviation):
+    """Return paths without the offset of their least-squares circle.
+
+    Parameters
+    ----------
+    deviation : ndarray, (..., path, place)
+        Radial deviations; NaN = unknown, alike in all leading dimensions. All paths have one centre.
+    """
+    *lead, paths, places = deviation.shape
+    flat = deviation.reshape(*lead, paths * places)
+    design = np.tile(circle(middles(places)), (paths, 1))
+    known = np.isfinite(flat.reshape(-1, paths * places)[0])
+    fitted = flat[..., known] @ np.linalg.pinv(design[known]).T
+    return (flat - fitted[..., 1:] @ design[:, 1:].T).reshape(deviation.shape)
+
+
+def evaluate(deviation):
+    """Return the figures (..., 7) of radial deviations (..., 2, place), CCW first, m; without regard to noise."""
+    both = centred(deviation)
+    single = [np.nanmax(path, axis=(-2, -1)) - np.nanmin(path, axis=(-2, -1)) for path in _single(deviation)]
+    top, bottom = np.nanmax(both, axis=(-2, -1)), np.nanmin(both, axis=(-2, -1))
+    hysteresis = np.nanmax(np.abs(both[..., 0, :] - both[..., 1, :]), axis=-1)
+    return np.stack([*single, top - bottom, hysteresis, top, bottom, radius(deviation)], axis=-1)
+
+
+def _single(deviation):
+    return (centred(deviation[..., k : k + 1, :]) for k in range(2))
+
+
+def radius(deviation):
+    """Return the radius of the least-squares circle of both paths, less the nominal one, (...), m."""
+    paths, places = deviation.shape[-2:]
+    flat = deviation.reshape(*deviation.shape[:-2], -1)
+    known = np.isfinite(flat.reshape(-1, paths * places)[0])
+    design = np.tile(circle(middles(places)), (paths, 1))[known]
+    return flat[..., known] @ np.linalg.pinv(design)[0]
+
+
+def figures(deviation, independent, shared):
+    """Return the figures, freed of the bias by noise, with their covariance.
+
+    Parameters
+    ----------
+    deviation : ndarray, (2, place)
+        Radial deviation, CCW first, m; NaN = unknown.
+    independent : ndarray, (2, place)
+        Standard uncertainty by what is new at every place, m.
+    shared : ndarray, (source, 2, place)
+        Effect of one standard uncertainty of each source that all places share, m.
+    """
+    draw = np.random.default_rng(0).standard_normal
+    half = independent * draw((DRAWS // 2, *deviation.shape))
+    half += np.tensordot(draw((DRAWS // 2, len(shared))), shared, axes=1)
+    first = evaluate(deviation)
+    again = evaluate(deviation + np.concatenate([half, -half]))  # in pairs: no bias from the draws themselves
+    d = again.mean(axis=0) - first
+    value = first - FLAT * d
+    covariance = np.cov(again.T)
+    tail = np.abs(np.quantile(again, (0.025, 0.975), axis=0) - again.mean(axis=0)).max(axis=0) / 2
+    skewed = np.maximum(tail**2 - np.diagonal(covariance), 0.0)
+    covariance += np.diag(skewed + ((FLAT - POINTED) * d) ** 2)
+    positive = np.isin(NAMES, POSITIVE)
+    return Figures(np.where(positive, np.maximum(value, 0.0), value), covariance)

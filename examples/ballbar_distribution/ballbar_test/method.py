@@ -1,0 +1,63 @@
+"""The plugin ``ballbar``."""
+
+from ballbar_test.result import figures_of
+from ballbar_test.schema import RAW_SCHEMAS, SCHEMA
+from ballbar_test.settings import Settings
+from errormotion.datasets import validate
+from errormotion.errors import MethodError
+from errormotion.plugins import MethodInfo, Needs, lazy
+
+
+class Ballbar:
+    """Circular test after ISO 230-4 with a telescoping ballbar."""
+
+    info = MethodInfo(
+        id="ballbar",
+        summary="Circular test after ISO 230-4 with a telescoping ballbar",
+        status="simulated_only",
+        version="1",
+        cannot_see=(
+            "errors across the bar: only the radial one of the three displacements is seen",
+            "the position of the circle: its centre is that of the least-squares circle",
+            "arcs: only full circles are centred",
+            "a drift of the bar, where each direction of travel has one circle only",
+        ),
+    )
+    needs = Needs(instruments=(), raw_schema=SCHEMA)
+    Settings = Settings
+    raw_schemas = RAW_SCHEMAS
+    simulate = lazy("ballbar_test.simulation:simulate")
+    chapters = lazy("ballbar_test.report:chapters")
+    conformance = lazy("ballbar_test.conformance:subjects")
+    figures = staticmethod(figures_of)
+
+    def acquire(self, bench, settings, *, inputs, done=None):
+        """Refuse: readings of a ballbar come from the software of its maker, as a CSV file."""
+        raise MethodError(
+            "ballbar does not acquire. Record with the software of the ballbar, write the readings to a CSV file of "
+            f"schema {SCHEMA}, and use 'errormotion identify FILE'."
+        )
+
+    def append_dim(self, settings):
+        """Return ``run``."""
+        return "run"
+
+    def progress(self, settings):
+        """Return the number of circles in each direction of travel."""
+        return float(settings.runs)
+
+    def identify(self, raw, settings=None):
+        """Turn a raw dataset into an error dataset; see ``identification``."""
+        from ballbar_test.identification import identify
+
+        checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
+        if checked.attrs["schema"] != SCHEMA:
+            raise MethodError(f"ballbar reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
+        validate(checked, RAW_SCHEMAS)
+        return identify(checked, settings or Settings(), self.info.id, self.info.version)
+
+    def plan(self, settings=None):
+        """Return zeros with the covariance to expect; see ``identification``."""
+        from ballbar_test.identification import plan
+
+        return plan(settings or Settings(), self.info.id, self.info.version)

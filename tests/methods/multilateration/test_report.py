@@ -1,0 +1,303 @@
+"""The chapter of a multilateration: complete, honest about what is not seen, readable with whatever is missing."""
+
+import re
+from functools import cache
+from html import unescape
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.datasets import build_errors, provenance
+from errormotion.methods.multilateration import Multilateration, simulation
+from errormotion.methods.multilateration.report.view import network, thinned
+from errormotion.report import write_report
+from errormotion.report.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
+from errormotion.twin import VirtualMachine
+
+UM = 1e-6
+WRONG = 320 * UM
+HEADINGS = [
+    "Errors of the volume",
+    "What is not seen",
+    "Stations",
+    "Uncertainty",
+    "Errors of the axes",
+    "Readings",
+    "Provenance",
+]
+
+
+@cache
+def measured():
+    """A real result with its raw data: some readings missing, one wrong by 0.32 mm."""
+    machine = VirtualMachine("cframe", seed=3)
+    raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, missing=0.02)
+    raw["displacement"][1, 20] += WRONG
+    return Multilateration().identify(raw), raw
+
+
+def bare(m=12, **extras):
+    """A result with nothing beyond the errors of targets whose places are not known."""
+    rng = np.random.default_rng(4)
+    values = np.full((m, 6), np.nan)
+    values[:, :3] = 5 * UM * rng.normal(size=(m, 3))
+    covariance = np.full((m, 6, 6), np.nan)
+    covariance[:, :3, :3] = UM**2 * np.eye(3)
+    return build_errors(
+        values,
+        covariance,
+        dims=("target",),
+        coords={},
+        component="tool",
+        machine="C-frame",
+        frame="machine",
+        functional_point=[0, 0, 0],
+        reference="best rigid fit",
+        method="multilateration",
+        method_version="1",
+        provenance=provenance.make({}, None, []),
+        extras={name: xr.DataArray(v, dims=dims) for name, (dims, v) in extras.items()},
+    )
+
+
+def page(errors, tmp_path, **more):
+    return write_report(errors, tmp_path / "r.html", **more).read_text(encoding="utf-8")
+
+
+def words(html):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>", "", html, flags=re.S)))
+
+
+@pytest.fixture(scope="module")
+def html(tmp_path_factory):
+    errors, raw = measured()
+    return page(errors, tmp_path_factory.mktemp("report"), raw=raw)
+
+
+def test_every_section_is_there_in_order(html):
+    places = [html.index(f"<h2>{title}</h2>") for title in HEADINGS]
+    assert places == sorted(places)
+    assert html.count("<figure") == 7
+
+
+def test_page_needs_no_network_and_runs_no_script(html):
+    assert "<script" not in html
+    assert not re.search(r"(?:src|href)=[\"']https?:", html)
+    assert "<image" not in html  # a picture in the picture would not pass the page's own policy
+
+
+def test_numbers_drawn_are_numbers(html):
+    drawn = re.findall(r" (?:d|transform|rx|ry|cx|cy)=['\"]([^'\"]*)['\"]", html)
+    assert drawn
+    assert not [text for text in drawn if re.search(r"nan|inf", text, re.I)]
+
+
+def test_reading_that_was_left_out_is_named_with_how_wrong_it_is(html):
+    found = re.search(r"the others contradict them: S2 to T021 \(\+(\d+\.\d) µm\)\.", words(html))
+    # Three readings are left of that target and place it to some micrometres along the line of sight.
+    assert float(found[1]) == pytest.approx(WRONG / UM, abs=30)
+
+
+def test_reading_that_was_left_out_is_named_without_raw_data_too(tmp_path):
+    assert "the others contradict them: S2 to T021" in words(page(measured()[0], tmp_path))
+
+
+def test_result_stays_as_it_is():
+    errors, raw = measured()
+    before = errors.copy(deep=True)
+    network(errors, raw)
+    xr.testing.assert_identical(errors, before)
+
+
+def test_missing_readings_are_counted_and_the_wrong_one_is_not_among_them(html):
+    lost = int(np.isnan(measured()[1]["displacement"]).sum())
+    assert f"{lost} of 192 readings are missing" in words(html)
+
+
+def test_six_rigid_freedoms_are_said_not_to_be_seen(html):
+    said = words(html)
+    assert "three shifts and three rotations of all targets together" in said
+    assert "rotations of the tool at a target, EA to EC, are unknown and not zero" in said
+
+
+def test_longest_vector_is_that_of_the_data(html):
+    net = network(measured()[0])
+    longest = net.length[net.worst]
+    assert f"which is {longest / UM:.2f} µm at {net.targets[net.worst]}" in words(html)
+
+
+def test_error_motions_that_are_not_seen_are_unknown_with_the_reason(html):
+    assert html.count("not determined</text>") == sum(
+        np.isnan(v.values).all() for name, v in measured()[0].data_vars.items() if re.fullmatch(r"E[XYZABC][XYZ]", name)
+    )
+    assert "EAZ: it moves no reflector" in words(html)
+
+
+def test_rotations_in_the_budget_are_dashes_and_never_zero(html):
+    row = re.search(r"combined, k = 1</th>(.*?)</tr>", html, re.S)[1]
+    assert len(re.findall("<td>—<sup>", row)) == 3
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        ["residual", "influence", "EYY_u", "EA0Z_u"],
+        [
+            "left_out",
+            "redundancy",
+            "dead_path",
+            "dead_path_u",
+            "station_nominal",
+            "EXX",
+            "EXX_u",
+            "EC0Y",
+            "axes_sigma0",
+        ],
+        ["station_place", "station_covariance"],
+        ["target_nominal", "target_place", "noise", "sigma0", "freedom", "iterations", "condition"],
+    ],
+)
+def test_nothing_breaks_when_something_is_missing(tmp_path, lost):
+    html = page(measured()[0].drop_vars(lost), tmp_path, raw=measured()[1])
+    assert [title for title in HEADINGS if f"<h2>{title}</h2>" not in html] == []
+    assert "nan" not in words(html).lower().split()
+
+
+def test_bare_errors_have_a_chapter_that_says_what_is_missing(tmp_path):
+    said = words(page(bare(), tmp_path))
+    for sentence in ("There are no error vectors to draw", "The result holds no stations", "holds no residuals"):
+        assert sentence in said
+
+
+def test_alternating_scheme_is_reported_beside_ours_where_it_was_run(tmp_path):
+    html = words(
+        page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
+    )
+    assert "iterations 4" in html
+    assert "turns of the alternating scheme, beside ours 715 what it had left to go / µm 0.250" in html
+
+
+def test_targets_that_are_unknown_are_counted(tmp_path):
+    errors = measured()[0].copy(deep=True)
+    for name in ("EX", "EY", "EZ", "covariance", "influence"):
+        errors[name][{"target": [3, 4]}] = np.nan
+    assert "The errors of 2 targets are unknown" in words(page(errors, tmp_path))
+
+
+def test_result_without_any_known_target_is_no_crash(tmp_path):
+    errors = bare()
+    for name in ("EX", "EY", "EZ", "covariance"):
+        errors[name] = np.nan * errors[name]
+    assert "The uncertainty of no target is known" in words(page(errors, tmp_path))
+
+
+def test_given_up_target_is_named(tmp_path):
+    errors = measured()[0].copy(deep=True)
+    errors["left_out"][{"target": 5}] = 2
+    assert "nothing tells which is wrong: T006." in words(page(errors, tmp_path))
+
+
+def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
+    errors = measured()[0]
+    names = ["<b>&'S1", *errors["station"].values[1:].tolist()]
+    html = page(errors.assign_coords(station=names), tmp_path)
+    assert "<b>&'" not in html
+
+
+def test_plan_states_what_to_expect_and_no_errors(tmp_path):
+    planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
+    html = page(planned, tmp_path)
+    assert "The plan names no better places" in html
+    assert "Expected uncertainty of a multilateration" in html
+    assert "Errors of the volume" not in html
+
+
+def test_plan_shows_the_best_places_beside_those_that_were_set(tmp_path):
+    places = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3))
+    best = (("station", "direction"), 0.1 * np.arange(12.0).reshape(4, 3) + 0.005)
+    planned = bare(target_uncertainty=(("target",), np.full(12, UM)), station_place=places, best_place=best)
+    assert "4 900 1000 1100 905 1005 1105" in words(page(planned, tmp_path))
+
+
+def test_view_turns_with_the_buttons():
+    """Each button shows its own picture; all pictures are of one scale, and every one is well-formed."""
+    ends = np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 2, 0]]], float)
+    html = str(draw(Scene([Lines(ends, "#000000")]), "k"))
+    pictures = re.findall(r"<svg id='(k-p\d+)'.*?</svg>", html)
+    assert len(pictures) == 15
+    assert html.count(" checked>") == 1
+    assert all(f"#k-v{i}:checked~#k-p{i}" in html for i in range(15))
+    for svg in re.findall(r"<svg.*?</svg>", html):
+        ElementTree.fromstring(svg)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (0.4, 0.3), (2.0, np.pi / 2), (-1.2, 0.9)])
+def test_camera_is_a_rotation_that_keeps_z_up(azimuth, elevation):
+    R = camera(azimuth, elevation)
+    assert pytest.approx(np.eye(3), abs=1e-14) == R @ R.T
+    assert np.linalg.det(R) == pytest.approx(1)
+    assert R[0, 2] == 0
+    assert R[1, 2] >= -1e-15
+
+
+def test_outline_of_an_ellipsoid_seen_from_above_is_its_section():
+    shape = np.diag([4.0, 1.0, 100.0])[None]
+    html = str(draw(Scene([Ellipsoids(np.zeros((1, 3)), shape, "#000000")]), "k"))
+    above = re.search(r"id='k-p12'.*?<ellipse rx='([\d.]+)' ry='([\d.]+)'", html)
+    assert float(above[1]) / float(above[2]) == pytest.approx(2, rel=0.01)  # two decimals of a point
+
+
+def test_enlargement_is_a_round_number_and_never_reduces():
+    assert enlargement(13.8e-6, 0.07) == 5000
+    assert enlargement(1.0, 0.5) == 1
+    assert enlargement(np.nan, 1.0) == 1
+
+
+def test_thinned_targets_are_distinct_and_hold_the_worst():
+    kept = thinned(np.arange(1000), 50, always=777)
+    assert 777 in kept
+    assert len(set(kept.tolist())) == kept.size <= 51
+
+
+def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
+    place = np.stack(np.meshgrid([0.0, 0.1], [0.0, 0.2], [0.0, 0.1, 0.2], indexing="ij"), -1).reshape(-1, 3)
+    sigma = UM * np.stack([np.linspace(1, 3, 12), np.linspace(0.5, 1, 12)])
+    planned = bare(
+        target_uncertainty=(("target",), np.full(12, UM)),
+        map_position=(("place", "direction"), place),
+        map_uncertainty=(("setup", "place"), sigma),
+        chosen=(("place",), np.arange(12) % 4 == 0),
+        gain=((), 3.0),
+    )
+    html = page(planned.assign(chosen=planned["chosen"].astype(np.int8)), tmp_path)
+    text = words(html)
+    assert "Predicted uncertainty" in html
+    assert "The gain in what was minimised is 3.00" in text
+    assert "as set 3.00 2.00 1.00" in text
+    assert "best, Z = 100 mm" in text
+    assert "3 100.0 0.0 200.0" in text  # the ninth of the places
+    (tmp_path / "other").mkdir()
+    assert "Predicted uncertainty" not in page(bare(), tmp_path / "other")
+
+
+def test_repeatability_of_the_machine_is_a_line_of_the_budget(tmp_path):
+    machine = VirtualMachine("cframe", seed=3)
+    raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, repeatability=2 * UM)
+    errors = Multilateration().identify(raw, Multilateration.Settings(repeatability="2 um", parametric=False))
+    html = page(errors, tmp_path)
+    table = html[html.index("Uncertainty budget") :]
+    cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", table[: table.index("</table>")], flags=re.S)
+    text = [unescape(re.sub(r"<[^>]+>", "", cell)).strip() for cell in cells]
+    names = {
+        "machine": "repeatability of the machine",
+        "tracker": "stations, by the tracker's noise",
+        "own": "noise of the target's own readings",
+        "all": "combined, k = 1",
+    }
+    rows = {key: np.array(text[text.index(name) + 1 :][:3], float) for key, name in names.items()}
+    # Figures of three digits.
+    parts = np.sqrt(rows["machine"] ** 2 + rows["tracker"] ** 2 + rows["own"] ** 2)
+    np.testing.assert_allclose(parts, rows["all"], rtol=0.01)
+    assert (rows["machine"] > 3 * rows["own"]).all()

@@ -1,0 +1,75 @@
+"""The tracker beside the virtual machine: what it reads, and the truth less the motion that distances do not see."""
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.errors import BenchError
+from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration.simulation import NOISE, REFLECTOR
+from errormotion.twin import VirtualMachine
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return VirtualMachine("cframe", seed=2)
+
+
+def test_readings_are_distances_less_the_dead_path(machine):
+    q, U, L = simulation.target_grid(machine), simulation.stations(machine), np.array([0.1, 0.0, 0.2, 0.3])
+    raw = simulation.raw(machine, q, U, seed=1, dead_path=L)
+    datasets.validate(raw)
+    distance = np.linalg.norm(simulation.reflector_positions(machine, q) - U[:, None], axis=2)
+    left = raw["displacement"].values - (distance - L[:, None])
+    # 400 readings: their scatter to 3.5 %.
+    assert left.std() == pytest.approx(NOISE, rel=0.15)
+    assert abs(left.mean()) < 4 * NOISE / 20
+
+
+def test_one_seed_gives_one_dataset(machine):
+    assert simulation.raw(machine, seed=1).identical(simulation.raw(machine, seed=1))
+    assert not simulation.raw(machine, seed=1).identical(simulation.raw(machine, seed=2))
+
+
+def test_the_reflector_is_where_the_volume_error_takes_it(machine):
+    q = np.array([(0.1, -0.1, 0.2)])
+    moved = machine.volumetric_truth(q).em.at(REFLECTOR)
+    found = simulation.reflector_positions(machine, q)[0] - q[0] - REFLECTOR
+    np.testing.assert_allclose(found, [float(moved[name].item()) for name in ("EX", "EY", "EZ")], atol=1e-18)
+
+
+def test_the_truth_has_no_motion_of_the_whole(machine):
+    q = simulation.target_grid(machine, (4, 3, 3))
+    truth = simulation.true_errors(machine, q)
+    error = np.stack([truth[name].values for name in ("EX", "EY", "EZ")], axis=-1)
+    assert np.abs(error.mean(axis=0)).max() < 1e-18
+    assert np.abs(np.cross(q - q.mean(axis=0), error).mean(axis=0)).max() < 1e-17
+    assert error.std() > 1e-6
+
+
+def test_broken_beams_and_drift_are_as_asked(machine):
+    still, broken = (simulation.raw(machine, seed=3, missing=share) for share in (0.0, 0.3))
+    assert not np.isnan(still["displacement"]).any()
+    assert float(np.isnan(broken["displacement"]).mean()) == pytest.approx(0.3, abs=0.1)
+    drifting = simulation.raw(machine, seed=3, drift=np.array([(1e-7, 0, 0, 0)] + [(0, 0, 0, 0)] * 3))
+    time = still["reading_time"].values[0]
+    difference = (drifting["displacement"] - still["displacement"]).values
+    np.testing.assert_allclose(difference[0], 1e-7 * (time - time.mean()), atol=1e-12)
+    assert not difference[1:].any()
+
+
+def test_targets_out_of_the_travel_are_refused(machine):
+    with pytest.raises(BenchError, match=r"Axis Z travels from 0 to 0\.46 m"):
+        simulation.raw(machine, [[0.0, 0.0, 0.5]], seed=1)
+
+
+def test_the_layout_of_the_settings_is_simulated_with_its_truth():
+    settings = Settings(layout={"count": (4, 4, 3), "reflector": ("20 mm", "0 mm", "-80 mm")})
+    raw, truth = Multilateration.simulate(settings, 4)
+    datasets.validate(raw)
+    assert raw["displacement"].shape == (4, 48)
+    np.testing.assert_array_equal(raw["reflector"].values[0], settings.layout.reflector)
+    errors = Multilateration().identify(raw, settings)
+    for name in ("EX", "EY", "EZ"):
+        u = np.sqrt(errors["covariance"].sel(dof=name, dof_=name).values)
+        assert np.abs(errors[name].values - truth[name].values).max() < 5 * u.max()

@@ -1,0 +1,86 @@
+"""Means of a record: right for every layout, whatever the pieces it comes in."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from errormotion.methods.spindle_drift.identification import averaging
+from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("layout", ["channel first", "time first"])
+@pytest.mark.parametrize("lost", [0.0, 0.02, 1.0])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, monkeypatch):
+    monkeypatch.setattr(averaging, "_COMPILED_SIZE", 0 if compiled else 1 << 30)
+    rng = np.random.default_rng(0)
+    values = rng.normal(1e-3, 1e-6, (5, 3001)).astype(dtype)
+    values[rng.random(values.shape) < lost] = np.nan
+    if layout == "time first":
+        values = np.ascontiguousarray(values.T).T
+    edges = np.array([0, 1, 1, 700, 1403, 3001])
+    sums, counts = window_sums(values, edges)
+    for k, (a, b) in enumerate(pairwise(edges)):
+        part = values[:, a:b].astype(np.float64)
+        np.testing.assert_allclose(sums[:, k], np.nansum(part, axis=1), rtol=1e-13)
+        np.testing.assert_array_equal(counts[:, k], np.isfinite(part).sum(axis=1))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(1, 400), min_size=1, max_size=12), st.floats(0.05, 0.5))
+def test_means_do_not_depend_on_the_pieces(pieces, length):
+    total = sum(pieces)
+    rng = np.random.default_rng(total)
+    time = 3.0 + np.arange(total) / 1000.0
+    values = rng.normal(size=(2, total))
+    values[:, rng.random(total) < 0.1] = np.nan
+    whole = Averager(2, length)
+    expected = join([whole.update(time, values), whole.finish()])
+    parts = Averager(2, length)
+    edges = np.cumsum([0, *pieces])
+    found = join([parts.update(time[a:b], values[:, a:b]) for a, b in pairwise(edges)] + [parts.finish()])
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found.time, expected.time, rtol=1e-12)
+    np.testing.assert_array_equal(found.count, expected.count)
+    # All samples are in a window, but for a last one that is not half full.
+    assert total - 500 * length - 1 <= expected.expected.sum() <= total
+
+
+def test_windows_follow_the_clock_and_not_the_samples():
+    time = np.concatenate([np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)])
+    averager = Averager(1, 0.5)
+    found = join([averager.update(time, time[None]), averager.finish()])
+    np.testing.assert_allclose(found.time, [0.245, 0.745, 5.245, 5.745])
+    np.testing.assert_allclose(found.mean[0], found.time)
+
+
+def test_samples_further_apart_than_a_window_stay_as_they_are():
+    time = np.arange(0, 10, 0.5)
+    values = np.sin(time)[None]
+    found = Averager(1, 0.5).update(time, values)
+    np.testing.assert_array_equal(found.mean, values)
+    np.testing.assert_array_equal(found.time, time)
+
+
+def test_a_mean_of_too_few_valid_samples_is_unknown_and_counted():
+    time = np.arange(100) / 100.0
+    values = np.ones((1, 100))
+    values[0, :30] = np.nan
+    averager = Averager(1, 0.5, minimum=0.5)
+    found = join([averager.update(time, values), averager.finish()])
+    assert np.isnan(found.mean[0, 0])
+    assert found.mean[0, 1] == 1.0
+    np.testing.assert_array_equal(found.count[0], [20, 50])
+
+
+def test_slices_take_the_time_from_a_rate_where_there_is_no_variable():
+    raw = xr.Dataset(
+        {"distance": (("channel", "time"), np.zeros((5, 7)))}, attrs={"sample_rate": 10.0, "time_start": 2.0}
+    )
+    times = np.concatenate([time for time, _ in slices(raw)])
+    np.testing.assert_allclose(times, 2.0 + np.arange(7) / 10)

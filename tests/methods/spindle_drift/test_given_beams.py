@@ -1,0 +1,60 @@
+"""A drift takes its beams from one detection of all, or from calibrations of one beam after the other."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.errors import MethodError
+from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
+from errormotion.methods.spindle_drift.acquisition.given_beams import NEEDED, given_beams
+from errormotion.twin import VirtualMachine
+
+CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
+
+
+@pytest.fixture(scope="module")
+def detected():
+    return SpindleDrift().identify(simulation.raw_beam_detection(VirtualMachine("cframe", seed=2), seed=5), Settings())
+
+
+def alone(beams, channel, name="beam"):
+    """Return one beam as a calibration of its own returns it: over ``beam`` of size 1, with a name of its own."""
+    return beams.sel(beam=[channel]).assign_coords(beam=[name])
+
+
+def test_beams_found_one_by_one_are_those_found_together(detected):
+    together = given_beams({"beams": detected})
+    single = given_beams({name: alone(detected, name) for name in CHANNELS})
+    xr.testing.assert_identical(together, single)
+    assert list(together["beam"].values) == list(CHANNELS)
+    for name in NEEDED:
+        np.testing.assert_array_equal(together[name].values, detected[name].values)
+
+
+def test_a_single_beam_goes_before_that_of_the_whole_frame(detected):
+    better = alone(detected, "Y2").assign(beam_origin=detected["beam_origin"].sel(beam=["Y1"]).drop_vars("beam") + 1e-3)
+    beams = given_beams({"beams": detected, "Y2": better})
+    np.testing.assert_array_equal(beams["beam_origin"].sel(beam="Y2"), better["beam_origin"][0])
+    np.testing.assert_array_equal(beams["beam_origin"].sel(beam="X1"), detected["beam_origin"].sel(beam="X1"))
+
+
+def test_without_any_the_nominal_beams_count():
+    assert given_beams({}) is None
+
+
+def test_what_is_no_beam_of_the_frame_is_refused(detected):
+    one = alone(detected, "X1")
+    with pytest.raises(MethodError, match="found X3"):
+        given_beams({"X3": one})
+    with pytest.raises(MethodError, match="no beam for X2; given are X1"):
+        given_beams({"X1": one})
+    with pytest.raises(MethodError, match="expected one beam in 'X1'; found 5"):
+        given_beams({"beams": detected, "X1": detected})
+    with pytest.raises(MethodError, match="it has no beam_covariance"):
+        given_beams({"beams": detected, "X1": one.drop_vars("beam_covariance")})
+    with pytest.raises(MethodError, match="zero point of beam X1 is not known"):
+        given_beams({"beams": detected, "X1": one.assign(beam_origin=one["beam_origin"] * np.nan)})
+    with pytest.raises(MethodError, match="several frames"):
+        given_beams({"beams": detected, "X1": one.assign_attrs(frame="table")})
+    with pytest.raises(MethodError, match="holds the beams X1, Z; expected X2 as well"):
+        given_beams({"beams": detected.sel(beam=["X1", "Z"])})

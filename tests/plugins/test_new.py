@@ -1,0 +1,47 @@
+"""``errormotion plugins new`` writes a distribution whose own tests pass as they stand."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from errormotion.cli.app import app
+from errormotion.cli.commands.new import id_of
+from errormotion.errors import PluginError
+
+
+@pytest.mark.parametrize(("what", "name"), [("instrument", "LX9 gauge"), ("method", "dial drift")])
+def test_the_tests_of_a_new_plugin_pass(what: str, name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    result = CliRunner().invoke(app, ["plugins", "new", what, name, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"],
+        cwd=folder,
+        env=os.environ
+        | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_name_becomes_an_id() -> None:
+    assert id_of("LX9 Gauge (new)") == "lx9_gauge_new"
+
+
+@pytest.mark.parametrize("name", ["", "9 lives", "class", "json", "spindle_drift", "errormotion", "a" * 50])
+def test_names_that_cannot_be_ids_or_are_taken_are_refused(name: str) -> None:
+    with pytest.raises(PluginError):
+        id_of(name)
+
+
+def test_no_file_of_a_folder_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    result = CliRunner().invoke(app, ["plugins", "new", "method", "dial drift", "--out", str(tmp_path)])
+    assert result.exit_code == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
