@@ -239,7 +239,7 @@ def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
         requests(ramp, monkeypatch, refused=refused)
         with pytest.raises(InstrumentTimeoutError, match=says) as caught:
             profiler.read()
-        assert "waits for its trigger (it has counted 0 triggers, its encoder is at 4711)" in str(caught.value)
+        assert "waits for its trigger (trigger count 0, encoder 4711)" in str(caught.value)
         assert "Move the axis" in str(caught.value)
         assert profiler.program() == 0  # it is not lost
 
@@ -250,7 +250,7 @@ def test_counts_that_cannot_be_had_are_left_out_of_the_message(
     ramp._feed = Waiting(obeys=False)
     with KeyenceLJX(reach(ramp), FAST) as profiler:
         requests(ramp, monkeypatch, refused=codec.GET_COUNTS)
-        with pytest.raises(InstrumentTimeoutError, match="waits for its trigger, and one by command"):
+        with pytest.raises(InstrumentTimeoutError, match="waits for its trigger, and a trigger by command"):
             profiler.read()
 
 
@@ -509,7 +509,7 @@ def test_leaving_in_the_middle_of_a_stream_ends_every_thread() -> None:
         next(stream)
         assert any(thread.name == "reader-keyence_ljx" for thread in threading.enumerate())
     assert set(threading.enumerate()) == before
-    with pytest.raises(InstrumentError, match="this stream is over"):
+    with pytest.raises(InstrumentError, match="this stream was closed"):
         next(stream)
 
 

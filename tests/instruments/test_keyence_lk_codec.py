@@ -166,5 +166,5 @@ def test_a_line_of_other_bytes_is_a_protocol_error(line: bytes) -> None:
 def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
     # 6 bytes to query, 15 to answer, 10 bits each: 210 bits a reading
     codec.check_rate(45.0, 9600, CONTROLLERS["LK-G5000"])
-    with pytest.raises(InstrumentError, match=r"6 bytes to query and 15 to answer, x 10 bits \(8N1\) = 10500 bit/s"):
+    with pytest.raises(InstrumentError, match=r"6 bytes of request and 15 of answer, x 10 bits \(8N1\) = 10500 bit/s"):
         codec.check_rate(50.0, 9600, CONTROLLERS["LK-G5000"])

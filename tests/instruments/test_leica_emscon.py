@@ -101,7 +101,7 @@ def test_a_beam_that_stays_broken_is_nan_with_its_reason() -> None:
         found = tracker.measure()
         assert tracker.beam_broken
         assert np.isnan(tracker.read())
-        with pytest.raises(BeamBrokenError, match="is the reflector where it should be"):
+        with pytest.raises(BeamBrokenError, match="check the position of the reflector"):
             tracker.find_reflector(1.5)
     assert not found.valid
     assert "no result" in found.reason
@@ -137,7 +137,7 @@ def test_after_a_stream_the_tracker_measures_single_points_again() -> None:
     with LeicaEmScon(ADDRESS, QUICK) as tracker:
         stream = tracker.stream(10)
         block = next(stream)
-        with pytest.raises(InstrumentError, match="leave the stream first"):
+        with pytest.raises(InstrumentError, match="close the stream first"):
             tracker.measure()
         stream.close()
         after = tracker.read()

@@ -132,7 +132,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_it_is_opened(addr
 
 
 def test_another_sensor_than_the_settings_say_is_refused() -> None:
-    with pytest.raises(InstrumentError, match=r"model ILD1420; .* answers a 'ILD2300-2'"):
+    with pytest.raises(InstrumentError, match=r"model ILD1420; .* is a 'ILD2300-2'"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(model="ILD1420", range=0.01, rate=4e3)).open()
     with pytest.raises(InstrumentError, match=r"range of 10 mm; .* has 2.00 mm"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(range=0.01)).open()
@@ -157,7 +157,7 @@ def test_a_beam_that_the_machine_does_not_have_is_refused() -> None:
 
 def test_silence_from_the_start_is_a_timeout_error() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
-    with pytest.raises(InstrumentTimeoutError, match="nothing came"):
+    with pytest.raises(InstrumentTimeoutError, match="received nothing"):
         OptoNCDT("sim://cframe/X1?seed=3&fault=silence", settings).open()
 
 

@@ -94,7 +94,7 @@ def test_the_identity_says_simulated() -> None:
         (lambda c: c.start([Event(0.0, spindle_speed=1e6)]), "refuses: The spindle turns at 0 to"),
         (lambda c: c.elapse(-1.0), "forwards only"),
         (lambda c: c.run_steps((0, 0, 0), (0, 1, 0), 20e-6, 5), "mount it first"),
-        (lambda c: c._call("dance"), "no such operation: dance"),
+        (lambda c: c._call("dance"), "unknown operation: dance"),
         (lambda c: c._call("mount"), "no request"),
     ],
 )

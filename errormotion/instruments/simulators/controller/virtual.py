@@ -42,7 +42,7 @@ class SimulatedController(SimulatedDevice):
         except ErrormotionError as error:
             reply = {"id": number, "ok": False, "error": str(error)}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            reply = {"id": number, "ok": False, "error": f"this is no request: {error!r}"}
+            reply = {"id": number, "ok": False, "error": f"expected a request in JSON: {error!r}"}
         return json.dumps(reply).encode() + b"\n"
 
     def _befall(self) -> None:
@@ -95,5 +95,5 @@ class SimulatedController(SimulatedDevice):
             case "set_station":
                 world.set_station(**arguments)
             case _:
-                raise ValueError(f"no such operation: {op}")
+                raise ValueError(f"unknown operation: {op}")
         return None

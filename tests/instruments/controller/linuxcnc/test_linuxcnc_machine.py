@@ -224,7 +224,7 @@ def test_an_e_stop_ends_a_move_and_has_to_be_released(machine: LinuxCNC) -> None
     with LinuxCNC(ADDRESS) as other:
         stopper = threading.Thread(target=lambda: (wait_until_moving(other), other.estop()))
         stopper.start()
-        with pytest.raises(InstrumentError, match="move to was broken off: e-stop"):
+        with pytest.raises(InstrumentError, match="move to was aborted: e-stop"):
             machine.move_to(THERE, 0.05)
         stopper.join()
     state = machine.state()
@@ -246,7 +246,7 @@ def test_stop_from_another_thread_ends_a_move(machine: LinuxCNC) -> None:
     with LinuxCNC(ADDRESS) as other:
         stopper = threading.Thread(target=lambda: (wait_until_moving(other), machine.stop()))
         stopper.start()
-        with pytest.raises(InstrumentError, match="broken off: it was stopped"):
+        with pytest.raises(InstrumentError, match="aborted: it was stopped"):
             machine.move_to(THERE, 0.05)
         stopper.join()
     place = machine.state()["position"]
@@ -363,7 +363,7 @@ def test_stop_ends_a_program(machine: LinuxCNC) -> None:
     wait_until_moving(machine)
     machine.stop()
     assert machine.state()["running"] is False
-    with pytest.raises(InstrumentError, match="broken off: it was stopped"):
+    with pytest.raises(InstrumentError, match="aborted: it was stopped"):
         machine.finish()
 
 
