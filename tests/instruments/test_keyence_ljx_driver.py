@@ -229,7 +229,10 @@ def test_a_profiler_that_waits_is_read_by_a_trigger(ramp: SimulatedLJX) -> None:
 
 @pytest.mark.parametrize(
     ("refused", "says"),
-    [(-1, "one by command brought none"), (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this")],
+    [
+        (-1, "a trigger by command had no effect"),
+        (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this"),
+    ],
 )
 def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
     ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int, says: str
@@ -464,7 +467,7 @@ def test_only_one_notice_ahead_of_the_first_profile_is_taken_as_late() -> None:
     [
         (b"\0\0\0\0" * 8, ProtocolError, "A reply has 28 to"),
         (b"\xff" * 32, ProtocolError, "A reply has 28 to"),
-        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "expected 32 bytes within 0.5 s; 31 came"),
+        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "expected 32 bytes within 0.5 s; received 31"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", ProtocolError, "A reply has 28 to"),
     ],
 )

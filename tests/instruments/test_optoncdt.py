@@ -113,8 +113,8 @@ def test_settings_from_a_file_have_units() -> None:
     ("wrong", "message"),
     [
         ({"rate": 20.5e3}, "ILD2300 measures at 1.5, 2.5, 5, 10, 20, 30, 49.14 kHz; found 20.5 kHz"),
-        ({"range": 3e-3}, "made for ranges of 2, 5, 10"),
-        ({"baudrate": 1234}, "speaks at"),
+        ({"range": 3e-3}, "has ranges of 2, 5, 10"),
+        ({"baudrate": 1234}, "has the baud rates"),
         ({"baudrate": 921600}, "= 1200000 bit/s"),
         ({"model": "ILD1420"}, "ILD1420 measures at"),
         ({"nois": 1e-6}, "nois"),
@@ -233,7 +233,7 @@ def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() ->
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"), [("checksum", "no such thing"), ("fire", "no such fault"), ("silenc", "choose from silence")]
+    ("fault", "message"), [("checksum", "no such fault"), ("fire", "unknown fault"), ("silenc", "choose from silence")]
 )
 def test_a_fault_that_is_not_on_the_menu_is_refused(fault: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

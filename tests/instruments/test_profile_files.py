@@ -170,8 +170,8 @@ def test_millimetres_taken_for_metres_are_found(tmp_path: Path) -> None:
     [
         ("1,2,3\n4,5\n", "line 2: expected 3 cells as in the lines before; found 2"),
         ("1,2,3\n4,five,6\n", "line 2 of heights: could not convert string to float: 'five'"),
-        ("# nothing\n", "no heights in it"),
-        (",,\n,,\n", "not a single height"),
+        ("# nothing\n", "expected heights; found none"),
+        (",,\n,,\n", "expected heights; found none"),
     ],
 )
 def test_a_csv_file_that_is_none_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
@@ -226,7 +226,7 @@ def test_a_cloud_that_is_no_height_map_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("address", "message"),
-    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "There is no file")],
+    [("none.ply", "no file 'none.ply'"), ("tcp://127.0.0.1:9", "Expected a file"), ("*.nc", "there is no file")],
 )
 def test_an_address_without_files_is_refused(address: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

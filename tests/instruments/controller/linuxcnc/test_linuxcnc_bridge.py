@@ -239,7 +239,7 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monke
         ("spindle", {"speed": "fast"}, "expected spindle speed"),
         ("run_program", {"text": 5}, "expected the text"),
         ("elapse", {"seconds": -1}, "expected a time"),
-        ("set_pins", {"pins": {"spindle.0.speed-in": 1}}, "no client may set"),
+        ("set_pins", {"pins": {"spindle.0.speed-in": 1}}, "not among those that clients may set"),
     ],
 )
 def test_wrong_orders_are_refused_in_words(

@@ -281,7 +281,7 @@ def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
         machine.state()  # after identity and state the wire breaks at the next answer, that of the stop
         ordered = threading.Thread(target=lambda: (wait_until_moving(witness), witness.stop()))
         ordered.start()
-        with pytest.raises(InstrumentError, match="was ordered to move to meanwhile"):
+        with pytest.raises(InstrumentError, match="during the order 'move to'"):
             machine.move_to(THERE, 0.05)
         ordered.join()
         place = witness.state()["position"]
