@@ -496,7 +496,7 @@ def test_a_stream_port_at_which_nobody_is_is_named(ramp: SimulatedLJX) -> None:
     [
         ("sim://cframe/profiler?wire=pty", "network connections only"),
         ("sim://cframe/profiler?artefact=cow", "'artefact=cow': expected one of .*swept"),
-        ("sim://cframe/profiler?fault=fire", "there is no such fault"),
+        ("sim://cframe/profiler?fault=fire", "unknown fault"),
         ("serial:///dev/ttyUSB0", "2 network connections"),
     ],
 )

@@ -306,7 +306,7 @@ def test_a_late_answer_is_not_taken_for_the_next_one() -> None:
     with KeyenceLK("sim://cframe/lk?readings=1,2,3", PATIENT) as sensor:
         assert sensor.read() == pytest.approx(1e-3)
         sensor.transport.write(b"MS,01\r")  # read by somebody who did not wait for the answer
-        sensor._in_step = False
+        sensor._synchronised = False
         assert sensor.read() == pytest.approx(3e-3)
 
 

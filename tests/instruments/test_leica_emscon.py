@@ -254,7 +254,7 @@ def test_settings_refuse_what_does_not_go_together() -> None:
 
 @pytest.mark.parametrize("query", ["tracker=AT100", "station=1,2", "station=a,b,c", "lever=0"])
 def test_addresses_of_no_tracker_are_refused(query: str) -> None:
-    with pytest.raises(InstrumentError, match=r"describes no tracker that there is"):
+    with pytest.raises(InstrumentError, match=r"has invalid parameters of a tracker"):
         LeicaEmScon(f"sim://cframe/tracker?seed=3&{query}", QUICK).open()
 
 

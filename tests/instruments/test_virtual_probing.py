@@ -114,7 +114,7 @@ def test_a_ball_that_was_pushed_is_met_elsewhere(controller: VirtualController, 
     [
         (lambda c: c.probe((5.0, 0.0, 0.0), SLOW), "X travels from 0 to 4 m"),
         (lambda c: c.probe((1.0, 0.0), SLOW), "Expected a position"),
-        (lambda c: c.probe((1.0, 0.0, 0.0), 0.0), "feed is above 0"),
+        (lambda c: c.probe((1.0, 0.0, 0.0), 0.0), "Expected a feed above 0"),
         (lambda c: c.probe((1.0, 0.0, 0.0), 1.0), "feed is above 0 and at most"),
         (lambda c: (c.spindle(3000.0), c.probe((1.0, 0.0, 0.0), SLOW)), "spindle turns at 3000 /min; stop it"),
         (lambda c: (c.run_program(PROGRAM), c.probe((1.0, 0.0, 0.0), SLOW)), "still running"),

@@ -205,7 +205,7 @@ def moving_to(fake: FakeLinuxCNC, place: tuple[float, ...]) -> Callable[[str], N
 def test_nothing_that_comes_in_ends_it(play: Callable[[Test], None], line: bytes) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         wire.reader.feed_data(line + b"\n")
-        assert "no request" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
+        assert "expected a request in JSON" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
         assert (await wire.ask("state"))["enabled"] is True
 
     play(test)
@@ -301,7 +301,9 @@ def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test],
 def test_the_text_of_an_error_may_come_late(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: asyncio.get_running_loop().call_later(0.02, fake.error, "too bad")  # type: ignore[assignment,return-value]
-        assert (await wire.ask("move_to", position=[0, 0, 0.1])).endswith("before its goal: too bad")
+        assert (await wire.ask("move_to", position=[0, 0, 0.1])).endswith(
+            "before its goal, at 0.0000, 0.0000, 0.0000 mm: too bad"
+        )
 
     play(test)
 
@@ -341,7 +343,7 @@ def test_probing_is_in_the_work_frame_and_its_result_is_not(play: Callable[[Test
         ({"task_state": FakeLinuxCNC.STATE_OFF}, "is off"),
         ({"homed": (1, 0, 1)}, "not homed"),
         ({"joints": 0}, "not homed"),
-        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "not by an order through this bridge"),
+        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not ordered"),
         ({"probe_val": 1}, "tripped before it moves"),
         ({"spindle": ({"speed": 9.0, "direction": 1},)}, "spindle turns"),
     ],
