@@ -209,7 +209,7 @@ def test_refuses_to_probe_with_the_probe_tripped(machine: LinuxCNC) -> None:
 def test_running_into_a_ball_stops_the_machine(machine: LinuxCNC) -> None:
     machine.move_to(above(0, 0.05))
     machine.probe(above(0, 0.045), 0.02)  # so that the probe is in the spindle
-    with pytest.raises(InstrumentError, match=r"stopped at .* before its goal: Probe tripped during non-probe move"):
+    with pytest.raises(InstrumentError, match=r"stopped before its goal, at .*: Probe tripped during non-probe move"):
         machine.move_to(above(0, 0.005), 0.02)
     assert machine.state()["alarms"] == ["Probe tripped during non-probe move."]
     machine.move_to(above(0, 0.05), FAST)
@@ -443,7 +443,7 @@ def test_a_ball_is_touched_through_linuxcnc() -> None:
 
 
 def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
-    with pytest.raises(InstrumentError, match="can run one LinuxCNC.*close that driver first"):
+    with pytest.raises(InstrumentError, match=r"can run one LinuxCNC.*close that driver first"):
         LinuxCNC("sim://cframe/linuxcnc?seed=4").open()
     assert machine.state()["enabled"]
 
