@@ -102,10 +102,11 @@ class RawStore:
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
-        for name, stored in skeleton.variables.items():
-            if stored.dtype.kind == "U":
-                skeleton[name] = stored.astype(np.dtypes.StringDType())
-            skeleton[name].encoding = {}
+        # An index would turn texts back into texts of fixed length, for which Zarr has no specified type.
+        texts = {n: v.astype(np.dtypes.StringDType()) for n, v in skeleton.variables.items() if v.dtype.kind == "U"}
+        coordinates = [name for name in texts if name in skeleton.coords]
+        skeleton = skeleton.drop_indexes([name for name in coordinates if name in skeleton.xindexes])
+        skeleton = skeleton.assign(texts).set_coords(coordinates).drop_encoding()
         for name, variable in growing.items():
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]
