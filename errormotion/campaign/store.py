@@ -102,8 +102,12 @@ class RawStore:
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
-        # An index would turn texts back into texts of fixed length, for which Zarr has no specified type.
-        texts = {n: v.astype(np.dtypes.StringDType()) for n, v in skeleton.variables.items() if v.dtype.kind == "U"}
+        # Objects become texts of free length with every version of xarray; an empty array of objects has no type.
+        texts = {
+            name: variable.astype(object if variable.size else np.dtypes.StringDType())
+            for name, variable in skeleton.variables.items()
+            if variable.dtype.kind == "U"
+        }
         coordinates = [name for name in texts if name in skeleton.coords]
         skeleton = skeleton.drop_indexes([name for name in coordinates if name in skeleton.xindexes])
         skeleton = skeleton.assign(texts).set_coords(coordinates).drop_encoding()
