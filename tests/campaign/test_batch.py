@@ -249,7 +249,7 @@ def test_mistakes_are_told_before_anything_is_done(raws: list[Path], identify: I
         identify(scheduler="thread")
     with pytest.raises(RunError, match="--workers: expected 1 or more"):
         identify(scheduler="threads", workers=0)
-    with pytest.raises(RunError, match="cluster, which has its own"):
+    with pytest.raises(RunError, match="no number for a cluster"):
         identify(scheduler="tcp://127.0.0.1:9", workers=2)
     with pytest.raises(RunError, match="at least one raw dataset"):
         identify_runs([], "spindle_drift", settings(), tmp_path, scheduler="sync")
