@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
+from errormotion.campaign.journal import cause_of
 from errormotion.errors import BenchError
 from errormotion.plugins import Identity
 
@@ -106,7 +107,7 @@ class OpenBench:
                     raise
             except Exception as error:
                 log.exception("instrument %s could not be opened", instrument.name)
-                self.answers.append(Answer(instrument, error=f"{type(error).__name__}: {error}"))
+                self.answers.append(Answer(instrument, error=cause_of(error)))
             else:
                 self.answers.append(Answer(instrument, driver, identity))
 

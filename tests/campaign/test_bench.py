@@ -41,7 +41,7 @@ def test_failed_connections_are_told_as_a_tree_and_nothing_stays_open(bench: Cal
     assert str(caught.value).splitlines() == [
         "Bench 'Table': 1 of 2 instruments could not be opened.",
         "├── counter (counter, sim://counter): Lab Counter, serial number 17",
-        "└── other (counter, tcp://10.0.0.5:10001): InstrumentError: tcp://10.0.0.5:10001: nobody listens there",
+        "└── other (counter, tcp://10.0.0.5:10001): tcp://10.0.0.5:10001: nobody listens there",
     ]
     assert plugins.get("instruments", "counter").opened == []
 
