@@ -1,20 +1,23 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint docs bench validate lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate lock
 
 BIN := .venv/bin
 ARGS ?=
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):[^#]*## /  \1\t/' | expand -t 14
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):[^#]*## /  \1\t/' | expand -t 14
 
 setup: .venv/.dev  ## install everything into .venv (uv where it is, else pip)
 
 demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, report
 	@$(BIN)/errormotion demo $(ARGS)
 
-test: .venv/.dev  ## run the tests (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
+test: .venv/.compiled  ## run the tests without the slow ones (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow" $(ARGS)
+
+test-all: .venv/.compiled  ## run all tests
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: .venv/.dev  ## style, types, and which package imports which
@@ -26,6 +29,9 @@ lint: .venv/.dev  ## style, types, and which package imports which
 docs: .venv/.dev  ## build docs/_build/html; a warning is an error
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
+
+wheel: .venv/.dev  ## build dist/*, and check the wheel in an empty environment
+	$(BIN)/python tools/check_wheel
 
 bench: .venv/.dev  ## run every benchmark and print its figures
 	@set -e; for script in $(filter-out benchmarks/validate.py,$(wildcard benchmarks/*.py)); do \
@@ -45,3 +51,8 @@ lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 
 .venv/.dev: requirements.lock requirements-core.lock pyproject.toml
 	@tools/setup dev
+
+# What is compiled at first use is compiled once, before the workers of the tests start.
+.venv/.compiled: .venv/.dev $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)
+	$(BIN)/python tools/precompile
+	@touch $@

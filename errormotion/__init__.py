@@ -1,23 +1,24 @@
-"""Measure how machine tools move wrongly: many sensors, many methods, one kind of result.
+"""Measure the error motions of machine tools: many sensors, many methods, one kind of result.
 
-The packages, from the bottom up (imports run one way, and a contract holds it):
+The packages, from the bottom up (imports run one way, enforced by a contract):
 
-``errors``       every exception that a user may meet, from one root
-``kinematics``   poses, twists, ISO 230-1 axes, machine chains, geometric fits; arrays in and out
-``datasets``     raw and error datasets: schemas, units, provenance, reading and writing
-``twin``         the virtual machine: truth for everything
-``plugins``      what an instrument and a method are, and the registry that finds them
-``instruments``  transports, codecs, drivers and their wire simulators
-``methods``      from raw datasets to error datasets
-``campaign``     bench and campaign files, the runner, run folders
-``report``       the page that a lab hands to its customer
-``testing``      the conformance kit that every plugin passes
-``cli``          the command ``errormotion``
+``errors``        every exception that a user may meet, from one root
+``kinematics``    poses, twists, ISO 230-1 axes, machine chains, geometric fits; arrays in and out
+``plugins``       contracts of instruments, methods and kinds of dataset; the registry
+``datasets``      raw and error datasets: schemas, units, provenance, reading and writing
+``twin``          virtual machines with known errors
+``report``        what chapters are made of
+``instruments``   transports, codecs, drivers and their simulators
+``methods``       from raw datasets to error datasets
+``testing``       the conformance kit that every plugin passes
+``compensation``  thermal models
+``campaign``      bench and campaign files, the runner, run folders
+``cli``           the command ``errormotion``
 """
 
 import logging
 
 __version__ = "0.1.0"
 
-# A library speaks when its user listens: without this, Python prints every warning of every call.
+# Without a handler, Python prints the warnings of a library whose user has configured no logging.
 logging.getLogger(__name__).addHandler(logging.NullHandler())

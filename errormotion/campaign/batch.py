@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
 from errormotion.datasets.hashing import has_hash
@@ -208,16 +209,6 @@ def _one_thread_at_a_time() -> bool:
 
     numba.get_num_threads()  # selects the layer
     return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
-
-
-def raw_of(path: Path) -> Path:
-    """Return the raw dataset of a path: of a run folder, its raw store."""
-    return path / "raw.zarr" if (path / "run.json").exists() else path
-
-
-def is_runs_folder(path: Path) -> bool:
-    """Return whether a path is a folder of run folders."""
-    return path.is_dir() and not (path / "run.json").exists() and any(path.glob("*/run.json"))
 
 
 def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:

@@ -70,6 +70,7 @@ class OpenBench:
     def __init__(self, plan: BenchPlan, ask: Callable[[str], None] | None = None) -> None:
         self.plan = plan
         self.machine = plan.machine
+        self.description = plan.description
         self.answers: list[Answer] = []
         self._ask = ask
 

@@ -17,10 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
+from errormotion.campaign.machine import limits_within, read_machine
 from errormotion.datasets import tomlfile
 from errormotion.datasets.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
+from errormotion.kinematics.description import MachineDescription
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
@@ -39,8 +41,8 @@ class BenchTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     schema_: Literal["errormotion.bench/1"] = Field(alias="schema", description='"errormotion.bench/1"')
     name: str
-    machine: str
-    instruments: dict[str, InstrumentTable] = Field(min_length=1)
+    machine: str = Field(description="the name of the machine tool, or the table [machine]")
+    instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
 
 
@@ -87,7 +89,11 @@ class BenchInstrument:
 
 @dataclass(frozen=True)
 class BenchPlan:
-    """A checked bench file; nothing is opened yet."""
+    """A checked bench file; nothing is opened yet.
+
+    ``machine`` is the name of the machine tool, ``description`` what the table ``[machine]`` states (None without it).
+    ``limits`` are those of the file, and the travel where the file has none.
+    """
 
     name: str
     machine: str
@@ -95,6 +101,7 @@ class BenchPlan:
     source: Path
     text: str
     limits: Limits = field(default_factory=Limits)
+    description: MachineDescription | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -201,7 +208,16 @@ def _missing(campaign: CampaignPlan) -> Iterator[str]:
 def parse_bench(text: str, source: Path) -> BenchPlan:
     """Check the text of a bench file; ``source`` is for the messages."""
     data = tomllib.loads(text)
-    table, mistakes = tomlfile.check(data, BenchTable)
+    description, mistakes, machine = None, list[str](), data.get("machine")
+    if isinstance(machine, dict):
+        description, mistakes = read_machine(machine)
+        data["machine"] = str(machine.get("name"))
+    table, found = tomlfile.check(data, BenchTable)
+    mistakes += found
+    limits = table.limits if table else Limits()
+    if description is not None:
+        limits, found = limits_within(limits, description)
+        mistakes += found
     instruments = []
     for name, entry in _tables(data.get("instruments")):
         if not isinstance(entry.get("driver"), str):
@@ -214,7 +230,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, table.limits)
+    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, limits, description)
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -293,8 +309,17 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
                     f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs one {kind}; the bench "
                     f'{bench.source} offers {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
                 )
+        mistakes += _machine_mistakes(entry["method"], found, bench, place)
         mistakes += _limit_mistakes(entry["method"], found, bench, place)
     return mistakes
+
+
+def _machine_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> Iterator[str]:
+    """Yield which settings contradict the machine of the bench."""
+    check = getattr(plugins.get("methods", method)(), "check_machine", None)
+    if check is not None and bench.description is not None:
+        for key, text in check(settings, bench.description).items():
+            yield f"{tomlfile.dotted((*place, 'settings', key))}: {text} ([machine] of {bench.source})"
 
 
 def _choice_mistakes(choice: Any, place: tuple[str | int, ...], bench: BenchPlan) -> list[str] | None:
@@ -326,7 +351,8 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
     except MethodError as error:
         return [f"{where}: {error}"]
     told = violations(extent(steps), bench.limits) if steps else []
-    return [f"{where}: {text} ([limits] of {bench.source})" for text in told]
+    tables = "[limits]" if bench.description is None else "[limits] and [machine]"
+    return [f"{where}: {text} ({tables} of {bench.source})" for text in told]
 
 
 def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:

@@ -1,15 +1,18 @@
 """Rigid bodies and machines: arrays in, arrays out.
 
-==============  ====================================================================================
-module          what it holds
-==============  ====================================================================================
-``twists``      small errors as twists; functional points, frames, covariance
-``poses``       twists and exact poses (scipy's ``RigidTransform``)
-``iso``         the six freedoms and their names in ISO 230-1
-``axes``        linear and rotary axes with their error motions
-``machines``    chains such as ``workpiece-X-Y-bed-Z-spindle-tool``, forward model and Jacobian
-``fits``        geometric least squares: line, plane, circle, sphere, cylinder, cone
-==============  ====================================================================================
+===============  ===================================================================================
+module           what it holds
+===============  ===================================================================================
+``twists``       small errors as twists; functional points, frames, covariance
+``poses``        twists and exact poses (scipy's ``RigidTransform``)
+``iso``          the six freedoms and their names in ISO 230-1
+``axes``         linear and rotary axes with their error motions
+``chains``       the text of a chain, such as ``workpiece-X-Y-bed-Z-spindle-tool``
+``machines``     machines of any chain: forward model and Jacobian
+``description``  one machine tool: chain, travel, spindle axis, rotary axes
+``beams``        directions of beams and inclinations of surfaces
+``fits``         geometric least squares: line, plane, circle, sphere, cylinder, cone
+===============  ===================================================================================
 
 A module is imported when it is first used.
 """
@@ -17,7 +20,7 @@ A module is imported when it is first used.
 from importlib import import_module
 from types import ModuleType
 
-__all__ = ["axes", "fits", "iso", "machines", "poses", "twists"]
+__all__ = ["axes", "beams", "chains", "description", "fits", "iso", "machines", "poses", "twists"]
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -1,25 +1,33 @@
-"""Geometric errors of the axes: smooth, seeded, zero at the axis's zero."""
+"""Geometric errors of the axes of any chain: smooth, seeded, zero at the axis's zero."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import mul
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
-from errormotion.kinematics.iso import DOF, location_names
+from errormotion.kinematics.description import MachineDescription
+from errormotion.kinematics.iso import DOF, ROTARY_AXES, direction_of, location_names
 from errormotion.kinematics.machines import Machine
 
-#: waves over the travel, and how large the first one is on a metre of travel (it grows with the root): m, rad
 WAVES = 4
+"""Number of waves over the travel of a linear axis, or over a turn of a rotary one."""
 STRAIGHTNESS = 3e-6
+"""Displacement by the first wave on 1 m of travel (it grows with the root of the travel), and on a turn, m, 1 sigma."""
 ANGLE = 8e-6
-#: linear growth of the positioning error, and squareness, rad (one sigma)
+"""Rotation by the first wave, likewise, rad, 1 sigma."""
 SCALE = 6e-6
+"""Linear growth of the positioning error, m/m, 1 sigma."""
 SQUARENESS = 15e-6
+"""Squareness of a linear axis and tilt of the line of a rotary axis, rad, 1 sigma."""
+LINE_OFFSET = 10e-6
+"""Offset of the line of a rotary axis, m, 1 sigma."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +37,7 @@ class AxisErrors:
     Attributes
     ----------
     travel : float
-        Length of the axis, m.
+        Length of a linear axis, m; half a turn of a rotary axis, rad.
     sine, cosine : ndarray, (6, wave)
         Amplitudes of waves with 1, 2, ... half periods over the travel, m and rad.
     slope : ndarray, (6,)
@@ -42,7 +50,7 @@ class AxisErrors:
     slope: Array
 
     def __call__(self, position: ArrayLike) -> Array:
-        """Return the error twists (..., 6), m and rad, at positions (...), m."""
+        """Return the error twists (..., 6), m and rad, at positions (...), m or rad."""
         q = np.asarray(position, dtype=float)[..., None, None]
         phase = np.pi * np.arange(1, WAVES + 1) * (q / self.travel)
         waves = self.sine * np.sin(phase) + self.cosine * (np.cos(phase) - 1)
@@ -51,29 +59,71 @@ class AxisErrors:
 
 @dataclass(frozen=True)
 class GeometricErrors:
-    """The 21 geometric errors of a machine with three linear axes.
+    """The geometric errors of a machine: 21 with three linear axes, ten more with each rotary axis.
 
     Attributes
     ----------
+    description : MachineDescription
+        The machine.
     machine : Machine
-        The chain of bodies.
+        Its kinematic model.
     motions : mapping
-        Axis to its error motions, stated at the machine's origin.
+        Axis to its error motions, stated at the machine's origin, or on the line of a rotary axis.
     locations : mapping
-        Name of a squareness to its value, rad.
+        Name of an error of position (squareness among them) to its value, rad or m.
     """
 
+    description: MachineDescription
     machine: Machine
     motions: Mapping[str, AxisErrors]
     locations: Mapping[str, float]
 
     def twist(self, points: ArrayLike) -> Array:
-        """Return the error twists of the tool at commanded points (..., 3), m; shape (..., 6), m and rad."""
-        errors = self.machine.errors_at(points, self.motions, self.locations)
-        return self.machine.volumetric_error(points, errors)
+        """Return the error twists of the tool relative to the workpiece.
+
+        They are stated in the frame of the workpiece that coincides with the machine's where the moving axes are at
+        zero and the fixed ones at their angle, for the point of the tool that is then at the origin.
+
+        Parameters
+        ----------
+        points : array_like, (..., moving axis)
+            Commands of the moving axes in the order of `MachineDescription.moving_axes`, m and rad. Of a machine that
+            also has rotary axes, X Y Z are enough: the others are at zero.
+
+        Returns
+        -------
+        ndarray, (..., 6)
+            m and rad.
+        """
+        moving = np.asarray(points, dtype=float)
+        count = len(self.description.moving_axes)
+        if self.description.moving_axes[:3] == ("X", "Y", "Z") and moving.shape[-1:] == (3,):
+            moving = np.concatenate([moving, np.zeros((*moving.shape[:-1], count - 3))], axis=-1)
+        q = self.description.commands(moving)
+        errors = self.machine.errors_at(q, self.motions, self.locations)
+        table, head = self._fixed_poses
+        twist = self.machine.volumetric_error(q, errors, head.inv().apply(np.zeros(3)))
+        if not self.description.fixed:
+            return twist
+        parts = twist.reshape(-1, 3)  # rows alternate: displacement, rotation
+        return np.asarray(table.rotation.inv().apply(parts)).reshape(twist.shape)
+
+    @cached_property
+    def _fixed_poses(self) -> tuple[RigidTransform, RigidTransform]:
+        """Nominal poses of the bed in the workpiece, and of the tool in the bed, with the moving axes at zero."""
+        at_zero = self.description.commands(np.zeros(len(self.description.moving_axes)))
+        command = dict(zip(self.description.axes, at_zero, strict=True))
+        table, head = (
+            [joint.motion([command[joint.name]])[0] for joint in self.machine.joints if joint.carries_tool is side]
+            for side in (False, True)
+        )
+        still = RigidTransform.identity()
+        return reduce(mul, table, still), reduce(mul, head, still)
 
     def displacement(self, points: ArrayLike) -> Array:
-        """Return EX, EY, EZ of `twist`, (..., 3), m, in a fiftieth of the time: for who asks point by point."""
+        """Return EX, EY, EZ of `twist`, (..., 3), m; fifty times as fast where all axes are linear."""
+        if self.machine.axis_names != ("X", "Y", "Z"):
+            return self.twist(points)[..., :3]
         q = np.asarray(points, dtype=float)
         total, before = np.zeros(q.shape), np.zeros(q.shape)
         for joint in self.machine.joints:
@@ -87,7 +137,7 @@ class GeometricErrors:
 
     @cached_property
     def _places(self) -> Mapping[str, Array]:
-        """Rotational errors of place of each axis, (3,), rad."""
+        """Rotational errors of orientation of each axis, (3,), rad."""
         axes = self.machine.axis_names
         named = {axis: location_names(axis, axes) for axis in axes}
         return {
@@ -96,16 +146,23 @@ class GeometricErrors:
         }
 
 
-def seeded_errors(rng: np.random.Generator, chain: str, travel: Mapping[str, tuple[float, float]]) -> GeometricErrors:
-    """Return the errors of a good machine with this chain: some micrometres and seconds of arc."""
-    machine = Machine(chain)
+def seeded_errors(rng: np.random.Generator, description: MachineDescription) -> GeometricErrors:
+    """Return the errors of a good machine: some micrometres and seconds of arc."""
+    machine = description.machine()
     motions = {}
-    for axis, (low, high) in travel.items():
-        length = high - low
-        first = np.sqrt(length) * np.array([STRAIGHTNESS] * 3 + [ANGLE] * 3)
+    for axis in machine.axis_names:
+        first, slope = np.array([STRAIGHTNESS] * 3 + [ANGLE] * 3), np.zeros(6)
+        if axis in ROTARY_AXES:
+            length = np.pi
+        else:
+            low, high = description.travel[axis]
+            length = high - low
+            first *= np.sqrt(length)
+            slope[direction_of(axis)] = rng.normal(0, SCALE)
         size = first[:, None] / np.arange(1, WAVES + 1) ** 2
-        slope = np.zeros(6)
-        slope["XYZ".index(axis)] = rng.normal(0, SCALE)
         motions[axis] = AxisErrors(length, rng.normal(0, size), rng.normal(0, size), slope)
-    places = machine.error_names[6 * len(motions) :]
-    return GeometricErrors(machine, motions, {name: float(rng.normal(0, SQUARENESS)) for name in places})
+    locations = {
+        name: float(rng.normal(0, LINE_OFFSET if name[:2] in DOF[:3] else SQUARENESS))
+        for name in machine.error_names[6 * len(motions) :]
+    }
+    return GeometricErrors(description, machine, motions, locations)

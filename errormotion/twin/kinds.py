@@ -1,18 +1,19 @@
-"""The two virtual machines, as tables: bodies and heat flows, what grows where, and how far the axes travel."""
+"""The two named virtual machines as tables: bodies, heat flows, thermal growth, chain and travel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from errormotion.errors import BenchError
+from errormotion.kinematics.description import MachineDescription
 
 Table = Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class MachineKind:
-    """One virtual machine before a seed makes it an individual.
+    """One virtual machine without the individual deviations that a seed adds.
 
     Attributes
     ----------
@@ -27,13 +28,13 @@ class MachineKind:
     growth : mapping
         Error of the spindle to (body to um/K or urad/K), at the end of the bar.
     behind : tuple of str
-        Bodies behind the last axis. They displace and tilt the spindle; the others also turn the frame of the axes.
+        Bodies behind the last axis. They displace and tilt the spindle; the others also rotate the frame of the axes.
     compensation : mapping
         Axis to (steady correction at top speed in m, time constant of the control's model in s).
     top_speed : float
         1/min.
     rapid : float
-        Feed of moves as fast as the machine can, m/s.
+        Feed of rapid moves, m/s.
     """
 
     name: str
@@ -50,6 +51,11 @@ class MachineKind:
     behind: tuple[str, ...] = ("spindle_front", "spindle_rear", "motor", "head")
     top_speed: float = 15000.0
     rapid: float = 20.0 / 60
+
+    @property
+    def description(self) -> MachineDescription:
+        """The machine as a bench file describes it."""
+        return MachineDescription(self.name, self.chain, self.travel)
 
 
 CFRAME = MachineKind(
@@ -181,8 +187,20 @@ GANTRY = MachineKind(
 KINDS: Mapping[str, MachineKind] = {"cframe": CFRAME, "gantry": GANTRY}
 
 
-def machine_kind(name: str) -> MachineKind:
-    """Return the tables of a machine; BenchError names the ones there are."""
-    if name not in KINDS:
-        raise BenchError(f"There is no virtual machine '{name}'; there are: {', '.join(KINDS)}.")
-    return KINDS[name]
+def machine_kind(machine: str | MachineDescription) -> tuple[str, MachineKind]:
+    """Return the name of a kind and its tables.
+
+    A described machine has its own chain and travel. It warms up like the gantry where X, Y and Z all carry the tool,
+    otherwise like the C-frame.
+
+    Raises
+    ------
+    BenchError
+        An unknown kind.
+    """
+    if isinstance(machine, MachineDescription):
+        name = "gantry" if machine.tool_axes == "XYZ" else "cframe"
+        return name, replace(KINDS[name], name=machine.name, travel=machine.travel, chain=machine.chain)
+    if machine not in KINDS:
+        raise BenchError(f"expected a virtual machine, {' or '.join(KINDS)}, or a description; found '{machine}'")
+    return machine, KINDS[machine]

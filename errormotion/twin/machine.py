@@ -1,4 +1,4 @@
-"""The virtual machine: one seeded individual, its truth, and what the sensors read on it."""
+"""The virtual machine: one seeded individual, its true errors, and the readings of its sensors."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
+from errormotion.kinematics.description import MachineDescription
+from errormotion.kinematics.iso import ROTARY_AXES
 from errormotion.kinematics.twists import move
 from errormotion.twin import bar as bars
 from errormotion.twin import frame as frames
@@ -24,9 +26,9 @@ from errormotion.twin.sensing import Sensing
 from errormotion.twin.stage_sensor import StageSensor
 from errormotion.twin.state import ThermalState, seeded_state
 
-#: the spindle reaches full speed in this time, s
+#: time to full spindle speed, s
 SPIN_UP_TIME = 0.75
-#: sensors count as warm when they have been on for this time, s
+#: time since switching on after which sensors are warm, s
 WARM_AFTER = 4 * 3600.0
 
 _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "probing")
@@ -34,15 +36,16 @@ _PART = {name: number for number, name in enumerate(_PARTS)}
 
 
 class VirtualMachine(StageSensor, ProbeMeasurements):
-    """A machine tool that knows its own errors.
+    """A machine tool whose true errors are known.
 
-    The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
-    schedule give the same numbers, whatever is asked for in which order.
+    The seed selects an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
+    schedule give the same numbers, independent of the order of the calls.
 
     Parameters
     ----------
-    kind : str
-        "cframe" (610 x 510 x 460 mm) or "gantry" (4 x 1.8 x 1 m).
+    machine : str or MachineDescription
+        "cframe" (610 x 510 x 460 mm), "gantry" (4 x 1.8 x 1 m), or the description of any other machine: it has the
+        heat of the gantry where X, Y and Z all carry the tool, else that of the C-frame.
     seed : int
         Which individual.
     warm : bool
@@ -51,37 +54,42 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     Attributes
     ----------
     name : str
-        For people.
+        For reports.
+    kind : str
+        "cframe" or "gantry".
+    description : MachineDescription
+        Chain, travel, spindle axis and rotary axes.
     travel : mapping
-        Axis to (lowest, highest) position, m.
+        Moving axis to (lowest, highest) position, m or rad.
     rapid : float
         Feed of rapid moves, m/s.
     chain : str
-        Bodies from workpiece to tool.
+        Bodies from workpiece to tool, without the fixed axes.
     frame : FrameGeometry
         The five sensors.
     bar : Bar
-        The bar as it truly is; ``bar_radius`` is what its certificate says, m.
+        The true bar; ``bar_radius`` is the radius in its certificate, m.
     sphere_radius : float
         m.
     state : ThermalState
         Temperatures and thermal errors under the present schedule.
     geometry : GeometricErrors
-        The 21 geometric errors.
+        The geometric errors of all axes.
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
-        A point sensor on the stage and what it looks at.
+        A point sensor on the stage, and its targets.
     """
 
-    def __init__(self, kind: str = "cframe", seed: int = 0, *, warm: bool = True) -> None:
-        tables = machine_kind(kind)
-        self.kind = kind
+    def __init__(self, machine: str | MachineDescription = "cframe", seed: int = 0, *, warm: bool = True) -> None:
+        self.kind, tables = machine_kind(machine)
         self.seed = int(seed)
         self.name = tables.name
-        self.travel = dict(tables.travel)
+        self._described = isinstance(machine, MachineDescription)
+        self.description = machine if isinstance(machine, MachineDescription) else tables.description
+        self.travel = {axis: self.description.travel[axis] for axis in self.description.moving_axes}
         self.rapid = tables.rapid
-        self.chain = tables.chain
+        self.chain = self.description.moving_chain
         self.top_speed = tables.top_speed
         self.bar_radius = bars.RADIUS
         self.sphere_radius = 5e-3
@@ -89,14 +97,14 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self.frame = frames.seeded_frame(self._rng("frame"), self.bar_radius)
         self.bar = bars.seeded_bar(self._rng("bar"), len(self.frame.channels))
         self.state: ThermalState = seeded_state(tables, self._rng("heat"), self._schedule(()))
-        self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.chain, self.travel)
-        self.crossbeam: Crossbeam = seeded_crossbeam(self._rng("crossbeam"), self.travel["Y"])
+        self.geometry: GeometricErrors = seeded_errors(self._rng("geometry"), self.description)
+        self.crossbeam: Crossbeam = seeded_crossbeam(self._rng("crossbeam"), tables.travel.get("Y", (0.0, 0.0)))
         self._set_up_point_sensor(self._rng("point_sensor"))
         self._set_up_probing(self._rng("probing"))
         self._sensing = self._sense()
 
     def __repr__(self) -> str:
-        return f"VirtualMachine({self.kind!r}, seed={self.seed})"
+        return f"VirtualMachine({self.name if self._described else self.kind!r}, seed={self.seed})"
 
     def _rng(self, part: str) -> np.random.Generator:
         return np.random.default_rng([abs(self.seed), int(self.seed < 0), _PART[part]])
@@ -107,10 +115,10 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     def _sense(self) -> Sensing:
         return Sensing(self.seed, self.frame, self.bar, self.sphere_radius, self.state, self.sensors_on_for)
 
-    # ------------------------------------------------------------------ what it does
+    # ------------------------------------------------------------------ commands
 
     def start(self, schedule: Sequence[Event] = ()) -> None:
-        """Begin anew at time 0, cold and at rest, with what is commanded from then on.
+        """Restart at time 0, cold and at rest, with a schedule of commands.
 
         Raises
         ------
@@ -121,26 +129,26 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self._sensing = self._sense()
 
     def command(self, event: Event) -> None:
-        """Add to the schedule what is commanded at a time; all before that time stays as it was.
+        """Add a command to the schedule; the state before its time stays unchanged.
 
-        What the schedule holds for later times stays as well, and what it holds for the same time comes first.
+        Later commands of the schedule stay, and those of the same time are executed before it.
 
         Raises
         ------
         BenchError
-            As `start`; the schedule stays as it was.
+            As `start`; the schedule stays unchanged.
         """
         events = sorted([*self._events, event], key=lambda each: each.time)
         self.start(events)
 
     def stop_spindle(self, time: float) -> None:
-        """Stop the spindle at a time, s, and take what was commanded for it later out of the schedule."""
+        """Stop the spindle at a time, s, and remove its later commands from the schedule."""
         events = [event if event.time < time else replace(event, spindle_speed=None) for event in self._events]
         self.start(events)
         self.command(Event(time, spindle_speed=0.0))
 
     def forget(self, events: Sequence[Event], time: float) -> None:
-        """Take events from a time on, s, out of the schedule, wherever they are in it."""
+        """Remove these events from the schedule, as far as they are at or after a time, s."""
         self.start([each for each in self._events if each.time < time or each not in events])
 
     @property
@@ -159,12 +167,12 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
 
     @property
     def temperature_sensors(self) -> tuple[str, ...]:
-        """Names of the places whose temperature is known."""
+        """Names of the temperature sensors."""
         return self.state.sensors
 
     @property
     def spindle_functional_point(self) -> Array:
-        """Where the cold axis of rotation meets the end of the bar, m, shape (3,)."""
+        """Intersection of the cold axis of rotation with the end of the bar, m, shape (3,)."""
         return self.bar.point.copy()
 
     def temperatures(self, t: ArrayLike) -> Array:
@@ -207,23 +215,38 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         return truth.dataset(twist, "time", coords, "spindle", point, "cold state at time 0", self._origin())
 
     def truth_axis(self, axis: str, positions: ArrayLike) -> xr.Dataset:
-        """Return the geometric errors of an axis as an error dataset over ``position`` (m), at the machine's origin."""
+        """Return the geometric errors of an axis as an error dataset over ``position``, m or rad.
+
+        They are stated at the machine's origin; those of a rotary axis at the point of its line that the description
+        gives.
+        """
         if axis not in self.geometry.motions:
-            raise BenchError(f"The axes are {', '.join(self.geometry.motions)}; found {axis!r}.")
+            raise BenchError(f"expected one of the axes {', '.join(self.geometry.motions)}; found {axis!r}")
         q = _times(positions)
-        coords = {axis.lower(): ("position", q, {"units": "m"})}
+        (joint,) = (each for each in self.geometry.machine.joints if each.name == axis)
+        coords = {axis.lower(): ("position", q, {"units": "rad" if joint.rotary else "m"})}
         twist = self.geometry.motions[axis](q)
-        return truth.dataset(twist, "position", coords, axis, np.zeros(3), "axis at zero", self._origin())
+        return truth.dataset(twist, "position", coords, axis, joint.reference, "axis at zero", self._origin())
 
     def volumetric_truth(self, points: ArrayLike) -> xr.Dataset:
-        """Return the errors of the tool at commanded points (n, 3), m, as an error dataset over ``target``."""
+        """Return the errors of the tool at commanded points as an error dataset over ``target``.
+
+        Parameters
+        ----------
+        points : (n, moving axis)
+            See `GeometricErrors.twist`, m and rad.
+        """
         places = np.atleast_2d(np.asarray(points, dtype=float))
-        coords = {name: ("target", places[:, i], {"units": "m"}) for i, name in enumerate("xyz")}
+        coords = {
+            axis.lower(): ("target", column, {"units": "rad" if axis in ROTARY_AXES else "m"})
+            for axis, column in zip(self.description.moving_axes, places.T, strict=False)
+        }
         twist = self.geometry.twist(places)
         return truth.dataset(twist, "target", coords, "tool", np.zeros(3), "commanded point", self._origin())
 
     def _origin(self) -> truth.Origin:
-        return truth.Origin(self.name, self.kind, self.seed, self._events)
+        description = self.description if self._described else None
+        return truth.Origin(self.name, self.kind, self.seed, self._events, description)
 
     # ------------------------------------------------------------------ readings
 
@@ -248,7 +271,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         tool: str = "bar",
         motion: StepProgram | None = None,
     ) -> Array:
-        """Return what the sensors read: samples first .. first + n - 1 of their streams.
+        """Return the readings of the sensors: samples first .. first + n - 1 of their streams.
 
         Parameters
         ----------
@@ -259,17 +282,17 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         channels : sequence of str, optional
             Which sensors; all where not given.
         tool : {"bar", "sphere"}
-            What is in the spindle.
+            Mounted in the spindle.
         motion : StepProgram, optional
-            How the sphere moves; needed for the sphere.
+            Motion of the sphere; required for the sphere.
 
         Returns
         -------
         ndarray, (channel, n)
-            m; NaN out of the measuring range and where a beam misses.
+            m; NaN outside of the measuring range and where a beam misses the target.
         """
         if first < 0 or n < 0 or not rate > 0:
-            raise BenchError(f"Samples need first >= 0, n >= 0, rate > 0; found {first}, {n}, {rate} Hz.")
+            raise BenchError(f"expected first >= 0, n >= 0 and a rate above 0 Hz; found {first}, {n}, {rate} Hz")
         chosen = self._chosen(channels)
         out = np.full((chosen.size, n), np.nan)
         if tool == "bar":
@@ -277,16 +300,14 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         elif tool == "sphere" and motion is not None:
             self._sensing.read_sphere(out, first, float(rate), chosen, motion)
         else:
-            raise BenchError(
-                f"The spindle holds a 'bar', or a 'sphere' with a StepProgram; found {tool!r}, {motion!r}."
-            )
+            raise BenchError(f"expected the tool 'bar', or 'sphere' with a StepProgram; found {tool!r}, {motion!r}")
         return out
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)
         unknown = [name for name in names if name not in self.frame.channels]
         if unknown:
-            raise BenchError(f"The channels are {', '.join(self.frame.channels)}; found {', '.join(unknown)}.")
+            raise BenchError(f"expected channels of {', '.join(self.frame.channels)}; found {', '.join(unknown)}")
         return np.array([self.frame.channels.index(name) for name in names], dtype=np.int64)
 
 

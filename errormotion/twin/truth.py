@@ -1,4 +1,4 @@
-"""The truth as error datasets: values that are known exactly, so with covariance 0."""
+"""True errors as error datasets: values that are known exactly, with covariance 0."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.kinematics.description import MachineDescription
 from errormotion.twin.schedule import Event
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Which virtual machine says so, and what it was told to do."""
+    """The virtual machine behind a truth, and its schedule; ``description`` where it is not one of the two kinds."""
 
     name: str
     kind: str
     seed: int
     events: tuple[Event, ...]
+    description: MachineDescription | None = None
 
 
 def dataset(
@@ -35,7 +37,9 @@ def dataset(
     frame: str = "machine",
 ) -> xr.Dataset:
     """Return an error dataset of true twists (..., 6), m and rad, over these dimensions."""
-    settings = {"kind": origin.kind, "schedule": [asdict(event) for event in origin.events]}
+    settings: dict[str, Any] = {"kind": origin.kind, "schedule": [asdict(event) for event in origin.events]}
+    if origin.description is not None:
+        settings["machine"] = asdict(origin.description)
     return build_errors(
         twist,
         np.zeros((*twist.shape, 6)),

@@ -44,7 +44,7 @@ def test_all_mistakes_of_a_bench_file_are_told_at_once(tmp_path: Path) -> None:
     )
     schema, machine, driver, unknown, rate, block = complaints(path, load_bench)
     assert schema.startswith("schema: expected 'errormotion.bench/1'; found \"errormotion.bench/2\"")
-    assert machine == "machine: missing; expected a string"
+    assert machine == "machine: missing; expected the name of the machine tool, or the table [machine]"
     assert driver.startswith("instruments.c.driver: missing; expected the id of an instrument plugin")
     assert unknown.startswith("instruments.a.driver: No instrument plugin 'countr'")
     assert unknown.endswith("Did you mean 'counter'?")

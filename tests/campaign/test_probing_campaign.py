@@ -230,7 +230,7 @@ def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pyt
     plan, runs = lab()
     with VirtualController("sim://gantry/controller?seed=5") as operator:
         breaks_at(monkeypatch, "elapse", 20, lambda: here().raise_alarm("oil is hot"))
-        with pytest.raises(RunError, match="in alarm: oil is hot; it went so while it warmed up"):
+        with pytest.raises(RunError, match="in alarm: oil is hot; this occurred during the warm-up"):
             runner.run(plan, runs=runs)
         state = operator.state()
         assert state["commanded_spindle_speed"] == 0
@@ -394,7 +394,7 @@ def test_an_alarm_while_a_program_runs_ends_the_run_with_nothing_false(
 
     monkeypatch.setattr(VirtualController, "run_program", counted)
     monkeypatch.setattr(VirtualController, "elapse", alarm_in_second)
-    with pytest.raises(RunError, match="in alarm: servo alarm; it went so while its program ran"):
+    with pytest.raises(RunError, match="in alarm: servo alarm; this occurred while its program was executed"):
         runner.run(plan, runs=runs)
     assert not virtual.running
     assert virtual.time < 1320
@@ -450,5 +450,5 @@ def test_a_machine_without_a_control_on_the_bench_warms_up_by_the_program_that_i
 def test_a_probe_that_has_the_machine_moved_is_refused_without_a_control(lab: Lab) -> None:
     plan, runs = lab()
     plan = without_control(plan)
-    with pytest.raises(RunError, match=r"'controller_probe' has the machine moved.*the bench has none"):
+    with pytest.raises(RunError, match=r"'controller_probe' moves the machine.*the bench has none"):
         runner.run(plan, runs=runs)

@@ -15,7 +15,6 @@ from errormotion.instruments.transports.modbus.codec import (
     crc16,
     decode_answer,
     encode_answer,
-    encode_refusal,
     encode_request,
     missing,
 )
@@ -71,10 +70,12 @@ def test_rubbish_is_a_protocol_error(framing: str, rubbish: bytes) -> None:
     assert found is None  # an older transaction
 
 
-@pytest.mark.parametrize("framing", ["tcp", "rtu"])
-def test_an_exception_reply_is_a_refusal_in_words(framing: str) -> None:
+@pytest.mark.parametrize(
+    ("framing", "frame"), [("tcp", bytes.fromhex("0009 0000 0003 01 83 02")), ("rtu", bytes.fromhex("01 83 02 C0F1"))]
+)
+def test_an_exception_reply_is_a_refusal_in_words(framing: str, frame: bytes) -> None:
     with pytest.raises(ModbusRefusal, match=r"exception 2 \(illegal data address\)") as refusal:
-        decode_answer(framing, encode_refusal(framing, 1, 3, 2, 9), 1, 3, 5, 9)
+        decode_answer(framing, frame, 1, 3, 5, 9)
     assert refusal.value.code == 2
     assert isinstance(refusal.value, InstrumentError)
 

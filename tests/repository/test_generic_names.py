@@ -14,10 +14,10 @@ HOMES = {
     for group in GROUPS
     for plugin_id, value in ENTRY_POINTS[f"errormotion.{group}"].items()
 }
-#: Text files of the package in which examples are shipped: campaigns and benches that a person may write.
+#: Folder of the package with examples: campaigns and benches that a person may write, and their programs.
 EXAMPLES = "errormotion/cli/demo/"
-#: Words that are ids and something else as well: variables of published datasets, the command of a package, and defaults
-#: of published settings that name another plugin.
+#: Words that are ids and something else as well: variables of published datasets, the command of a package, and
+#: defaults of published settings that name another plugin.
 OTHER_MEANINGS = {
     ("optoncdt", "errormotion/instruments/spindle_frame/"),
     ("virtual_controller", "errormotion/instruments/touch_probe/controller_probe.py"),

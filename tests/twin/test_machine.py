@@ -133,5 +133,5 @@ def test_twist_is_continuous_where_nothing_is_switched(warming):
 
 
 def test_an_unknown_machine_names_the_known_ones():
-    with pytest.raises(BenchError, match="cframe, gantry"):
+    with pytest.raises(BenchError, match="cframe or gantry, or a description; found"):
         VirtualMachine("lathe")

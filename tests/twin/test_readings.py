@@ -231,7 +231,7 @@ def test_a_beam_that_misses_the_sphere_reads_nothing(machine):
     [
         ((0, 10, RATE, ["X3"]), "X1, X2, Y1, Y2, Z"),
         ((-1, 10, RATE), "first >= 0"),
-        ((0, 10, 0.0), "rate > 0"),
+        ((0, 10, 0.0), "a rate above 0 Hz"),
         ((0, 10, RATE, None, "sphere"), "StepProgram"),
         ((0, 10, RATE, None, "probe"), "'bar'"),
     ],

@@ -62,7 +62,7 @@ def test_compensation_goes_and_comes_within_its_slew():
         ([Event(-1.0)], "from 0 on"),
         ([Event(float("nan"))], "finite"),
         ([Event(0, 99999)], "15000 /min"),
-        ([Event(0, float("nan"))], "commanded were nan"),
+        ([Event(0, float("nan"))], "found nan /min"),
         ([Event(0, compensation={"A": False})], "X, Y and Z"),
     ],
 )
@@ -87,7 +87,7 @@ def test_step_program_visits_every_place_in_its_time():
     ("change", "says"),
     [
         ({"direction": (0, 0, 0)}, "direction"),
-        ({"count": 0}, "at least one place"),
+        ({"count": 0}, "at least one position"),
         ({"dwell": 0.0}, "positive dwell"),
         ({"start": (1, 2)}, "three finite numbers"),
         ({"home": (0, 0, float("nan"))}, "'home'"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from errormotion import datasets, plugins
+from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
@@ -32,16 +33,16 @@ def identify(
     as_json: bool,
 ) -> None:
     """Identify one raw dataset into a file, or several into a folder."""
-    from errormotion.campaign import batch
-
-    several = len(raws) > 1 or scheduler or workers or batch.is_runs_folder(raws[0])
+    several = len(raws) > 1 or scheduler or workers or is_runs_folder(raws[0])
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
-        _identify_one(batch.raw_of(raws[0]), method_id, settings, out, as_json)
+        _identify_one(raw_of(raws[0]), method_id, settings, out, as_json)
         return
+    from errormotion.campaign import batch
+
     scheduler, note = batch.choose_scheduler(scheduler)
     if note:
         typer.echo(note, err=True)
@@ -54,11 +55,9 @@ def identify(
 
 def _method_of(raw: Path) -> str:
     """Return the id of the method that identifies a raw dataset."""
-    from errormotion.campaign import batch
-
-    if batch.is_runs_folder(raw):
+    if is_runs_folder(raw):
         raise DatasetError(f"{raw}: is a folder of runs; name the method with --method")
-    path = batch.raw_of(raw)
+    path = raw_of(raw)
     with reading(path), datasets.load(path) as dataset:
         schema = str(dataset.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)

@@ -1,8 +1,7 @@
-"""A line that comes back: what an instrument needs that is asked for days, and may be unplugged meanwhile."""
+"""A line of bytes that is opened again after it was lost, for instruments that are read for days."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,14 +10,14 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.base import CHUNK, Transport
+from errormotion.instruments.transports.lost import Reopened
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
 
 class ReconnectingTransport(Transport):
-    """Connects again by itself when the connection is lost, but not more often than every ``retry`` seconds.
+    """A transport whose connection is opened again after it was lost; see `transports.lost`.
 
-    The exchange in which a connection is lost fails; the next one connects anew. A connection that was closed while
-    nobody used it is noticed by `forget_input`, before anything is asked.
+    A connection that was closed while it was not in use is detected by `forget_input`, ahead of a request.
 
     Parameters
     ----------
@@ -26,15 +25,15 @@ class ReconnectingTransport(Transport):
     connect : callable
         Opens a connection, or raises InstrumentError.
     timeout : float
-        Time limit of a silent read, s.
+        Time limit of a read without data, s.
     retry : float
         Least time between two attempts to connect, s.
     simulated : bool
     end : callable, optional
         Called when this is closed.
     recorder : Recorder, optional
-        Where the frames of all connections are written, and what would have been sent while there was none: played
-        back, the same exchanges fail.
+        Records the frames of all connections, and those that were not sent while there was none: in a replay the same
+        exchanges fail.
     """
 
     def __init__(
@@ -50,48 +49,31 @@ class ReconnectingTransport(Transport):
     ) -> None:
         super().__init__(url, timeout)
         self.simulated = simulated
-        self._connect, self._retry, self._end, self._recorder = connect, retry, end, recorder
-        self._inner: Transport | None = None
-        self._tried = 0.0
-        self._lost_by = ""
-        self._closed = False
+        self._line, self._end, self._recorder = Reopened(url, self._opened, retry), end, recorder
+        self._connect = connect
         try:
-            self._line()
+            self._line.get()
         except BaseException:
             self.close()
             raise
 
-    def lose(self, why: str) -> None:
+    def lose(self, reason: str) -> None:
         """Give the connection up; the next exchange opens another one."""
-        inner, self._inner = self._inner, None
-        self._rest, self._lost_by = b"", why
-        if inner is not None:
-            inner.close()
+        self._rest = b""
+        lost = self._line.lose(reason)
+        if lost is not None:
+            lost.close()
 
-    def _line(self) -> Transport:
-        if self._closed:
-            raise InstrumentError(f"The connection to {self.url} is closed")
-        if self._inner is None:
-            now = time.monotonic()
-            if self._lost_by and now < self._tried + self._retry:
-                raise InstrumentError(
-                    f"{self._lost_by}; the next attempt is in {self._tried + self._retry - now:.1f} s"
-                )
-            self._tried = now
-            try:
-                self._inner = self._connect()
-            except InstrumentError as error:
-                self._lost_by = str(error)
-                raise
-            self._inner.url = self.url  # messages name the address that a person knows
-            self.holds_back = self._inner.holds_back
-            self._lost_by = ""
-        return self._inner
+    def _opened(self) -> Transport:
+        line = self._connect()
+        line.url = self.url  # messages state the address of the bench file
+        self.holds_back = line.holds_back
+        return line
 
     def _send(self, data: bytes) -> None:
         if self._recorder is not None:
             self._recorder.frame("W", data)  # before it goes out: the answer must not overtake it
-        line = self._line()
+        line = self._line.get()
         try:
             line.write(data)
         except InstrumentError as error:
@@ -99,10 +81,11 @@ class ReconnectingTransport(Transport):
             raise
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
-        if self._inner is None:
-            raise InstrumentError(self._lost_by or f"The connection to {self.url} is closed")
+        line = self._line.connection
+        if line is None:
+            raise InstrumentError(self._line.reason or f"The connection to {self.url} is closed")
         try:
-            data = self._inner.read(max_bytes, timeout)
+            data = line.read(max_bytes, timeout)
         except InstrumentTimeoutError:
             raise
         except InstrumentError as error:
@@ -114,12 +97,11 @@ class ReconnectingTransport(Transport):
 
     def close(self) -> None:
         """Close for good; idempotent."""
-        self._closed = True
-        inner, self._inner = self._inner, None
+        line = self._line.close()
         end, self._end = self._end, None
         try:
-            if inner is not None:
-                inner.close()
+            if line is not None:
+                line.close()
         finally:
             if end is not None:
                 end()
@@ -128,18 +110,18 @@ class ReconnectingTransport(Transport):
 
 
 def forget_input(line: Transport) -> bytes:
-    """Return what lies unread on a line, and so forget late answers; a connection that was lost meanwhile is let go."""
+    """Discard and return the unread bytes of a line, such as late answers; detect a connection that was lost."""
     old = b""
-    with suppress(InstrumentError):  # silence is what is hoped for; a lost connection is opened by the next write
+    with suppress(InstrumentError):  # silence is expected; the next write opens a lost connection again
         while data := line.read(CHUNK, timeout=0.0):
             old += data
     return old
 
 
 def give_up_silent(line: Transport) -> None:
-    """After silence: a TCP connection may be a dead one, and a late answer of no use; so begin with a new one."""
+    """Give a TCP connection up after a timeout: it may be dead, and a late answer must not be read as the next one."""
     if isinstance(line, ReconnectingTransport) and line.holds_back:
-        line.lose(f"{line.url} was silent")
+        line.lose(f"{line.url} did not answer")
 
 
 def open_reconnecting(
@@ -151,7 +133,7 @@ def open_reconnecting(
     retry: float = 1.0,
     baudrate: int | None = None,
 ) -> ReconnectingTransport | ReplayTransport:
-    """Open a line of bytes that comes back after it was lost; ``replay://`` as ever.
+    """Open a line of bytes that is opened again after it was lost; ``replay://`` as in `open_transport`.
 
     Parameters
     ----------
@@ -167,7 +149,7 @@ def open_reconnecting(
     Raises
     ------
     InstrumentError
-        Nobody at the address now, or an address of another kind.
+        No device answers at the address, or the address has another scheme.
     """
     address = parse_address(url) if isinstance(url, str) else url
     if address.scheme == "replay":

@@ -1,9 +1,10 @@
-"""How a machine tool moves wrongly while it warms up, from balls on its table that it touches itself (Yang et al.).
+"""Thermal errors of a machine tool from balls on its table that it probes itself while it warms up (Yang et al.).
 
-``method`` is the plugin. From touches to result: ``reading`` takes them out of the raw dataset, ``rigid`` finds the
-motion of every probing cycle in one least-squares problem (``chain`` solves it), ``moved`` finds balls that moved and
-touches that are wrong, ``spheres`` and ``normals`` make centres, planes and the published construction of them,
-``bound`` says how good any estimate can be, and ``identification`` puts them together.
+``method`` is the plugin, ``acquisition`` the measurement, ``simulation`` its replacement by the virtual machine. In
+``identification``: ``reading`` reads the raw dataset, ``rigid`` determines the motion of every probing cycle in one
+least-squares problem (solved by ``chain``), ``moved`` detects balls that moved and outliers among the touches,
+``spheres`` and ``normals`` compute centres, planes and the published construction, ``bound`` is the Cramer-Rao bound,
+and ``identify`` combines them.
 """
 
 from errormotion.methods.normal_vector.method import NormalVector

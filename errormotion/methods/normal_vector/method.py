@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import xarray as xr
-
-from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
@@ -14,11 +11,13 @@ from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    import xarray as xr
+
 SCHEMA = "errormotion.raw.normal_vector/1"
 
 
 class NormalVector:
-    """How the frame of a machine's axes moves and turns while it warms up, from balls that its own probe touches."""
+    """Translation and rotation of the frame of the axes during warm-up, from balls touched by the machine itself."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="normal_vector",
@@ -26,12 +25,12 @@ class NormalVector:
         status="simulated_only",
         version="1",
         cannot_see=(
-            "a tilt of the spindle behind the last axis: the tip always sits at the same place of it, and all balls "
-            "seem to move alike",
-            "where two axes carry the workpiece: the turn about the one that carries the tool, and the other turns "
-            "without balls at different heights along it",
-            "what bends or stretches the axes: they are taken to move as one rigid frame",
-            "drift faster than the probing cycles follow one another",
+            "a tilt of the spindle relative to the last axis: the tip keeps its position in the spindle, so that all "
+            "balls appear displaced equally",
+            "where two axes carry the workpiece: the rotation about the axis that carries the tool, and the other "
+            "rotations unless the balls lie at different heights along it",
+            "bending and expansion of the axes: they are assumed to move as one rigid frame",
+            "drift faster than the interval of the probing cycles",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)
@@ -50,15 +49,15 @@ class NormalVector:
         inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield one raw dataset a probing cycle. See ``acquisition``."""
+        """Measure; yield one raw dataset for each probing cycle. See ``acquisition``."""
         from errormotion.methods.normal_vector.acquisition import measure as acquisition
 
         return acquisition.acquire(bench, settings, done)
 
     def programs(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> Mapping[str, str]:
-        """Return the NC programs with which a machine makes the test by itself, the name of each file to its text.
+        """Return the NC programs of the test, file name to text.
 
-        The tip is that of the settings, else that of the bench's touch probe.
+        The tip radius is that of the settings, else that of the bench's touch probe.
         """
         from errormotion.methods.normal_vector.acquisition.programs import programs
 
@@ -66,19 +65,19 @@ class NormalVector:
         return programs(settings if settings.tip_radius or not tip else settings.model_copy(update={"tip_radius": tip}))
 
     def motions(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
-        """Return every step that the machine will make, for its limits and for a dry run."""
+        """Return every step of the machine, for the check of its limits and for a dry run."""
         from errormotion.methods.normal_vector.acquisition.cycle import campaign_steps
 
         return campaign_steps(settings, instruments)
 
     def check(self, settings: BallSettings) -> dict[str, str]:
-        """Return what a campaign cannot be made with: too few balls, or no cycle behind the cold one."""
+        """Return the settings with which no campaign is possible: too few balls, or no cycle after the cold one."""
         found = {}
         if len(settings.balls) < 3:
-            found["balls"] = f"expected the rough places of three balls or more; found {len(settings.balls)}"
+            found["balls"] = f"expected the approximate centres of three or more balls; found {len(settings.balls)}"
         if settings.interval > settings.duration:
             found["interval"] = (
-                f"expected no more than the duration, {settings.duration:g} s, so that a cycle follows the cold one; "
+                f"expected at most the duration, {settings.duration:g} s, so that a cycle follows the cold one; "
                 f"found {settings.interval:g} s"
             )
         return found
@@ -88,13 +87,13 @@ class NormalVector:
         return "time"
 
     def progress(self, settings: BallSettings) -> float:
-        """Return the number of probing cycles, the cold one included."""
+        """Return the number of probing cycles, including the cold one."""
         from errormotion.methods.normal_vector.acquisition.cycle import cycles
 
         return float(cycles(settings))
 
     def follow(self, settings: BallSettings) -> Callable[[xr.Dataset], str]:
-        """Return what tells of each cycle how far the balls have gone; see ``live``."""
+        """Return a function that reports the displacement of the balls after each cycle; see ``live``."""
         from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 
         return LiveBalls(settings).update
@@ -105,16 +104,17 @@ class NormalVector:
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.normal_vector/1``, either variant; stays as it is.
+            Schema ``errormotion.raw.normal_vector/1``, either variant; not modified.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations at once.
+            The raw dataset violates its schema; all violations in one message.
         MethodError
-            The data do not determine the answer, or contradict what is stated of the balls.
+            The data do not determine the errors, or contradict the stated balls.
         """
+        from errormotion.datasets import validate
         from errormotion.methods.normal_vector.identification.identify import identify_motion
 
         settings = settings or BallSettings()
@@ -125,7 +125,7 @@ class NormalVector:
         return identify_motion(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BallSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros over the cycles whose covariance is the one to expect. See ``planning``."""
+        """Return an error dataset of zeros over the cycles with the expected covariance. See ``planning``."""
         from errormotion.methods.normal_vector.planning import plan
 
         return plan(self, settings or BallSettings())

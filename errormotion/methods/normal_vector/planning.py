@@ -1,4 +1,4 @@
-"""What to expect before anything is touched, and which freedoms will not be seen."""
+"""Expected uncertainty of a measurement, and the errors that it will not determine."""
 
 from __future__ import annotations
 
@@ -22,22 +22,20 @@ if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
     from errormotion.plugins import Method
 
-    Array = Array
-
 TIP_RADIUS, NOISE = 3e-3, 0.25e-6
-"""Taken where the settings leave them to the probe, m."""
+"""Radius of the tip and noise of a touch where the settings have none, m."""
 
 
 def plan(method: Method, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros over the cycles, with the covariance to expect of balls, touches and noise.
+    """Return an error dataset of zeros over the cycles, with the covariance expected from balls, touches and noise.
 
-    ``normals_loss(dof)`` is by what factor the published construction is less certain; ``notes`` say in words what
-    will be known how well, and what not at all.
+    ``normals_loss(dof)`` is the uncertainty of the published construction relative to that of the fit; ``notes`` state
+    the expected uncertainties and the errors that are not determined.
 
     Raises
     ------
     MethodError
-        Fewer than three balls, or balls that leave open what they could show.
+        Fewer than three balls, or a layout of balls that leaves errors undetermined.
     """
     names = touching.names(settings)
     rough = np.array([ball.centre for ball in settings.balls], dtype=float).reshape(-1, 3)
@@ -47,8 +45,8 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     noise, count = settings.touch_noise or NOISE, int(method.progress(settings))
     if count < 2:
         raise MethodError(
-            f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at "
-            f"intervals of {settings.interval:g} s."
+            f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at an "
+            f"interval of {settings.interval:g} s."
         )
     seen = planned_touches(settings, count, noise)
     found = fit(seen, motion, interpolate=False)
@@ -82,16 +80,16 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
 
 
 def planned_touches(settings: Settings, cycles: int, noise: float) -> Observations:
-    """Return the touches of cycles in which nothing moves, one cycle an interval."""
+    """Return the touches of cycles without errors, one cycle for each interval."""
     normal = touching.normals(settings)
     reach = np.array([ball.radius for ball in settings.balls]) + (settings.tip_radius or TIP_RADIUS)
-    place = np.array([ball.centre for ball in settings.balls], float)[:, None] + reach[:, None, None] * normal
-    b, m, _ = place.shape
+    position = np.array([ball.centre for ball in settings.balls], float)[:, None] + reach[:, None, None] * normal
+    b, m, _ = position.shape
     weight = np.zeros((cycles, b, m, m))
     weight[..., range(m), range(m)] = noise**-2
     time = np.asarray(settings.interval * np.arange(cycles))
     every = np.array(np.broadcast_to(time[:, None, None], (cycles, b, m)))
-    return Observations(np.tile(place, (cycles, 1, 1, 1)), weight, every, time, touched=True)
+    return Observations(np.tile(position, (cycles, 1, 1, 1)), weight, every, time, touched=True)
 
 
 def _loss(
@@ -114,32 +112,32 @@ def _loss(
 
 
 def _factors(shared: Array) -> Array:
-    """Return columns whose squares sum to a covariance (6, 6): (source, 6)."""
+    """Return columns whose outer products sum to a covariance (6, 6): (source, 6)."""
     u = np.sqrt(np.maximum(np.diagonal(shared), 0.0))
     unit = np.where(u > 0, u, 1.0)
     values, vectors = np.linalg.eigh(shared / np.outer(unit, unit))
-    some = values > 1e-9
-    return np.asarray((vectors[:, some] * np.sqrt(values[some])).T * u)
+    significant = values > 1e-9
+    return np.asarray((vectors[:, significant] * np.sqrt(values[significant])).T * u)
 
 
 def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, noise: float) -> list[str]:
     u = np.sqrt(np.diagonal(covariance))
-    said = ", ".join(f"{DOF[k]} {format_quantity(float(u[k]), 'um' if k < 3 else 'arcsec', 3)}" for k in motion.seen)
+    stated = ", ".join(f"{DOF[k]} {format_quantity(float(u[k]), 'um' if k < 3 else 'arcsec', 3)}" for k in motion.seen)
     touches = settings.touches * len(settings.balls)
     notes = [
-        f"With {touches} touches a cycle and {format_quantity(noise, 'um', 2)} noise of each, the standard "
-        f"uncertainties relative to the cold cycle are {said}. Half of the variance is "
-        "the cold cycle's, which is probed once."
+        f"With {touches} touches in each cycle and a noise of {format_quantity(noise, 'um', 2)}, the standard "
+        f"uncertainties relative to the cold cycle are {stated}. Half of the variance is due to the cold cycle, which "
+        "is probed once."
     ]
     if unseen := [DOF[k] for k in range(6) if k not in motion.seen]:
         notes.append(
-            f"Not seen: {', '.join(unseen)}. Only {' and '.join(motion.tool_axes) or 'no axis'} carries the tool, and "
-            "its way is the lever by which a turn shows."
+            f"Not determined: {', '.join(unseen)}. Only {' and '.join(motion.tool_axes) or 'no axis'} carries the "
+            "tool, and a rotation is observed through the travel of these axes alone."
         )
-    notes.append("Not seen: a tilt of the spindle behind the last axis; it displaces all balls alike.")
+    notes.append("Not determined: a tilt of the spindle relative to the last axis; it displaces all balls equally.")
     if np.isinf(loss).any():
         notes.append(published.ONE_PLANE)
     elif np.isfinite(loss).all():
         worse = ", ".join(f"{name} {factor:.2f}" for name, factor in zip(DOF, loss, strict=True))
-        notes.append(f"The normals of two planes would be less certain by the factors {worse}.")
+        notes.append(f"The uncertainties by the normals of two planes would be larger by the factors {worse}.")
     return notes

@@ -15,9 +15,9 @@ REFERENCE_TEMPERATURE = 20.0  # degC
 class Circles:
     """Readings in the order of ``DIRECTIONS``, (2, run, sample), SI.
 
-    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where no times are
-    known. ``expansion`` is the effect of the bar's temperature on its length (2, run), ``shared`` that of one
-    standard uncertainty of sources that all readings share: name to (2, run).
+    ``length`` holds NaN where a reading is missing. ``time`` counts from the calibration of the bar; None where it is
+    not given. ``expansion`` is the effect of the bar's temperature on its length, (2, run), ``shared`` that of one
+    standard uncertainty of each source that all readings share.
     """
 
     length: np.ndarray

@@ -23,9 +23,9 @@ from ballbar_test.extremes import Figures, figures
 class Evaluation:
     """Radial deviations over (2, place), CCW first, and what follows from them; SI, NaN = unknown.
 
-    ``independent`` is the standard uncertainty of a deviation by noise, ``shared`` the effect of one standard uncertainty
-    of each named source. ``model`` is the fitted path, ``offset`` (2,) that of the path from the ball on the table.
-    ``misfit`` is chi-square of the model by degree of freedom.
+    ``independent`` is the standard uncertainty of a deviation by noise, ``shared`` the effect of one standard
+    uncertainty of each named source. ``model`` is the fitted path, ``offset`` (2,) that of the path from the ball on
+    the table. ``misfit`` is chi-square of the model by degree of freedom.
     """
 
     deviation: np.ndarray

@@ -70,7 +70,7 @@ def centred(deviation):
     Parameters
     ----------
     deviation : ndarray, (..., path, place)
-        Radial deviations over one full circle; NaN = unknown, alike in all leading dimensions. All paths have one centre.
+        Radial deviations; NaN = unknown, alike in all leading dimensions. All paths have one centre.
     """
     *lead, paths, places = deviation.shape
     flat = deviation.reshape(*lead, paths * places)

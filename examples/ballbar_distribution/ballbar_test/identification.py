@@ -25,6 +25,7 @@ def identify(raw, settings, method, version):
     errors = dataset(
         found,
         read,
+        settings,
         machine=str(raw.attrs.get("machine", "unknown")),
         frame=str(raw.attrs.get("frame", "machine")),
         reference=result.REFERENCE,
@@ -46,6 +47,7 @@ def plan(settings, method, version):
     errors = dataset(
         found,
         read,
+        settings,
         machine="plan",
         frame="machine",
         reference="planned, not measured",
@@ -58,13 +60,13 @@ def plan(settings, method, version):
     words = ", ".join(f"{name} {value:.2f} um" for name, value in zip(result.NAMES, u, strict=True))
     note = (
         f"With {settings.runs} circles of {settings.samples} readings in each direction, the expanded uncertainties "
-        f"(k = 2) of a path without errors are {words}. Those of G and H are smaller where a path has distinct "
+        f"(k = 2) of a path without errors are {words}. Those of G and H are smaller where the path has distinct "
         "extremes."
     )
     return errors.assign(zero).assign_attrs(notes=[note])
 
 
-def dataset(found, read, **attributes):
+def dataset(found, read, settings, **attributes):
     """Return an evaluation as an error dataset."""
     total = found.independent**2 + sum(effect**2 for effect in found.shared.values())
     over, metre = result.DIMS, {"units": "m"}
@@ -75,6 +77,7 @@ def dataset(found, read, **attributes):
         "offset": ("axis", found.offset, {**metre, "long_name": "set-up error: path against the table's ball"}),
         "offset_u": ("axis", found.offset_u, metre),
         "reading_noise": ((), found.averaged.noise, {**metre, "long_name": "standard deviation of one reading"}),
+        "spike_decay": ((), settings.spike_decay, {"units": "rad", "long_name": "of the model's spikes"}),
         "misfit": ((), found.misfit, {"units": "1", "long_name": "chi-square of the model by degree of freedom"}),
         "drift": ((), found.averaged.drift, {"units": "m/s", "long_name": "of the bar; NaN = not determined"}),
         "drift_u": ((), found.averaged.drift_u, {"units": "m/s"}),

@@ -53,7 +53,7 @@ class Ballbar:
         checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=SCHEMA)
         if checked.attrs["schema"] != SCHEMA:
             raise MethodError(f"ballbar reads raw data of schema {SCHEMA}; found {checked.attrs['schema']}.")
-        validate(checked)
+        validate(checked, RAW_SCHEMAS)
         return identify(checked, settings or Settings(), self.info.id, self.info.version)
 
     def plan(self, settings=None):

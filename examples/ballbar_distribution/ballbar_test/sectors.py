@@ -151,7 +151,7 @@ def check_gaps(count, settings):
 
 
 def first_model(circles, deviation, decay):
-    """Return the model of the path by a fit to single readings: at the readings (2, run, sample), and its parameters."""
+    """Return the model of the path by a fit to single readings: its values there, and circle with parameters, (12,)."""
     known = np.isfinite(deviation)
     angle, sense = circles.angle[known], circles.sense[known]
     design = np.hstack([circle(angle), basis(angle, sense, circles.radius, circles.feed, decay)])

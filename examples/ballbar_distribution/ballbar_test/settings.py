@@ -16,7 +16,7 @@ class Settings(PluginSettings):
 
     # The test
     plane: Literal["XY", "YZ", "ZX"] = Field(
-        default="XY", description="axes of the circle; angles count from the first"
+        default="XY", description="axes of the circle; angles count from the first one"
     )
     centre: tuple[Length, Length, Length] = Field(
         default=(0.0, 0.0, 0.0), description="programmed centre of the circle, machine coordinates"
@@ -35,9 +35,8 @@ class Settings(PluginSettings):
         default=180,
         ge=36,
         multiple_of=4,
-        description="sectors of the circle over which readings are averaged; a multiple of 4, so that no sector holds "
-        "a "
-        "reversal of an axis",
+        description="sectors of the circle over which readings are averaged; a multiple of 4, so that axes reverse "
+        "between sectors",
     )
     largest_gap: Angle = Field(
         default=6 * DEGREE, gt=0, lt=0.5, description="largest arc without a reading; only full circles are centred"

@@ -5,6 +5,7 @@ calibration error, an expansion, a drift of its transducer and noise. Lengths ar
 the linear model of the evaluation.
 """
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,5 +157,10 @@ def raw_dataset(settings, length, angle, time, temperature):
             "direction": list("xyz"),
             "axis": list(settings.plane),
         },
-        attrs={"schema": SCHEMA, "machine": "virtual machine", "frame": "machine"},
+        attrs={
+            "schema": SCHEMA,
+            "machine": "virtual machine",
+            "frame": "machine",
+            "instruments": json.dumps([{"name": "ballbar", "kind": "ballbar", "identity": {"simulated": True}}]),
+        },
     )

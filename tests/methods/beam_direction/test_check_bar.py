@@ -53,7 +53,9 @@ def test_published_centres(name: str, centre: tuple[float, float]) -> None:
 def test_misprint_of_the_published_table_is_named() -> None:
     bar = published("scheme2_0deg_compensated")
     assert bar.left_out == (8,)
-    assert "Point 9 of 20 (index 8, reading 5.465 mm) is an outlier and was ignored: it is 130 um inside" in bar.notes[0]
+    assert (
+        "Point 9 of 20 (index 8, reading 5.465 mm) is an outlier and was ignored: it is 130 um inside" in bar.notes[0]
+    )
 
 
 def test_systematic_residual_of_the_published_compensation_is_called_so() -> None:

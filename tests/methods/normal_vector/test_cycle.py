@@ -123,7 +123,7 @@ def test_a_late_cycle_is_made_at_once_and_those_before_it_are_left_out(interval,
     assert cycle.cycles(chosen) == count + 1
     found = cycle.due(chosen, number, number * interval + late)
     assert found >= number
-    assert found * interval <= number * interval + late + cycle.SHORTEST
+    assert found * interval <= number * interval + late + cycle.SHORTEST_STEP
     assert number * interval + late < (found + 1) * interval
     assert cycle.following(chosen, found * interval) == found + 1
 
@@ -144,7 +144,7 @@ def test_warm_up_fills_its_time_with_what_the_schedule_says(begin, length, event
     schedule = [{"at": float(at), "spindle_speed": float(speed)} for at, speed in sorted(events)]
     chosen = settings(schedule=schedule, moves=moves)
     steps = cycle.warm_up_steps(chosen, begin, begin + length, (0.5, 0.5, 0.9))
-    assert math.fsum(step.seconds for step in steps) == pytest.approx(length, abs=2 * cycle.SHORTEST)
+    assert math.fsum(step.seconds for step in steps) == pytest.approx(length, abs=2 * cycle.SHORTEST_STEP)
     now = begin
     for step in steps:
         assert step.spindle_speed == cycle.speed_at(chosen, now)[0]

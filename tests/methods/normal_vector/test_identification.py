@@ -132,7 +132,7 @@ def test_noise_that_nobody_stated_comes_from_the_residuals(probed):
     stated, found = METHOD.identify(raw), METHOD.identify(raw.drop_vars("touch_noise"))
     # 192 degrees of freedom tell a standard deviation to 5 %; the interval is widened by Student's factor, 1.006.
     assert float(found["noise"]) == pytest.approx(float(stated["noise"]), rel=0.17)
-    assert "by the residuals" in found.attrs["notes"][0]
+    assert "from the residuals" in found.attrs["notes"][0]
 
 
 def test_noise_above_the_stated_one_is_told_and_counted(probed):

@@ -37,18 +37,18 @@ def test_plan_says_what_a_c_frame_does_not_show(probed):
     planned = METHOD.plan(settings_of(probed("cframe")[1]))
     assert np.isnan(planned["EC"]).all()
     text = " ".join(planned.attrs["notes"])
-    assert "Not seen: EC." in text
-    assert "tilt of the spindle behind the last axis" in text
+    assert "Not determined: EC." in text
+    assert "tilt of the spindle relative to the last axis" in text
 
 
 def test_plan_of_balls_that_do_not_do_is_refused():
     one_height = tuple(Ball(centre=(x, y, 0.1)) for x, y in ((0, 0), (0.2, 0), (0, 0.2), (0.2, 0.2)))
-    with pytest.raises(MethodError, match="different places along Z"):
+    with pytest.raises(MethodError, match="different positions along Z"):
         METHOD.plan(Settings(balls=one_height, tool_axes="Z"))
     planned = METHOD.plan(Settings(balls=one_height, tool_axes="XYZ"))
     assert np.isfinite(sigma(planned)).all()
     assert np.isinf(planned["normals_loss"]).all()
-    assert "both normals are one" in planned.attrs["notes"][-1]
+    assert "both normals are equal" in planned.attrs["notes"][-1]
     with pytest.raises(MethodError, match="found 0"):
         METHOD.plan(Settings())
     with pytest.raises(MethodError, match="has none"):
@@ -76,7 +76,10 @@ def test_touches_lie_around_the_ball_and_on_top():
     ("wrong", "message"),
     [
         ({"balls": ({"centre": (0, 0, 0), "name": "A"}, {"centre": (1, 0, 0), "name": "A"})}, "names that differ"),
-        ({"schedule": ({"at": 60.0, "spindle_speed": 1e3}, {"at": 0.0, "spindle_speed": 0.0})}, "times that rise"),
+        (
+            {"schedule": ({"at": 60.0, "spindle_speed": 1e3}, {"at": 0.0, "spindle_speed": 0.0})},
+            "expected increasing times",
+        ),
         ({"normals_balls": ("1", "2", "3", "3")}, "four different balls"),
         ({"touches": 3}, "greater than or equal to 4"),
     ],

@@ -161,5 +161,5 @@ def test_the_first_touch_of_a_ball_names_it_as_a_control_can_read_it() -> None:
 
 
 def test_without_balls_there_is_no_program() -> None:
-    with pytest.raises(MethodError, match="three balls or more; found none"):
+    with pytest.raises(MethodError, match="three or more balls; found none"):
         NormalVector().programs(Settings())

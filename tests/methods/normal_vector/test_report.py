@@ -22,7 +22,7 @@ HEADINGS = [
     "Errors and temperatures",
     "Balls",
     "Touches and residuals",
-    "The published normals beside the fit",
+    "Published normals compared with the fit",
     "Temperature sensors",
     "Uncertainty",
     "Data quality",
@@ -119,7 +119,7 @@ def test_errors_in_the_table_are_those_of_the_dataset(folder):
 def test_displacements_of_the_balls_are_those_of_the_dataset(folder):
     errors, _ = clean()
     moved = errors["ball_displacement"].values / UM
-    found = rows(page(clean, folder), "Centres of the balls")[2:]
+    found = rows(page(clean, folder), "Apparent centres of the balls")[2:]
     assert [row[0] for row in found] == ["B1", "B2", "B3", "B4"]
     for row, own in zip(found, moved.transpose(1, 0, 2), strict=True):
         assert [number(cell.split("±")[0]) for cell in row[4:7]] == pytest.approx(own[-1], abs=0.06)
@@ -130,7 +130,7 @@ def test_displacements_of_the_balls_are_those_of_the_dataset(folder):
 def test_enlargement_that_is_told_is_the_one_that_is_drawn():
     seen = probing(*clean())
     figure = balls(seen, "k")
-    factor = int(re.search(r"displacements (\d[\d\u202f]*) times", figure.caption)[1].replace("\u202f", ""))
+    factor = int(re.search(r"magnified (\d[\d\u202f]*) times", figure.caption)[1].replace("\u202f", ""))
     span = np.linalg.norm(np.ptp(seen.centre[0], axis=0))
     longest = np.linalg.norm(seen.displacement, axis=2).max()
     assert 0.02 * span < factor * longest < 0.25 * span
@@ -145,7 +145,7 @@ def test_cost_of_the_normals_is_a_number_and_a_curve(folder):
     for i, name in enumerate(("EX", "EY", "EZ", "EA", "EB", "EC")):
         assert number(found[name][4]) == pytest.approx(np.nanmedian(loss[:, i]), abs=0.006)
         assert number(found[name][5]) == pytest.approx(np.nanmax(loss[:, i]), abs=0.006)
-    assert "Cost: standard uncertainty by the normals over that of the fit" in words(html)
+    assert "Standard uncertainty by the normals over that of the fit" in words(html)
 
 
 def test_residuals_are_counted_by_ball_and_by_reason(folder):
@@ -166,8 +166,8 @@ def test_ball_that_moved_is_named_and_marked(folder):
     html = words(page(troubled, folder))
     assert "Moved on the table: B2." in html
     assert "B2 (moved)" in html
-    assert "from cycle 5 on" in html
-    assert "Red and broken: B2" in html
+    assert "from cycle 5" in html
+    assert "Red, dashed: B2" in html
 
 
 def test_remarks_of_the_method_and_flags_of_the_probe_are_told(folder):
@@ -182,10 +182,10 @@ def test_remarks_of_the_method_and_flags_of_the_probe_are_told(folder):
 
 def test_centre_that_lost_its_top_touch_is_not_drawn_as_a_displacement():
     seen = probing(*clean())
-    assert seen.sound.all()
+    assert seen.well_known.all()
     seen.centre_u[4, 2, 2] = 30 * UM
     seen.displacement[4, 2, 2] = 500 * UM
-    assert not seen.sound[4, 2]
+    assert not seen.well_known[4, 2]
     assert "500" not in balls(seen, "k").caption
     assert "Not drawn: 1 centres" in balls(seen, "k").caption
 
@@ -196,9 +196,9 @@ def test_freedom_that_is_not_seen_is_a_dash_with_its_reason(folder):
     assert row[2].startswith("—")
     assert row[7] == "0 of 10"
     text = words(html)
-    assert "Not observed: EC. Reported as unknown, not as zero." in text
-    assert "of the axes only Z move the tool" in text
-    assert "not part of this result; the remarks on the data's quality say why" in text
+    assert "Not determined: EC. Reported as unknown, not as zero." in text
+    assert "only Z carry the tool" in text
+    assert "The result contains no published normals; the reason is stated under data quality." in text
 
 
 def test_temperatures_and_speed_share_the_time_axis_of_the_errors(folder):
@@ -250,7 +250,7 @@ def test_result_by_the_normals_says_so(tmp_path):
     raw = warm_up()
     errors = NormalVector().identify(raw, NormalVector.Settings(procedure="normals"))
     text = words(write_report(errors, tmp_path / "r.html", raw=raw).read_text(encoding="utf-8"))
-    assert "The result of this page is by the published normals" in text
+    assert "The result of this page is that of the published normals" in text
     assert "Normals minus fit" not in text
 
 
@@ -261,8 +261,8 @@ def test_result_without_any_of_its_extras_still_has_a_page(tmp_path):
         errors="ignore",
     )
     text = words(write_report(bare, tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert "The result holds no displacements of balls" in text
-    assert "The result holds no residuals" in text
+    assert "The result contains no displacements of balls" in text
+    assert "The result contains no residuals" in text
     assert "No temperatures were recorded." in text
 
 
@@ -274,7 +274,7 @@ def test_cycles_that_are_all_unknown_are_told(tmp_path):
     gone["covariance"][:] = np.nan
     gone = gone.drop_vars(["influence"])
     text = words(write_report(gone, tmp_path / "r.html", raw=raw).read_text(encoding="utf-8"))
-    assert "the errors of 10 are not" in text
+    assert "the errors of 10 are unknown" in text
     assert "No cycle determines the errors" in text
 
 

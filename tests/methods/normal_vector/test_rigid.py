@@ -6,7 +6,7 @@ import pytest
 from errormotion.methods.normal_vector.acquisition.touching import touch_normals
 from errormotion.methods.normal_vector.identification import chain
 from errormotion.methods.normal_vector.identification.bound import bound
-from errormotion.methods.normal_vector.identification.freedoms import Motion, turned, undetermined
+from errormotion.methods.normal_vector.identification.freedoms import Motion, rotated, undetermined
 from errormotion.methods.normal_vector.identification.rigid import Observations, fit, knot_weights
 
 BALLS = {
@@ -94,9 +94,9 @@ def test_a_milliradian_is_turned_exactly():
 def test_a_turn_leaves_lengths_as_they_are():
     rng = np.random.default_rng(1)
     rotation, vector = rng.normal(size=(2, 50, 3))
-    np.testing.assert_allclose(np.linalg.norm(turned(rotation, vector), axis=1), np.linalg.norm(vector, axis=1))
-    np.testing.assert_allclose(turned(np.zeros(3), vector), vector)
-    np.testing.assert_allclose(turned(np.array([0, 0, np.pi / 2]), np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(rotated(rotation, vector), axis=1), np.linalg.norm(vector, axis=1))
+    np.testing.assert_allclose(rotated(np.zeros(3), vector), vector)
+    np.testing.assert_allclose(rotated(np.array([0, 0, np.pi / 2]), np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-15)
 
 
 @pytest.mark.parametrize("axes", ["XYZ", "Z"])

@@ -31,7 +31,7 @@ def test_balls_in_one_line(probed):
     _, raw = probed()
     line = raw["ball_nominal"][0].values + np.outer([0, 1, 2, 3], [1.0, 0.1, 0.0])
     raw = moved(raw, line - raw["ball_nominal"].values)
-    refused(raw, "lie in one line.*Set up one ball away")
+    refused(raw, "lie in one line.*Set up one ball as far")
 
 
 def test_balls_at_one_height_on_a_c_frame_are_enough_for_a_gantry_alone(probed):
@@ -39,10 +39,10 @@ def test_balls_at_one_height_on_a_c_frame_are_enough_for_a_gantry_alone(probed):
     shift = np.zeros((4, 3))
     shift[:, 2] = 0.1 - raw["ball_nominal"].values[:, 2]
     raw = moved(raw, shift)
-    refused(raw, r"only by balls at different places along Z.*EA, EB cannot be told.*posts")
+    refused(raw, r"only by balls at different positions along Z.*EA, EB cannot be distinguished.*posts")
     errors = METHOD.identify(raw.assign_attrs(tool_axes="XYZ"), Settings(robust=False))
     assert np.isfinite(errors["EC"]).all()
-    assert any("both normals are one" in note for note in errors.attrs["notes"])
+    assert any("both normals are equal" in note for note in errors.attrs["notes"])
 
 
 def test_no_axis_carries_the_tool_so_that_only_displacements_show(probed):
@@ -56,7 +56,7 @@ def test_axes_that_there_are_not(probed):
 
 
 def test_too_few_touches_for_a_sphere(probed):
-    refused(probed()[1].isel(touch=slice(0, 3)), "Ball B1 was touched at 3 places; a sphere needs four")
+    refused(probed()[1].isel(touch=slice(0, 3)), "Ball B1 was touched in 3 directions; a sphere needs four")
     refused(probed()[1].isel(touch=slice(0, 4)), "no sphere through its touches.*one plane")
 
 
@@ -82,25 +82,25 @@ def test_radii_that_the_touches_contradict(probed):
 def test_balls_in_another_order_than_stated(probed):
     _, raw = probed()
     raw["ball_nominal"] = raw["ball_nominal"].copy(data=raw["ball_nominal"].values[[1, 0, 2, 3]])
-    refused(raw, "Ball B1 was found where ball B2 should be")
+    refused(raw, "Ball B1 was found at the position of ball B2")
 
 
 def test_ball_that_is_nowhere_near_its_place(probed):
     _, raw = probed()
     raw["ball_nominal"][2, 0] += 0.05
-    refused(raw, "Ball B3 was found 50.1 mm from its rough place")
+    refused(raw, "Ball B3 was found 50.1 mm from its nominal position")
 
 
 def test_balls_in_another_order_in_one_cycle(probed):
     _, raw = probed()
     raw["touch"][3] = raw["touch"].values[3, [1, 0, 2, 3]]
-    refused(raw, "In cycle 3 ball B1 was touched where ball B2 is")
+    refused(raw, "In cycle 3 ball B1 was touched at the position of ball B2")
 
 
 def test_something_else_was_touched(probed):
     _, raw = probed()
     raw["touch"][3, 2] += 0.02
-    refused(raw, "In cycle 3 ball B3 was touched 34.64 mm from where")
+    refused(raw, "In cycle 3 ball B3 was touched 34.64 mm from its touches")
 
 
 def test_time_that_does_not_increase(probed):
@@ -110,7 +110,7 @@ def test_time_that_does_not_increase(probed):
 def test_touches_on_another_clock(probed):
     _, raw = probed()
     raw["touch_time"] = (raw["touch_time"] * 0 + raw["touch_time"].values[0]).assign_attrs(units="s")
-    refused(raw, "touch_time: expected cycle 0 to end before cycle 1 begins")
+    refused(raw, "touch_time: expected cycle 0 to end before cycle 1 starts")
 
 
 def test_cold_cycle_that_is_missing(probed):
@@ -119,7 +119,7 @@ def test_cold_cycle_that_is_missing(probed):
         raw.isel(time=slice(2, None)), 'cold cycle is missing: expected the first cycle at 0 s.*reference = "first"'
     )
     raw["touch"][0] = np.nan
-    refused(raw, "cycle 0 holds no good touch")
+    refused(raw, "cycle 0 has no good touch")
 
 
 def test_one_cycle_alone(probed):
@@ -145,7 +145,7 @@ def test_noise_of_nothing(probed):
     _, raw = probed()
     raw["touch_noise"] = raw["touch_noise"] * 0
     raw["touch_noise"].attrs["units"] = "m"
-    refused(raw, "touch_noise above 0")
+    refused(raw, "touch_noise: expected more than 0 m")
 
 
 def test_normals_where_they_say_nothing(probed):
@@ -163,7 +163,7 @@ def test_data_of_another_method(probed):
     ("settings", "said"),
     [
         ({"normals_balls": ("1", "2", "3", "5")}, "normals_balls: expected names of 1, 2, 3, 4; found 5"),
-        ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected places apart; 2 and 4 would be within one another"),
+        ({"centre_of_4": (0.42, 0.0, 0.0)}, "balls: expected separate balls; 2 and 4 overlap"),
     ],
 )
 def test_balls_that_cannot_be_are_refused_before_anything_is_touched(settings, said):

@@ -12,7 +12,7 @@ from errormotion.instruments.point_lds.optoncdt.codec import COUNTER_BITS, encod
 from errormotion.instruments.streaming import Chunk
 
 LARGEST_GAP = 1 << (COUNTER_BITS - 1)
-"""Samples: half the counter's circle; more cannot be told from a counter that ran backwards."""
+"""Samples: half the counter's circle; more cannot be distinguished from a counter that ran backwards."""
 
 
 class StreamDecoder:
@@ -36,11 +36,6 @@ class StreamDecoder:
         self._next = 0
         self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
         self._state[kernels.ANCHORED] = from_zero
-
-    @property
-    def orphans(self) -> int:
-        """Values so far that did not fit together."""
-        return int(self._state[kernels.ORPHANS])
 
     def __call__(self, data: bytes) -> Chunk:
         """Return the samples that the next bytes complete.

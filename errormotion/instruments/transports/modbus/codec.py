@@ -12,8 +12,6 @@ from typing import Literal
 from errormotion.errors import InstrumentError, ProtocolError
 
 Framing = Literal["tcp", "rtu"]
-MOST_REGISTERS = 125
-"""In one answer: their number of bytes has to fit into one byte."""
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal data address",
@@ -40,7 +38,7 @@ def crc16(data: bytes) -> bytes:
 
 
 def encode_request(framing: Framing, unit: int, function: int, register: int, count: int, number: int = 0) -> bytes:
-    """Return the request for ``count`` registers from ``register`` on; ``number`` tells TCP's transactions apart."""
+    """Return the request for ``count`` registers from ``register`` on; ``number`` distinguishes TCP's transactions."""
     return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
 
 
@@ -48,11 +46,6 @@ def encode_answer(framing: Framing, unit: int, function: int, registers: Sequenc
     """Return the answer with these registers."""
     pdu = struct.pack(f">BB{len(registers)}H", function, 2 * len(registers), *registers)
     return _frame(framing, unit, pdu, number)
-
-
-def encode_refusal(framing: Framing, unit: int, function: int, code: int, number: int = 0) -> bytes:
-    """Return an exception reply."""
-    return _frame(framing, unit, bytes((function | 0x80, code)), number)
 
 
 def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
@@ -63,14 +56,14 @@ def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
 
 
 def missing(framing: Framing, data: bytes) -> int:
-    """Return how many bytes an answer that begins so still lacks, as far as its beginning tells."""
+    """Return how many bytes an answer that starts so still lacks, as far as its start shows."""
     if framing == "rtu":
         size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
     elif len(data) < _HEAD - 1:
         size = _HEAD + 2
     else:
         protocol, length = struct.unpack(">HH", data[2:6])
-        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: nothing is worth waiting for
+        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: no further bytes are awaited
     return max(size - len(data), 0)
 
 
@@ -92,7 +85,7 @@ def decode_answer(
 
 
 class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
-    """The device answers that it does not do what it was asked for.
+    """The device answers that it does not do what it was requested.
 
     Attributes
     ----------

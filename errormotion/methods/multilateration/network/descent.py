@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.problem import Problem, Sums
 
@@ -95,26 +94,14 @@ def _rehearsed(problem: Problem, stations: Stations, Z: Array) -> Stations:
     return stations
 
 
-@compiled()
-def _step(Z: Array, H: Array, h: Array, mu: float) -> tuple[Array, float, float]:  # pragma: no cover - compiled
-    """Return the step of the stations' parameters within the columns of Z, damped by mu, its size, and what it gains.
+def _step(Z: Array, H: Array, h: Array, mu: float) -> tuple[Array, float, float]:
+    """Return the step of the stations' parameters within the columns of Z, damped by mu, its size, and its gain.
 
-    The size is its largest part; what it gains of the sum of squares is to second order.
+    The size is its largest part; the gain is that of the sum of squares, to second order.
     """
-    q, p = Z.shape
-    A, b = Z.T @ H @ Z, Z.T @ h
-    least = 1e-30 * np.trace(A) + 1e-300
-    scale = np.empty(p)
-    for i in range(p):
-        scale[i] = 1.0 / np.sqrt(max(A[i, i], least))
-    for i in range(p):
-        b[i] *= scale[i]
-        for j in range(p):
-            A[i, j] *= scale[i] * scale[j]
-        A[i, i] += mu
-    x = np.linalg.lstsq(A, b, 1e-15)[0]
-    step, gain, size = Z @ (scale * x), 0.0, 0.0
-    for i in range(q):
-        size = max(size, abs(step[i]))
-        gain += step[i] * h[i]
-    return step, size, gain
+    A = Z.T @ H @ Z
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-30 * np.trace(A) + 1e-300))
+    A *= np.outer(scale, scale)
+    A[np.diag_indices_from(A)] += mu
+    step = Z @ (scale * np.linalg.lstsq(A, scale * (Z.T @ h), 1e-15)[0])
+    return step, float(np.abs(step).max()), float(step @ h)

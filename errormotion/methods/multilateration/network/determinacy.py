@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations
 
 LOOSE = 0.05
@@ -107,37 +106,18 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     )
 
 
-@compiled()
 def _freedoms(
     information: Array, basis: Array, place: Array, target: Array
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:  # pragma: no cover - compiled
-    """Return eigenvalues of the information, its diagonal made 1; what a deviation of each does, how far, and if loose.
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return eigenvalues of the information with its diagonal made 1, and for each the motion by one deviation.
 
-    How far is that of places and dead paths.
+    Also the size of the motion (positions and dead paths), and whether it is loose.
     """
-    distance = 0.0
-    for k in range(3):
-        middle = np.mean(target[:, k])
-        distance += np.mean((place[:, k] - middle) ** 2)
-    far = LOOSE * np.sqrt(distance)
-    p = len(information)
-    scale, scaled = np.empty(p), np.empty((p, p))
-    for i in range(p):
-        scale[i] = 1.0 / np.sqrt(max(information[i, i], _NOTHING * np.trace(information)))
-    for i in range(p):
-        for j in range(p):
-            scaled[i, j] = information[i, j] * scale[i] * scale[j]
-    values, vectors = np.linalg.eigh(scaled)
-    factor = np.empty((p, p))
-    for j in range(p):
-        size = 1.0 / np.sqrt(max(values[j], _NOTHING * values[-1]))
-        for i in range(p):
-            factor[i, j] = scale[i] * vectors[i, j] * size
-    motions, sigma = basis @ factor, np.zeros(p)
-    for j in range(p):
-        for i in range(4 * len(place)):
-            sigma[j] += motions[i, j] ** 2
-    sigma = np.sqrt(sigma)
+    far = LOOSE * np.sqrt(np.mean((place - target.mean(axis=0)) ** 2, axis=0).sum())
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), _NOTHING * np.trace(information)))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    motions = basis @ (scale[:, None] * vectors / np.sqrt(np.maximum(values, _NOTHING * values[-1])))
+    sigma = np.linalg.norm(motions[: 4 * len(place)], axis=0)
     return values, motions, sigma, (values < DIGITS * values[-1]) | (sigma > far)
 
 
@@ -281,20 +261,33 @@ def _of_target(target: Array, place: Array) -> str:
     return "it lies nearly in one plane with the stations that see it"
 
 
-def swapped_stations(found: Array, rough: Array | None) -> list[str]:
-    """Return a note where the stations found (n, 3) fit their rough places (n, 3) in another order."""
+def swapped_stations(found: Array, rough: Array | None) -> list[tuple[int, int]]:
+    """Return stations (j, k), from 0, of which j was found where k is stated, where another order fits much better.
+
+    Positions are (n, 3), m: as found, and as stated.
+    """
     if rough is None or not np.isfinite(rough).all():
         return []
     from scipy.optimize import linear_sum_assignment
 
     off = np.linalg.norm(found[:, None] - rough[None], axis=-1)
     rows, columns = linear_sum_assignment(off)
-    own, other = np.diag(off), off[rows, columns]
-    if (rows == columns).all() or not other.sum() < 0.5 * own.sum():
+    if (rows == columns).all() or not off[rows, columns].sum() < 0.5 * np.diag(off).sum():
         return []
-    pairs = [(j + 1, k + 1) for j, k in zip(rows, columns, strict=True) if j != k]
-    changed = [f"the readings of station {j} are those of station {k}" for j, k in pairs]
+    return [(int(j), int(k)) for j, k in zip(rows, columns, strict=True) if j != k]
+
+
+def swap_note(found: Array, rough: Array | None) -> list[str]:
+    """Return a note on swapped stations."""
+    pairs = swapped_stations(found, rough)
+    if not pairs or rough is None:
+        return []
+    order = np.arange(len(found))
+    for j, k in pairs:
+        order[j] = k
+    own, other = (np.linalg.norm(found - each, axis=1).max() * 1e3 for each in (rough, rough[order]))
+    changed = ", ".join(f"the readings of station {j + 1} are those of station {k + 1}" for j, k in pairs)
     return [
-        f"stations look swapped: {', '.join(changed)} (as given they are {own.max() * 1e3:.4g} mm off their rough "
-        f"places, swapped {other.max() * 1e3:.4g} mm); the targets are right, the names of the stations are not"
+        f"stations are probably swapped: {changed} (as stated, they are {own:.4g} mm off their approximate positions, "
+        f"swapped {other:.4g} mm); the targets are right, the names of the stations are not"
     ]

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network import determinacy, outliers
-from errormotion.methods.multilateration.network.kernels.examination import datum_sums, examine, residuals
+from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
 
@@ -128,7 +127,9 @@ class Network:
     datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
 
     def _reckoned_datum(self) -> Datum:
-        GG, GDG, GF = datum_sums(self.weight, self.station, self.extra, self.target, self.carries, self.centre)
+        GG, GDG, GF = loops(len(self.target)).datum_sums(
+            self.weight, self.station, self.extra, self.target, self.carries, self.centre
+        )
         H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
         return Datum(self.centre, self.factor, H @ GF @ self.factor, H, H @ GDG @ H)
 
@@ -157,27 +158,17 @@ class Network:
         shows its whole error.
         """
         s = self.stations
-        return residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """What a person should know."""
-        return (
-            *outliers.told(self.left_out, self.undecided),
-            *determinacy.without_place(self.weight, self.undecided),
-            *determinacy.without_say(self.carries, self.target),
-            *determinacy.weak_layout(self.target_covariance, self.weight, self.station, self.target),
-            *determinacy.weak_targets(self.target, self.target_covariance, self.station),
-            *determinacy.swapped_stations(self.station, self.rough),
-        )
+        of = loops(len(self.target))
+        return np.asarray(of.residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target))
 
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
-        return examine(
+        covariance, redundancy = loops(len(self.target)).examine(
             self.weight, self.station, self.extra, self.target, self.carries,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip
+        return covariance, redundancy
 
     @property
     def station(self) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
-from errormotion.methods.multilateration.network.kernels.general import reduce_targets
+from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations
 
 
@@ -65,8 +63,9 @@ class Problem:
 
     def weighted(self, weight: Array) -> Problem:
         """Return the problem with other weights (n, m); a target with fewer than three readings has no place."""
-        weight[:, _count(weight)[0] < 3] = 0.0
-        by_target, by_station = _count(weight)
+        count = loops(weight.shape[1]).count
+        weight[:, count(weight)[0] < 3] = 0.0
+        by_target, by_station = count(weight)
         return replace(self, weight=weight, by_target=by_target, by_station=by_station)
 
     def sample(self, every: int) -> Problem:
@@ -74,7 +73,7 @@ class Problem:
         part = slice(every // 2, None, every)
         reading, weight = (np.ascontiguousarray(a[:, part]) for a in (self.reading, self.weight))
         extra = np.ascontiguousarray(self.extra[:, :, part])
-        by_target, by_station = _count(weight)
+        by_target, by_station = loops(weight.shape[1]).count(weight)
         return replace(
             self, reading=reading, weight=weight, extra=extra, nominal=self.nominal[part].copy(),
             by_target=by_target, by_station=by_station,
@@ -82,13 +81,15 @@ class Problem:
 
     def basis(self, stations: Stations, centre: Array) -> Array:
         """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
-        Z = np.zeros((len(self.free), int(np.count_nonzero(self.free)) - 6))
-        _complement(stations.place, centre, self.free, Z)
+        T = stations.motions(centre)[self.free]
+        size = np.linalg.norm(T, axis=0)
+        Z = np.zeros((len(self.free), len(T) - 6))
+        Z[self.free] = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
         return Z
 
     def reduce(self, stations: Stations, place: Array) -> Sums:
         """Move the targets (3, m) in place and return what they say about the stations."""
-        sums, moved = reduce_targets(
+        sums, moved = loops(place.shape[1]).reduce_targets(
             self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, place
         )
         H, h, square = sums[:-1, :-1].copy(), sums[:-1, -1].copy(), float(sums[-1, -1])
@@ -128,7 +129,8 @@ def state_problem(
             "give a row of displacements for every station and a place for every target"
         )
     n, m = d.shape
-    u, centre = _copied(np.ascontiguousarray(u))
+    of = loops(m)
+    u, centre = of.copied(np.ascontiguousarray(u))
     if not np.isfinite(centre).all():
         raise MethodError("expected a nominal place for every target, found NaN among them; leave such targets out")
     sigma = np.asarray(noise, dtype=float)
@@ -137,7 +139,8 @@ def state_problem(
     if sigma.shape not in ((), (n, 1), (n, m)):
         raise MethodError(f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; say whose it is")
     sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
-    reading, weight, positive, by_target, by_station = _weigh(np.ascontiguousarray(d), sigma)
+    reading, weight, positive = of.weigh(np.ascontiguousarray(d), sigma)
+    by_target, by_station = of.count(weight)
     if not positive:
         raise MethodError("expected a positive standard deviation for every reading; state the instrument's noise, m")
     c = np.zeros((0, n, m)) if extra is None else np.nan_to_num(np.asarray(extra, dtype=float))
@@ -152,98 +155,3 @@ def state_problem(
     if extra_prior is not None:
         precision[4 * n :] = 1.0 / np.broadcast_to(np.asarray(extra_prior, dtype=float), (len(c),)) ** 2
     return Problem(reading, weight, np.ascontiguousarray(c), precision, prior, u, centre, by_target, by_station)
-
-
-@compiled()
-def _complement(place: Array, centre: Array, free: NDArray[np.bool_], Z: Array) -> None:  # pragma: no cover - compiled
-    """Fill Z with orthonormal columns, orthogonal to the motions of the places, by Householder's reflections."""
-    where = np.flatnonzero(free)
-    q, T, beta = len(where), np.zeros((len(where), 6)), np.zeros(6)
-    for a in range(q):
-        j, k = where[a] // 4, where[a] % 4
-        if j < len(place) and k < 3:
-            T[a, k] = 1.0
-            h, i = (k + 1) % 3, (k + 2) % 3
-            T[a, 3 + h], T[a, 3 + i] = place[j, i] - centre[i], centre[h] - place[j, h]
-    for c in range(6):
-        size = math.sqrt(np.sum(T[:, c] ** 2))
-        if size > 0.0:
-            T[:, c] /= size
-    for c in range(6):
-        square = np.sum(T[c:, c] ** 2)
-        alpha = -math.copysign(math.sqrt(square), T[c, c])
-        beta[c] = 1.0 / (square - alpha * T[c, c]) if square > 0.0 else 0.0
-        T[c, c] -= alpha
-        for k in range(c + 1, 6):
-            T[c:, k] -= beta[c] * np.sum(T[c:, c] * T[c:, k]) * T[c:, c]
-    for p in range(Z.shape[1]):
-        column = np.zeros(q)
-        column[6 + p] = 1.0
-        for c in range(5, -1, -1):
-            column[c:] -= beta[c] * np.sum(T[c:, c] * column[c:]) * T[c:, c]
-        for a in range(q):
-            Z[where[a], p] = column[a]
-
-
-@compiled()
-def _weigh(
-    d: Array, sigma: Array
-) -> tuple[Array, Array, bool, NDArray[np.int64], NDArray[np.int64]]:  # pragma: no cover - compiled
-    """Return readings, weights (n, m), whether standard deviations ((n, 1) or (n, m)) are positive, and counts."""
-    n, m = d.shape
-    reading, weight, positive = np.empty((n, m)), np.empty((n, m)), True
-    count, by_station = np.zeros(m, dtype=np.int64), np.zeros(n, dtype=np.int64)
-    for j in range(n):
-        if sigma.shape[1] == m:
-            bad = 0
-            for i in range(m):
-                there = d[j, i] - d[j, i] == 0.0
-                bad += 1 if there and not sigma[j, i] > 0.0 else 0
-                reading[j, i] = d[j, i] if there else np.nan
-                weight[j, i] = 1.0 / sigma[j, i] if there else 0.0
-                count[i] += there
-                by_station[j] += there
-        else:
-            w, some = 1.0 / sigma[j, 0], 0
-            for i in range(m):
-                there = d[j, i] - d[j, i] == 0.0
-                reading[j, i] = d[j, i] if there else np.nan
-                weight[j, i] = w if there else 0.0
-                count[i] += there
-                some += there
-            bad, by_station[j] = some if not sigma[j, 0] > 0.0 else 0, some
-        positive = positive and bad == 0
-    # A target with fewer than three readings has no place.
-    for i in range(m):
-        if count[i] < 3:
-            for j in range(n):
-                by_station[j] -= weight[j, i] > 0.0
-                count[i] -= weight[j, i] > 0.0
-                weight[j, i] = 0.0
-    return reading, weight, positive, count, by_station
-
-
-@compiled()
-def _count(weight: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # pragma: no cover - compiled
-    """Return how many weights (n, m) are not 0, by column and by row."""
-    n, m = weight.shape
-    by_target, by_station = np.zeros(m, dtype=np.int64), np.zeros(n, dtype=np.int64)
-    for j in range(n):
-        some = 0
-        for i in range(m):
-            by_target[i] += weight[j, i] > 0.0
-            some += weight[j, i] > 0.0
-        by_station[j] = some
-    return by_target, by_station
-
-
-@compiled()
-def _copied(u: Array) -> tuple[Array, Array]:  # pragma: no cover - compiled
-    """Return places (m, 3) of one's own, and their mean (3,)."""
-    own, x, y, z = np.empty(u.shape), 0.0, 0.0, 0.0
-    for i in range(len(u)):
-        own[i, 0], own[i, 1], own[i, 2] = u[i, 0], u[i, 1], u[i, 2]
-        x += u[i, 0]
-        y += u[i, 1]
-        z += u[i, 2]
-    return own, np.array([x, y, z]) / max(len(u), 1)

@@ -11,17 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.identification.weakness import carriers
 from errormotion.methods.multilateration.network import determinacy, outliers
 from errormotion.methods.multilateration.network.descent import State, descend
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
-from errormotion.methods.multilateration.network.kernels.examination import datum_sums
-from errormotion.methods.multilateration.network.kernels.general import settle_targets
+from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import Problem, state_problem
 from errormotion.methods.multilateration.network.start import initial_stations
-from errormotion.methods.multilateration.network.turning import Motion, moments, moved
+from errormotion.methods.multilateration.network.turning import Motion
+from errormotion.methods.multilateration.network.weakness import carriers
 
 TOLERANCE = 1e-12
 """What a further step may still move a target, m."""
@@ -138,23 +136,24 @@ def conclude(
         What was left out.
     """
     place, free = state.place, state.stations
-    openness, sums = settle_targets(
+    of = loops(place.shape[1])
+    openness, sums = of.settle_targets(
         problem.reading, problem.weight, free.place, free.dead_path, problem.extra, free.value,
         place, problem.nominal, problem.centre,
     )  # fmt: skip
     carries = carriers(openness)
     if np.count_nonzero(carries) != sums[0]:
-        sums = moments(place, problem.nominal, carries, problem.centre)
+        sums = of.moments(place, problem.nominal, carries, problem.centre)
     some = slice(None, None, max(1, place.shape[1] // LOOKED_AT))
     determinacy.refuse_nowhere(place[:, some], state.sums.H, sums)
     determinacy.refuse_flat(int(sums[0]), start, place[:, some].T)
     motion = Motion.of(sums, problem.centre)
-    stations, target = motion.stations(free), moved(place, motion.a, motion.b, motion.R, openness)
+    stations, target = motion.stations(free), of.moved(place, motion.a, motion.b, motion.R, openness)
     Z = problem.basis(stations, motion.b)
     information = _within(state.sums.H, Z, motion.R, len(start))
     # A loose freedom is judged in the datum of some of the targets.
     sample = np.flatnonzero(carries)[:: max(1, int(sums[0]) // LOOKED_AT)]
-    GG, _, GF = datum_sums(
+    GG, _, GF = loops(len(sample)).datum_sums(
         problem.weight[:, sample],
         stations.place,
         problem.extra[:, :, sample],
@@ -163,7 +162,7 @@ def conclude(
         motion.b,
     )
     determinacy.refuse_nowhere(GG, GF)
-    basis = _in_datum(Z, stations.motions(motion.b), GG, GF)
+    basis = Z - stations.motions(motion.b) @ np.linalg.lstsq(GG, GF @ Z)[0]
     values = determinacy.refuse_loose(information, basis, stations, target[sample], start)
     W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
     known = int(np.count_nonzero(problem.free & (problem.precision > 0)))
@@ -176,17 +175,9 @@ def conclude(
     )  # fmt: skip
 
 
-@compiled()
-def _within(H: Array, Z: Array, R: Array, stations: int) -> Array:  # pragma: no cover - compiled
+def _within(H: Array, Z: Array, R: Array, stations: int) -> Array:
     """Return the information H within the columns of Z when the whole, with so many stations, has been turned by R."""
-    B = np.eye(len(H))
-    for j in range(0, 4 * stations, 4):
-        B[j : j + 3, j : j + 3] = R
-    C = B.T @ Z
-    return C.T @ H @ C
-
-
-@compiled()
-def _in_datum(Z: Array, T: Array, GG: Array, GF: Array) -> Array:  # pragma: no cover - compiled
-    """Return Z less the motions T of the whole that its columns make of the targets."""
-    return Z - T @ np.linalg.lstsq(np.ascontiguousarray(GG), np.ascontiguousarray(GF) @ Z)[0]
+    C = Z.copy()
+    blocks = C[: 4 * stations].reshape(stations, 4, -1)
+    blocks[:, :3] = R.T @ blocks[:, :3]
+    return np.asarray(C.T @ H @ C)

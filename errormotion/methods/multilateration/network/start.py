@@ -11,7 +11,6 @@ stands; then its rough place decides.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -19,7 +18,6 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
 
 SOME = 150
 """Readings of a station that are looked at: enough to tell where it is."""
@@ -90,106 +88,40 @@ def _some(count: int, most: int) -> slice:
     return slice(None, None, max(1, -(-count // most)))
 
 
-@compiled()
-def _shape(target: Array, every: int) -> tuple[Array, float, Array]:  # pragma: no cover - compiled
+def _shape(target: Array, every: int) -> tuple[Array, float, Array]:
     """Return mean (3,), extent, m, and products (3, 3) about the mean of every so many-th of targets (m, 3)."""
     some = target[::every]
-    centre, low, high, products = np.zeros(3), some[0].copy(), some[0].copy(), np.zeros((3, 3))
-    for i in range(len(some)):
-        for k in range(3):
-            centre[k] += some[i, k] / len(some)
-            low[k], high[k] = min(low[k], some[i, k]), max(high[k], some[i, k])
-    for i in range(len(some)):
-        for k in range(3):
-            for h in range(3):
-                products[k, h] += (some[i, k] - centre[k]) * (some[i, h] - centre[h])
-    return centre, math.sqrt(np.sum((high - low) ** 2)), products
+    centre = some.mean(axis=0)
+    return centre, float(np.linalg.norm(np.ptp(some, axis=0))), (some - centre).T @ (some - centre)
 
 
-@compiled()
-def _taken(
-    reading: Array, weight: Array, target: Array, centre: Array, most: int
-) -> tuple[Array, Array]:  # pragma: no cover - compiled
+def _taken(reading: Array, weight: Array, target: Array, centre: Array, most: int) -> tuple[Array, Array]:
     """Return some of a station's readings (k,) and their targets (k, 3) about ``centre``, evenly spread."""
-    known = 0
-    for i in range(len(weight)):
-        known += weight[i] > 0.0
-    every = max(1, -(-known // most))
-    d, u, ahead, taken = np.empty(known // every + 1), np.empty((known // every + 1, 3)), 0, 0
-    # Where none is missing there is nothing to count.
-    for i in range(0, len(weight), every if known == len(weight) else 1):
-        if not weight[i] > 0.0:
-            continue
-        if ahead == 0 or known == len(weight):
-            d[taken], ahead = reading[i], every
-            for k in range(3):
-                u[taken, k] = target[i, k] - centre[k]
-            taken += 1
-        ahead -= 1
-    return d[:taken], u[:taken]
+    known = np.flatnonzero(weight > 0.0)
+    taken = known[:: max(1, -(-len(known) // most))]
+    return reading[taken], target[taken] - centre
 
 
-@compiled()
-def _linear(d: Array, u: Array) -> Array:  # pragma: no cover - compiled
-    """Return (U, L) of a station from the equations that are linear in U, L and K, gross readings given little weight.
-
-    Their least squares is by Householder's reflections.
-    """
-    n, x = len(d), np.zeros(5)
-    middle = np.median(d)
-    A, b, size, w, off = np.empty((n, 5)), np.empty(n), np.zeros(5), np.ones(n), np.empty(n)
-    M, c = np.empty((n, 5)), np.empty(n)
-    for i in range(n):
-        e = d[i] - middle
-        A[i, 0], A[i, 1], A[i, 2], A[i, 3], A[i, 4] = 2 * u[i, 0], 2 * u[i, 1], 2 * u[i, 2], 2 * e, 1.0
-        b[i] = u[i, 0] ** 2 + u[i, 1] ** 2 + u[i, 2] ** 2 - e * e
-        for k in range(5):
-            size[k] += A[i, k] ** 2
-    size = np.sqrt(size)
+def _reweighted(A: Array, b: Array) -> Array:
+    """Return the solution of linear equations A x = b (n, p), rows that are far off given little weight."""
+    w, x = np.ones(len(b)), np.zeros(A.shape[1])
+    scale = 1.0 / np.linalg.norm(A, axis=0)
     for _ in range(_REWEIGHTED):
-        for i in range(n):
-            c[i] = w[i] * b[i]
-            for k in range(5):
-                M[i, k] = w[i] * A[i, k] / size[k]
-        for k in range(5):
-            square = 0.0
-            for i in range(k, n):
-                square += M[i, k] ** 2
-            alpha = -math.copysign(math.sqrt(square), M[k, k])
-            beta = 1.0 / (square - alpha * M[k, k]) if square > 0.0 else 0.0
-            M[k, k] -= alpha
-            for h in range(k + 1, 6):
-                s = 0.0
-                for i in range(k, n):
-                    s += M[i, k] * (M[i, h] if h < 5 else c[i])
-                s *= beta
-                for i in range(k, n):
-                    if h < 5:
-                        M[i, h] -= s * M[i, k]
-                    else:
-                        c[i] -= s * M[i, k]
-            M[k, k] = alpha
-        for k in range(4, -1, -1):
-            s = c[k]
-            for h in range(k + 1, 5):
-                s -= M[k, h] * x[h]
-            x[k] = s / M[k, k] if abs(M[k, k]) > 1e-14 else 0.0
-        for k in range(5):
-            x[k] /= size[k]
-        largest = 0.0
-        for i in range(n):
-            s = -b[i]
-            for k in range(5):
-                s += A[i, k] * x[k]
-            off[i] = abs(s)
-            largest = max(largest, off[i])
-        typical = np.median(off)
-        # Straight least squares will do where nothing is far off.
-        if largest <= 10 * typical:
+        x = scale * np.linalg.lstsq(w[:, None] * A * scale, w * b, rcond=None)[0]
+        off = np.abs(A @ x - b)
+        typical = float(np.median(off))
+        # Plain least squares suffices where no row is far off.
+        if off.max() <= 10 * typical:
             break
-        for i in range(n):
-            w[i] = 1.0 / math.sqrt(1.0 + (off[i] / (3 * typical + 1e-300)) ** 2)
-    found = x[:4].copy()
+        w = 1.0 / np.sqrt(1.0 + (off / (3 * typical + 1e-300)) ** 2)
+    return x
+
+
+def _linear(d: Array, u: Array) -> Array:
+    """Return (U, L) of a station from the equations that are linear in U, L and K."""
+    middle = np.median(d)
+    d = d - middle
+    found = _reweighted(np.column_stack([2 * u, 2 * d, np.ones(len(d))]), np.sum(u**2, axis=1) - d**2)[:4]
     found[3] -= middle
     return found
 
@@ -203,21 +135,11 @@ def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> I
 
 def _beside_plane(d: Array, u: Array, rough: Array | None, normal: Array) -> Array:
     """Return (U, L) by the linear equations where targets lie in a plane through their mean."""
-    w, middle = np.ones(len(d)), np.median(d)
+    middle = np.median(d)
     d = d - middle
     # In the plane of flat targets the normal part of U has no column.
     B = np.linalg.svd(normal[None])[2][1:].T
-    A = np.column_stack([2 * u @ B, 2 * d, np.ones(len(d))])
-    b = np.sum(u**2, axis=1) - d**2
-    scale = 1.0 / np.linalg.norm(A, axis=0)
-    for _ in range(_REWEIGHTED):
-        x = scale * np.linalg.lstsq(w[:, None] * A * scale, w * b, rcond=None)[0]
-        off = np.abs(A @ x - b)
-        typical = float(np.median(off))
-        # Straight least squares will do where nothing is far off.
-        if off.max() <= 10 * typical:
-            break
-        w = 1.0 / np.sqrt(1.0 + (off / (3 * typical + 1e-300)) ** 2)
+    x = _reweighted(np.column_stack([2 * u @ B, 2 * d, np.ones(len(d))]), np.sum(u**2, axis=1) - d**2)
     U, L, K = B @ x[:-2], x[-2], x[-1]
     height = np.sqrt(max(L**2 - K - U @ U, 0.0))
     if rough is None and height > FLAT * np.linalg.norm(u, axis=1).max():
@@ -244,7 +166,7 @@ def _from_few(d: Array, u: Array) -> list[Array]:
 def _reversed(d: Array, u: Array, found: Array, normal: Array | None, scale: float) -> bool:
     """Return whether readings fit much better with their sign reversed: far stations bear either nearly as well."""
     x = _linear(d, u) if normal is None else found
-    return bool(x[3] + _middle(d) < 0 and _sharpened(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
+    return bool(x[3] + np.median(d) < 0 and _sharpened(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
 
 
 def _best(guesses: Iterable[Array], d: Array, u: Array) -> tuple[Array, float]:
@@ -257,42 +179,24 @@ def _best(guesses: Iterable[Array], d: Array, u: Array) -> tuple[Array, float]:
     return min(found, key=lambda each: each[1])
 
 
-@compiled()
-def _middle(d: Array) -> float:  # pragma: no cover - compiled
-    return float(np.median(d))
+def _residuals(x: Array, d: Array, u: Array) -> tuple[Array, Array, float]:
+    """Return residuals (n,) and directions (n, 3) of readings from a station (U, L), and their robust scale, m."""
+    v = u - x[:3]
+    distance = np.sqrt(np.einsum("ia,ia->i", v, v))
+    r = d - distance + x[3]
+    return r, v / distance[:, None], _scale(r)
 
 
-@compiled()
-def _residuals(x: Array, d: Array, u: Array, r: Array, e: Array) -> float:  # pragma: no cover - compiled
-    """Fill residuals (n,) and directions (n, 3) of readings from a station (U, L); return their robust scale, m."""
-    for i in range(len(d)):
-        a, b, c = u[i, 0] - x[0], u[i, 1] - x[1], u[i, 2] - x[2]
-        distance = math.sqrt(a * a + b * b + c * c)
-        e[i, 0], e[i, 1], e[i, 2] = a / distance, b / distance, c / distance
-        r[i] = d[i] - distance + x[3]
-    return 1.4826 * float(np.median(np.abs(r)))
-
-
-@compiled()
-def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:  # pragma: no cover - compiled
+def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
     """Fit (U, L) to the distances from nominal targets by damped Gauss-Newton with Cauchy's weights."""
-    n = len(d)
-    r, e, r_tried, e_tried = np.empty(n), np.empty((n, 3)), np.empty(n), np.empty((n, 3))
-    A, g, J = np.empty((4, 4)), np.empty(4), np.empty(4)
-    scale, mu = _residuals(x, d, u, r, e), 0.0
+    (r, e, scale), mu = _residuals(x, d, u), 0.0
     for _ in range(_STEPS):
-        A[:], g[:] = 0.0, 0.0
-        for i in range(n):
-            w = 1.0 / (1.0 + (r[i] / (3.0 * scale + 1e-15)) ** 2)
-            J[0], J[1], J[2], J[3] = -e[i, 0], -e[i, 1], -e[i, 2], -1.0
-            for a in range(4):
-                g[a] += w * J[a] * r[i]
-                for b in range(4):
-                    A[a, b] += w * J[a] * J[b]
-        for a in range(4):
-            A[a, a] *= 1.0 + mu + 1e-14
+        w = 1.0 / (1.0 + (r / (3.0 * scale + 1e-15)) ** 2)
+        J = np.column_stack([-e, np.full(len(d), -1.0)])
+        A, g = J.T @ (w[:, None] * J), J.T @ (w * r)
+        A[np.diag_indices(4)] *= 1.0 + mu + 1e-14
         tried = x + np.linalg.solve(A, g)
-        size = _residuals(tried, d, u, r_tried, e_tried)
+        r_tried, e_tried, size = _residuals(tried, d, u)
         if not size <= scale * (1 + 1e-3):
             if mu == 0.0 and size < 1.25 * scale:
                 break
@@ -303,18 +207,16 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:  # pragma: 
         mu = 0.1 * mu if mu > 1e-3 else 0.0
         # A start need not be sharper than this.
         settled = mu == 0.0 and size > 0.98 * scale
-        x, scale = tried, size
-        r, e, r_tried, e_tried = r_tried, e_tried, r, e
+        x, scale, r, e = tried, size, r_tried, e_tried
         if settled:
             break
     return x, scale
 
 
-@compiled()
 def _at_once(
     reading: Array, weight: Array, target: Array, centre: Array, enough: float, place: Array, dead_path: Array
-) -> bool:  # pragma: no cover - compiled
-    """Fill places (n, 3) and dead paths (n,) of stations that plain readings tell; whether they tell all."""
+) -> bool:
+    """Fill positions (n, 3) and dead paths (n,) of stations from plain readings; return whether all were found."""
     for j in range(len(reading)):
         d, u = _taken(reading[j], weight[j], target, centre, SOME)
         if len(d) < 5:

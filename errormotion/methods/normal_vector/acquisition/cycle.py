@@ -1,6 +1,6 @@
-"""One probing cycle, and the whole warm-up: what is touched in which order, and how the machine gets there.
+"""Steps of a probing cycle and of the whole warm-up: order of the touches, and paths between them.
 
-The same steps make the moves, the NC programs and the dry run, so that what was checked is what is done.
+Moves, NC programs and the dry run all use these steps: the checked motions are those that are executed.
 """
 
 from __future__ import annotations
@@ -20,24 +20,22 @@ from errormotion.plugins import Step, Touch
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
-Place = tuple[float, float, float]
+Position = tuple[float, float, float]
 
 TIP_RADIUS = 3e-3
-"""Taken where neither the settings nor the probe say, m."""
-SHORTEST = 1e-3
-"""Waits and moves below this are none, s."""
-EARLY = 0.1
-"""By so much of an interval a cycle may be early: one that is printed begins with its first touch."""
-_HERE = 1e-9  # m
+"""Radius of the tip if neither the settings nor the probe state it, m."""
+SHORTEST_STEP = 1e-3
+"""Shorter waits and moves are omitted, s."""
+EARLY_START = 0.1
+"""Largest advance of a cycle, in intervals: a printed cycle starts with its first touch."""
+_SAME_POSITION = 1e-9  # m
 
 
 def cycle_touches(settings: Settings, tip_radius: float) -> tuple[list[Touch], list[tuple[int, int]]]:
-    """Return the touches of one cycle in their order, and which ball and which of its touches each of them is.
+    """Return the touches of one cycle in their order, and the numbers of ball and touch of each.
 
-    A touch begins ``approach`` before the contact that is due for a ball at its rough place, and ends ``overtravel``
-    behind it.
+    A touch starts ``approach`` before the contact with a ball at its approximate position, and ends ``overtravel``
+    beyond it.
     """
     normal = touching.normals(settings)
     centre = np.array([ball.centre for ball in settings.balls], dtype=float)
@@ -47,7 +45,7 @@ def cycle_touches(settings: Settings, tip_radius: float) -> tuple[list[Touch], l
     for ball, touch in order:
         n = normal[ball, touch]
         start = centre[ball] + (reach[ball] + settings.approach) * n
-        # a ball is not pierced: the tip ends before its centre at the latest
+        # the target is not beyond the centre of the ball
         target = centre[ball] + max(reach[ball] - settings.overtravel, 0.0) * n
         touches.append(Touch(_tuple(start), _tuple(target), item=ball))
     return touches, order
@@ -63,47 +61,47 @@ def _order(balls: int, touches: int, back: bool) -> Iterator[tuple[int, int]]:
             yield ball, touch
 
 
-def itinerary(touches: Sequence[Touch], clearance: float, here: Place | None = None) -> Iterator[Touch | Place]:
-    """Yield the way through the touches of a cycle: places to go to, and touches to make from where the machine is.
+def itinerary(touches: Sequence[Touch], clearance: float, here: Position | None = None) -> Iterator[Touch | Position]:
+    """Yield the path through the touches of a cycle: positions to approach, and touches to make from there.
 
-    From touch to touch the tip rises by the clearance (m) above the starts of the touches of its ball, or of all balls
-    where it goes to another one; it goes across, and down. It goes up first from ``here``, where that is known.
+    Between two touches the tip rises by the clearance (m) above the starts of the touches of this ball, or of all balls
+    on the path to another ball; then it moves horizontally, and down. It rises first from ``here``, if this is known.
     """
     high = safe_height(touches, clearance)
     above = high
     if here is not None:
         above = max(here[2], high)
         yield here[0], here[1], above
-    before: Touch | None = None
+    previous: Touch | None = None
     for touch in touches:
         top = above
-        if before is not None:
+        if previous is not None:
             top = safe_height([t for t in touches if t.item == touch.item], clearance)
-            top = top if before.item == touch.item else high
-            yield before.start[0], before.start[1], top
+            top = top if previous.item == touch.item else high
+            yield previous.start[0], previous.start[1], top
         yield touch.start[0], touch.start[1], top
         yield touch.start
         yield touch
-        before = touch
-    if before is not None:
-        yield before.start[0], before.start[1], high
+        previous = touch
+    if previous is not None:
+        yield previous.start[0], previous.start[1], high
 
 
 def safe_height(touches: Sequence[Touch], clearance: float) -> float:
-    """Return the height at which the tip passes over what is touched, m."""
+    """Return the height at which the tip passes over the balls, m."""
     return max(touch.start[2] for touch in touches) + clearance
 
 
-def cycle_steps(settings: Settings, probe: Any = None, here: Place | None = None) -> list[Step]:
+def cycle_steps(settings: Settings, probe: Any = None, here: Position | None = None) -> list[Step]:
     """Return every step of one cycle.
 
     Parameters
     ----------
     settings : Settings
     probe : settings of the bench's touch probe, optional
-        Its feeds and its clearance hold where it has some; else those of the method.
+        Its feeds and its clearance have priority over those of the method.
     here : (3,) tuple of float, optional
-        Where the machine is before, m; else the way to the first touch does not count.
+        Position of the machine before the cycle, m; if unknown, the path to the first touch takes no time.
     """
     tip = settings.tip_radius or float(getattr(probe, "tip_radius", TIP_RADIUS))
     clearance = float(getattr(probe, "clearance", settings.clearance))
@@ -114,14 +112,14 @@ def cycle_steps(settings: Settings, probe: Any = None, here: Place | None = None
     steps: list[Step] = []
     for item in itinerary(touches, clearance, here) if touches else ():
         if isinstance(item, Touch):
-            way = settings.approach
-            contact = _tuple(np.array(item.start) + way * _unit(np.subtract(item.target, item.start)))
-            steps.append(Step("touch", contact, search, way / search + slow))
-            steps.append(Step("move", item.start, feed, way / feed))
+            distance = settings.approach
+            contact = _tuple(np.array(item.start) + distance * _unit(np.subtract(item.target, item.start)))
+            steps.append(Step("touch", contact, search, distance / search + slow))
+            steps.append(Step("move", item.start, feed, distance / feed))
             here = item.start
             continue
         length = 0.0 if here is None else math.dist(item, here)
-        if here is None or length > _HERE:
+        if here is None or length > _SAME_POSITION:
             steps.append(Step("move", item, feed, length / feed))
         here = item
     return steps
@@ -132,7 +130,7 @@ def _unit(vector: Array) -> Array:
 
 
 def _slow_seconds(probe: Any) -> float:
-    """Return how long the slow contacts behind the first one take, s: back a little, and to the contact again."""
+    """Return the duration of the slow contacts after the first one, s: retraction and renewed approach."""
     names = ("back_off", "approach_feed", "touch_feed", "repeats")
     if probe is None or not all(hasattr(probe, name) for name in names):
         return 0.0
@@ -151,21 +149,21 @@ class Part:
     settle : float
         Rest between both, s.
     here : (3,) tuple of float or None
-        Where the cycle begins, m; None: not known.
+        Position at the start of the cycle, m; None if unknown.
     cycle : list of Step
     """
 
     number: int
     warm_up: list[Step]
     settle: float
-    here: Place | None
+    here: Position | None
     cycle: list[Step]
 
 
 def parts(settings: Settings, probe: Any = None) -> Iterator[Part]:
     """Yield the cold cycle, and every later one with the warm-up before it; ``probe`` as for `cycle_steps`."""
     now, cold, number = 0.0, 0.0, 0
-    here: Place | None = None
+    here: Position | None = None
     while (number := due(settings, number, now)) < cycles(settings):
         warm_up: list[Step] = []
         settle = settings.settle
@@ -195,15 +193,15 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
     Raises
     ------
     MethodError
-        A cycle takes longer than the interval from one to the next.
+        A cycle takes longer than the interval.
     """
     steps: list[Step] = []
     for part in parts(settings, (instruments or {}).get("touch_probe")):
         length = math.fsum(step.seconds for step in part.cycle) + part.settle
         if length >= settings.interval:
             raise MethodError(
-                f"interval: expected more than the {length:.0f} s that a cycle takes, so that the machine warms up in "
-                f"between; found {settings.interval:g} s"
+                f"interval: expected more than the duration of a cycle, {length:.0f} s, so that the machine warms up "
+                f"between the cycles; found {settings.interval:g} s"
             )
         steps += part.warm_up
         if part.settle:
@@ -212,25 +210,25 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
     return steps
 
 
-def warm_up_steps(settings: Settings, begin: float, end: float, here: Place | None = None) -> list[Step]:
-    """Return what the machine does between two times of the warm-up, s: spindle speeds, moves to and fro, or rests.
+def warm_up_steps(settings: Settings, start: float, end: float, here: Position | None = None) -> list[Step]:
+    """Return the steps between two times of the warm-up, s: spindle speeds, and moves or rests.
 
-    The moves begin with the first one, from ``here``, where that is known.
+    The first move starts at ``here``, if this is known.
     """
     steps: list[Step] = []
-    now, number = begin, 0
-    while end - now > SHORTEST:
+    now, number = start, 0
+    while end - now > SHORTEST_STEP:
         speed, until = speed_at(settings, now)
         until = min(until, end)
         if settings.moves:
-            place = settings.moves[number % len(settings.moves)]
-            seconds = math.dist(place, place if here is None else here) / settings.moves_feed
-            if here is None or (seconds <= SHORTEST and len(set(settings.moves)) > 1):
-                number, here = number + 1, place
+            target = settings.moves[number % len(settings.moves)]
+            seconds = math.dist(target, target if here is None else here) / settings.moves_feed
+            if here is None or (seconds <= SHORTEST_STEP and len(set(settings.moves)) > 1):
+                number, here = number + 1, target
                 continue
-            if SHORTEST < seconds <= end - now:
-                steps.append(Step("move", place, settings.moves_feed, seconds, speed))
-                number, here, now = number + 1, place, now + seconds
+            if SHORTEST_STEP < seconds <= end - now:
+                steps.append(Step("move", target, settings.moves_feed, seconds, speed))
+                number, here, now = number + 1, target, now + seconds
                 continue
         steps.append(Step("rest", None, math.nan, until - now, speed))
         now = until
@@ -238,7 +236,7 @@ def warm_up_steps(settings: Settings, begin: float, end: float, here: Place | No
 
 
 def speed_at(settings: Settings, time: float) -> tuple[float, float]:
-    """Return the spindle speed (1/min) at a time of the warm-up, and the time at which it changes, s."""
+    """Return the spindle speed (1/min) at a time of the warm-up, and the time of its next change, s."""
     speed = 0.0
     for event in settings.schedule:
         if event.at > time + 1e-9:
@@ -248,30 +246,30 @@ def speed_at(settings: Settings, time: float) -> tuple[float, float]:
 
 
 def cycles(settings: Settings) -> int:
-    """Return the number of probing cycles, the cold one included."""
+    """Return the number of probing cycles, including the cold one."""
     return int(settings.duration / settings.interval + 1e-9) + 1
 
 
 def due(settings: Settings, number: int, now: float) -> int:
-    """Return which cycle is next at a time since the cold one began, s, if it is ``number`` or a later one.
+    """Return the number of the next cycle, ``number`` or later, at a time since the start of the cold cycle, s.
 
-    One that is late is made at once; one whose successor is due as well is left out.
+    A late cycle starts immediately; it is omitted if its successor is due as well.
     """
-    return max(number, int((now + SHORTEST) // settings.interval))
+    return max(number, int((now + SHORTEST_STEP) // settings.interval))
 
 
 def following(settings: Settings, last: float) -> int:
-    """Return which cycle follows one that began at a time since the cold one began, s; perhaps a little early."""
-    return int(last / settings.interval + EARLY) + 1
+    """Return the number of the cycle after one that started at a time since the start of the cold cycle, s."""
+    return int(last / settings.interval + EARLY_START) + 1
 
 
 def planned_history(part: Part, settings: Settings) -> tuple[float, float]:
-    """Return mean spindle speed (1/min) and mean feed (m/s) from the cycle before to this one."""
+    """Return mean spindle speed (1/min) and mean feed (m/s) between the previous cycle and this one."""
     turned = math.fsum(step.spindle_speed * step.seconds for step in part.warm_up)
-    way = math.fsum(step.feed * step.seconds for step in part.warm_up if step.place is not None)
-    return turned / settings.interval, way / settings.interval
+    path = math.fsum(step.feed * step.seconds for step in part.warm_up if step.place is not None)
+    return turned / settings.interval, path / settings.interval
 
 
-def _tuple(place: Array) -> Place:
-    x, y, z = (float(value) for value in place)
+def _tuple(position: Array) -> Position:
+    x, y, z = (float(value) for value in position)
     return x, y, z

@@ -1,4 +1,4 @@
-"""A campaign while it is being measured: cycle by cycle how far the balls have gone, as the machine sees them."""
+"""Live display of a campaign: apparent displacement of the balls after each cycle."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 
 class LiveBalls:
-    """Follow the cycles; hold the touches of the first one.
+    """Compares each cycle with the first one.
 
-    A view for the person at the machine: one displacement common to all balls, by least squares from the touches that
-    both cycles have, without turns and uncertainty. What counts is identified from the whole record afterwards.
+    For the operator: one displacement common to all balls, by least squares from the touches that both cycles have,
+    without rotations and uncertainty. The result is identified from the whole record afterwards.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -31,16 +29,19 @@ class LiveBalls:
         self._since = ""
 
     def update(self, chunk: xr.Dataset) -> str:
-        """Take in a cycle; return in a line of text where the balls are and how warm it is."""
+        """Return a line of text with the displacement of the balls in a cycle, and the highest temperature."""
         time = float(chunk["time"].values[-1])
         number = cycle.following(self._settings, time) - 1
-        place = chunk["touch"].values[-1]
-        good = np.isfinite(place).all(axis=-1) & (chunk["touch_flag"].values[-1] == 0)
+        position = chunk["touch"].values[-1]
+        good = np.isfinite(position).all(axis=-1) & (chunk["touch_flag"].values[-1] == 0)
         parts = [f"cycle {number} of {cycle.cycles(self._settings) - 1}, {time / 60:.1f} min"]
         if self._first is None:
-            self._first, self._since = np.where(good[..., None], place, np.nan), f"cycle {number}" if number else "cold"
+            self._first, self._since = (
+                np.where(good[..., None], position, np.nan),
+                f"cycle {number}" if number else "cold",
+            )
         else:
-            parts.append(self._displacement(place, good, chunk["approach"].values))
+            parts.append(self._displacement(position, good, chunk["approach"].values))
         if good.sum() < good.size:
             parts.append(f"{good.sum()} of {good.size} touches good")
         if "temperature" in chunk and np.isfinite(chunk["temperature"].values[-1]).any():
@@ -49,12 +50,12 @@ class LiveBalls:
             parts.append(f"warmest {chunk['sensor'].values[warmest]} {temperature[warmest]:.1f} degC")
         return "; ".join(parts)
 
-    def _displacement(self, place: Array, good: NDArray[np.bool_], approach: Array) -> str:
-        """Return the mean displacement of the balls since the first cycle: touches tell it along their approach."""
+    def _displacement(self, position: Array, good: NDArray[np.bool_], approach: Array) -> str:
+        """Return the mean displacement of the balls since the first cycle, from touches along their approach."""
         assert self._first is not None
         common = good & np.isfinite(self._first).all(axis=-1)
         direction = approach[common]
-        moved = np.einsum("ik,ik->i", place[common] - self._first[common], direction)
+        moved = np.einsum("ik,ik->i", position[common] - self._first[common], direction)
         found, _, rank, _ = np.linalg.lstsq(direction, moved, rcond=None)
         if rank < 3:
             return "too few touches"

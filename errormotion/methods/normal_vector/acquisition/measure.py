@@ -1,7 +1,7 @@
-"""Measuring: cycles of touches while the machine warms up, by its controller or by a program that it runs itself.
+"""Measurement: cycles of touches while the machine warms up, by its controller or by a program that it executes.
 
-Every cycle is handed over when it is over, and one that breaks off with what it has. Before that axes and spindle are
-stopped: nothing moves on. A cold cycle that breaks off is no reference for anything; the next run makes it anew.
+Each cycle is yielded at its end; an interrupted cycle with its touches so far, after axes and spindle have been
+stopped. An interrupted cold cycle is discarded, since it is no reference; the next run repeats it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import xarray as xr
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.normal_vector.acquisition import cycle, programs
 from errormotion.methods.normal_vector.acquisition.record import Record
-from errormotion.methods.normal_vector.acquisition.warming import Warming, age, run, trouble
+from errormotion.methods.normal_vector.acquisition.warming import Warming, age, fault, run
 from errormotion.plugins import Bench, Contact, Touch
 
 if TYPE_CHECKING:
@@ -24,44 +24,46 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LATE = 1.0
-"""So much behind its time a cycle may begin before it is told, s."""
-LAST_LINES = 2.0
-"""When a program has ended, its last lines come within this time, s."""
+LARGEST_DELAY = 1.0
+"""Delay of a cycle above which a warning is logged, s."""
+LAST_LINES_TIMEOUT = 2.0
+"""Time after the end of a program within which its last printed lines arrive, s."""
 
 Measure = Callable[[list[Touch]], Iterator[Contact]]
 
 
 def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
-    """Yield one raw dataset a cycle, the cold one first.
+    """Yield one raw dataset for each cycle, the cold one first.
 
     Parameters
     ----------
     bench : Bench
-        With a ``touch_probe``; a ``controller`` that moves and turns the spindle, unless the operator starts a program
-        that does so; and as many thermometers as there are.
+        With a ``touch_probe``; a ``controller`` that moves the axes and turns the spindle, unless the operator starts a
+        program that does so; and any number of thermometers.
     settings : Settings
     done : Dataset, optional
-        Cycles that an interrupted run holds: the next one follows.
+        Cycles of an interrupted run, which is continued.
 
     Raises
     ------
     MethodError
-        Settings without balls, or a bench that cannot do it.
+        Settings without balls, or a bench that lacks an instrument.
     InstrumentError
-        Whatever stops a cycle. The machine stands then.
+        A cycle was interrupted. The machine has been stopped.
     """
     if len(settings.balls) < 3:
-        raise MethodError(f"balls: expected the rough places of three balls or more; found {len(settings.balls)}.")
+        raise MethodError(
+            f"balls: expected the approximate centres of three or more balls; found {len(settings.balls)}."
+        )
     probe = bench.of_kind("touch_probe")
     control = bench.of_kind("controller") if bench.has_kind("controller") else None
     moves = hasattr(control, "spindle") and hasattr(control, "move_to")
     active = hasattr(type(probe), "control")  # it moves the machine itself
     if active and not moves:
         raise MethodError(
-            f"The touch probe '{probe.info.id}' has the machine moved, and a machine that is to warm up needs an "
-            "instrument of kind 'controller' that turns its spindle; the bench has none. Add it; or let the machine "
-            "run a program ('errormotion program') and use a touch probe that reads the lines that the program prints."
+            f"The touch probe '{probe.info.id}' moves the machine through its controller, and the warm-up needs an "
+            "instrument of kind 'controller' that turns the spindle; the bench has none. Add one; or let the machine "
+            "execute a program ('errormotion program') and use a touch probe that reads its printed lines."
         )
     record = Record(bench, settings, probe, done)
     if not moves or not (active or hasattr(control, "run_program")):
@@ -70,112 +72,112 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
     fastest = max((event.spindle_speed for event in settings.schedule), default=0.0)
     if fastest and not settings.to_probe:
         bench.ask(
-            f"The spindle will turn at up to {fastest:g} /min with the probe in it. If the probe is not made for that, "
-            "say in the settings by which lines of a program the tool is changed: to_probe, to_warm_up."
+            f"The spindle will turn at up to {fastest:g} /min with the probe in it. If the probe is not designed for "
+            "this, state in the settings the program lines that change the tool: to_probe, to_warm_up."
         )
     measure = probe.measure if active else _ByProgram(probe, control, record).measure
     yield from _driven(Warming(control, settings, done), measure, record)
 
 
 def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.Dataset]:
-    """Yield cycles that the controller makes, and warm the machine up in between."""
+    """Yield cycles that the controller executes, with the warm-up between them."""
     settings, number = record.settings, record.first
     try:
         while (number := _due(settings, number, machine.now)) < cycle.cycles(settings):
             machine.warm_until(number * settings.interval)
-            begin, history = machine.now, machine.history()
-            if begin - number * settings.interval > LATE:
-                log.warning("cycle %d begins %.0f s late", number, begin - number * settings.interval)
-            record.begin()
+            start, history = machine.now, machine.history()
+            if start - number * settings.interval > LARGEST_DELAY:
+                log.warning("cycle %d starts %.0f s late", number, start - number * settings.interval)
+            record.start_cycle()
             contacts: list[Contact] = []
             try:
                 machine.rest()
                 for contact in measure(record.touches):
                     contacts.append(contact)
-            except BaseException:  # an interruption by the operator, too
-                machine.halt()
+            except BaseException:  # including an interruption by the operator
+                machine.stop()
                 if number and _any_good(contacts):
-                    yield record.dataset(contacts, begin, begin, machine.origin, history)
+                    yield record.dataset(contacts, start, start, machine.origin, history)
                 raise
             if number == 0:
                 record.refuse_unknown_balls(contacts)
                 machine.warm_from = machine.now
-            yield record.dataset(contacts, begin, machine.now, machine.origin, history)
+            yield record.dataset(contacts, start, machine.now, machine.origin, history)
             number += 1
         machine.turn(0.0)
-    except GeneratorExit:  # nobody takes the cycles any more; the bench may be closed by now
-        machine.halt(anew=False)
+    except GeneratorExit:  # the acquisition was ended; the bench may be closed already
+        machine.stop(reconnect=False)
         raise
     except BaseException as error:
-        why = machine.halt()
-        if why and isinstance(error, InstrumentError):
+        failure = machine.stop()
+        if failure and isinstance(error, InstrumentError):
             raise type(error)(
-                f"{error}. Axes and spindle could not be stopped ({why}): stop them at the machine"
+                f"{error}. Axes and spindle could not be stopped ({failure}): stop them at the machine"
             ) from error
         raise
 
 
 def _listened(bench: Bench, probe: Any, control: Any, record: Record, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
-    """Yield cycles of a program that the operator starts, and that warms the machine up as well."""
+    """Yield cycles of a program that the operator starts and that includes the warm-up."""
     settings, virtual = record.settings, probe.identify().simulated
     parts = [part for part in cycle.parts(settings) if part.number >= record.first]
     if not parts:
         return
-    where = f" from its sequence number N{parts[0].number} on" if record.first else ""
+    where = f" from sequence number N{parts[0].number}" if record.first else ""
     minutes = (parts[-1].number - parts[0].number) * settings.interval / 60
     bench.ask(
         f"Start the program {programs.WARM_UP}{where} on the machine ('errormotion program' writes it). Its last cycle "
-        f"begins after about {minutes:.0f} min."
+        f"starts after about {minutes:.0f} min."
     )
     origin: float | None = None  # of the machine's clock
     for part in parts:
         contacts: list[Contact] = []
         broken: BaseException | None = None
-        begin, history = part.number * settings.interval, cycle.planned_history(part, settings)
+        start, history = part.number * settings.interval, cycle.planned_history(part, settings)
         try:
             for contact in record.in_time(probe.measure(record.touches)):
                 if not contacts:
-                    record.begin()
+                    record.start_cycle()
                     if done is not None and origin is None and not virtual:
-                        begin = age(done)
+                        start = age(done)
                 contacts.append(contact)
-        except BaseException as error:  # noqa: BLE001 - an interruption by the operator, too; it is raised below
-            broken = _told(error, control)
+        except BaseException as error:  # noqa: BLE001 - including an interruption by the operator; raised below
+            broken = _with_machine_state(error, control)
             if not (part.number and _any_good(contacts)):
-                raise broken  # noqa: B904 - it is the same one, or says so
+                raise broken  # noqa: B904 - the same error, or caused by it
         if part.number == 0:
             record.refuse_unknown_balls(contacts)
         if known := [contact.time for contact in contacts if math.isfinite(contact.time)]:
-            origin = known[0] - begin if origin is None else origin
-            begin, end = known[0] - origin, known[-1] - origin
+            origin = known[0] - start if origin is None else origin
+            start, end = known[0] - origin, known[-1] - origin
         else:
-            end = begin + math.fsum(step.seconds for step in part.cycle)
-        yield record.dataset(contacts, begin, end, origin or 0.0, history)
+            end = start + math.fsum(step.seconds for step in part.cycle)
+        yield record.dataset(contacts, start, end, origin or 0.0, history)
         if broken is not None:
             raise broken
 
 
-def _told(error: BaseException, control: Any) -> BaseException:
-    """Return an error with what the control says of itself, where one is on the bench."""
+def _with_machine_state(error: BaseException, control: Any) -> BaseException:
+    """Return an error with the state of the controller appended, if the bench has one."""
     if not isinstance(error, InstrumentError):
         return error
-    why = ""
+    state = ""
     if control is not None:
         try:
-            why = trouble(control.state())
+            state = fault(control.state())
         except InstrumentError as silent:
-            why = f"silent as well ({silent})"
-    said = f". The machine is {why}" if why else ""
-    told = type(error)(f"{error}{said}. What its program still moves only the operator can stop")
-    told.__cause__ = error
-    return told
+            state = f"not answering either ({silent})"
+    suffix = f". The machine is {state}" if state else ""
+    extended = type(error)(f"{error}{suffix}. If its program is still running, stop it at the machine")
+    extended.__cause__ = error
+    return extended
 
 
 def _due(settings: Settings, number: int, now: float) -> int:
-    """Return which cycle is next, and tell which are left out."""
+    """Return the number of the next cycle, and log those that are omitted."""
     due = cycle.due(settings, number, now)
     if due > number:
-        log.warning("cycles %d to %d are left out: their time is past", number, due - 1)
+        log.warning("cycles %d to %d are omitted: their start times have passed", number, due - 1)
     return due
 
 
@@ -184,21 +186,21 @@ def _any_good(contacts: list[Contact]) -> bool:
 
 
 class _ByProgram:
-    """A probe that only listens, at a controller that runs a program for every cycle."""
+    """A probe that reads printed lines, with a controller that executes a program for every cycle."""
 
     def __init__(self, probe: Any, control: Any, record: Record) -> None:
         self._probe, self._control, self._record = probe, control, record
         self._text = programs.cycle_program(record.settings, record.tip_radius)
 
     def measure(self, touches: list[Touch]) -> Iterator[Contact]:
-        """Run the program of a cycle, and yield what it has printed; also where it ended in alarm."""
+        """Execute the program of a cycle, and yield its printed contacts, also if it ended in alarm."""
         failure: InstrumentError | None = None
         try:
             run(self._control, self._text)
         except InstrumentError as error:
             failure = error
         usual = self._probe.settings
-        self._probe.configure(_impatient(usual))  # all lines are there, or on the wire
+        self._probe.configure(_short_timeouts(usual))  # all lines have been sent
         try:
             yield from self._record.in_time(self._probe.measure(touches))
         except InstrumentError as error:
@@ -209,7 +211,7 @@ class _ByProgram:
             raise failure
 
 
-def _impatient(settings: Any) -> Any:
-    """Return settings of a probe whose time limits are those of lines that have been sent."""
+def _short_timeouts(settings: Any) -> Any:
+    """Return settings of a probe with timeouts for lines that have already been sent."""
     limits = {"timeout", "start_timeout"} & set(type(settings).model_fields)
-    return settings.model_copy(update={name: min(getattr(settings, name), LAST_LINES) for name in limits})
+    return settings.model_copy(update={name: min(getattr(settings, name), LAST_LINES_TIMEOUT) for name in limits})

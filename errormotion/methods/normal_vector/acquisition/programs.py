@@ -1,8 +1,8 @@
-"""NC programs for machines that run programs only: G-code out, DPRNT lines in.
+"""NC programs for machines that only execute programs: G-code out, DPRNT lines in.
 
-``G31`` moves until the probe trips, ``DPRNT`` prints where that was (macro variables #5061 to #5063, mm) and when
-(#3001, ms). Places are those of the machine's axes in mm, feeds in mm/min. ``G4 P`` is in seconds on some controls and
-in milliseconds on others: the settings choose, and the head of each program says it.
+``G31`` moves until the probe trips, ``DPRNT`` prints the position of the trip (macro variables #5061 to #5063, mm) and
+its time (#3001, ms). Positions are those of the machine's axes in mm, feeds in mm/min. ``G4 P`` is in seconds on some
+controls and in milliseconds on others: the settings select it, and the head of each program states it.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
 MM, MINUTE = 1e3, 60.0
 CYCLE, WARM_UP = "cycle.nc", "warm_up.nc"
 
-_SAME = 1e-6  # m, as programs write places
+_SAME_POSITION = 1e-6  # m, resolution of the programs
 _PRINT = "DPRNT[N{number}*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]"
 
 
 def programs(settings: Settings) -> Mapping[str, str]:
-    """Return one probing cycle, and the whole warm-up with all its cycles, as NC programs by the name of their files.
+    """Return one probing cycle, and the whole warm-up with all cycles, as NC programs by file name.
 
     Raises
     ------
     MethodError
-        The settings name no balls.
+        The settings have no balls.
     """
     return {CYCLE: cycle_program(settings), WARM_UP: warm_up_program(settings)}
 
 
 def cycle_program(settings: Settings, tip_radius: float | None = None) -> str:
-    """Return one probing cycle as a program, for a tip radius (m) that the settings do not say otherwise."""
+    """Return one probing cycle as a program; ``tip_radius`` (m) is used if the settings have none."""
     part = next(cycle.parts(settings))
     body = [*_to_probe(settings, settings.settle), *_cycle(settings, None, tip_radius)]
     return _text(CYCLE, "one probing cycle", body, settings, _seconds(part))
@@ -47,7 +47,7 @@ def cycle_program(settings: Settings, tip_radius: float | None = None) -> str:
 def warm_up_program(settings: Settings) -> str:
     """Return the cold cycle, the warm-up and all later cycles as a program.
 
-    Each cycle has its number as sequence number, before its warm-up: the program can be begun again there.
+    Each cycle has its number as sequence number, before its warm-up: the program can be restarted there.
     """
     lines: list[str] = []
     seconds = 0.0
@@ -69,30 +69,30 @@ def _text(name: str, purpose: str, body: list[str], settings: Settings, seconds:
         "%",
         f"({name}: {purpose}, about {seconds / 60:.1f} min)",
         f"(mm, mm/min, dwells G4 {settings.dwell})",
-        "(places of the tip in machine coordinates: work offset all zero, no tool length offset)",
+        "(positions of the tip in machine coordinates: work offset all zero, no tool length offset)",
         "G90 G94 G21",
     ]
     return "\n".join([*head, *body, "M30", "%", ""])
 
 
 def _to_probe(settings: Settings, settle: float) -> list[str]:
-    """Return the lines that stop the spindle, put the probe in, and let the machine come to rest."""
+    """Return the lines that stop the spindle, insert the probe, and let the machine settle."""
     return ["M5", *settings.to_probe, *([_dwell(settings, settle)] if settle else [])]
 
 
 def _first_up(settings: Settings, tip_radius: float | None = None) -> str:
-    """Return the move to where nothing is in the way, wherever the tip is."""
+    """Return the move to the safe height from any position of the tip."""
     high = cycle.safe_height(_touches(settings, tip_radius), settings.clearance)
     return f"G1 Z{high * MM:.3f} F{_feed(settings.positioning_feed)}"
 
 
 def _touches(settings: Settings, tip_radius: float | None) -> list[Touch]:
     if not settings.balls:
-        raise MethodError("balls: expected the rough places of three balls or more; found none.")
+        raise MethodError("balls: expected the approximate centres of three or more balls; found none.")
     return cycle.cycle_touches(settings, settings.tip_radius or tip_radius or cycle.TIP_RADIUS)[0]
 
 
-def _cycle(settings: Settings, here: cycle.Place | None, tip_radius: float | None = None) -> Iterator[str]:
+def _cycle(settings: Settings, here: cycle.Position | None, tip_radius: float | None = None) -> Iterator[str]:
     names, feed = touching.names(settings), _feed(settings.positioning_feed)
     number, ball = 0, -1
     yield "POPEN"
@@ -103,18 +103,18 @@ def _cycle(settings: Settings, here: cycle.Place | None, tip_radius: float | Non
             number += 1
             comment = f" ({_plain(names[item.item])})" if item.item != ball else ""
             ball = item.item
-            yield f"G31 {_place(item.target)} F{_feed(settings.probing_feed)}{comment}"
+            yield f"G31 {_position(item.target)} F{_feed(settings.probing_feed)}{comment}"
             yield _PRINT.format(number=number)
-            yield f"G1 {_place(item.start)} F{feed}"
+            yield f"G1 {_position(item.start)} F{feed}"
             here = item.start
-        elif here is None or math.dist(item, here) > _SAME:
-            yield f"G1 {_place(item)} F{feed}"
+        elif here is None or math.dist(item, here) > _SAME_POSITION:
+            yield f"G1 {_position(item)} F{feed}"
             here = item
     yield "PCLOS"
 
 
 def _plain(name: str) -> str:
-    """Return a name as a control's comment can have it."""
+    """Return a name with the characters that are allowed in a comment."""
     return re.sub(r"[^ -~]|[()]", "?", name)
 
 
@@ -125,7 +125,7 @@ def _warm_up(settings: Settings, steps: list[Step]) -> Iterator[str]:
             speed = step.spindle_speed
             yield f"M3 S{speed:.10g}" if speed else "M5"
         if step.place is not None:
-            yield f"G1 {_place(step.place)} F{_feed(step.feed)}"
+            yield f"G1 {_position(step.place)} F{_feed(step.feed)}"
         else:
             yield _dwell(settings, step.seconds)
 
@@ -139,5 +139,5 @@ def _feed(feed: float) -> str:
     return f"{feed * MM * MINUTE:.10g}"
 
 
-def _place(place: tuple[float, float, float]) -> str:
-    return " ".join(f"{axis}{value * MM:.3f}" for axis, value in zip("XYZ", place, strict=True))
+def _position(position: tuple[float, float, float]) -> str:
+    return " ".join(f"{axis}{value * MM:.3f}" for axis, value in zip("XYZ", position, strict=True))

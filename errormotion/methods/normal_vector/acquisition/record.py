@@ -1,4 +1,4 @@
-"""Contacts of a cycle and what else is known of it, as a raw dataset."""
+"""Raw dataset of a cycle: contacts, temperatures and history."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from errormotion.arrays import Array
 from errormotion.errors import InstrumentError
 from errormotion.methods.normal_vector.acquisition import cycle, touching
 from errormotion.plugins import Bench, Contact
@@ -20,38 +19,36 @@ from errormotion.plugins import Bench, Contact
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 log = logging.getLogger(__name__)
 
 SCHEMA = "errormotion.raw.normal_vector/1"
 FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
-"""What a contact's flag says; the dataset holds its number in this list."""
+"""Flags of contacts; the dataset contains the index in this list."""
 NOT_MADE = FLAGS.index("not made")
-FEWEST = 3
-"""Good touches of a ball without which a cold cycle tells nothing of it."""
-OF_THE_RUN = ("start", "cold_cycle_seconds", "clock_origin")
-"""Attributes that hold for all cycles: when the cold one began, how long it took, and the machine's clock then."""
+FEWEST_TOUCHES = 3
+"""Smallest number of good touches of each ball in the cold cycle."""
+RUN_ATTRIBUTES = ("start", "cold_cycle_seconds", "clock_origin")
+"""Attributes common to all cycles: UTC and machine clock at the start of the cold cycle, and its duration."""
 
 _M, _S = {"units": "m"}, {"units": "s"}
 
 
 class Record:
-    """Makes raw datasets of cycles.
+    """Builds the raw datasets of the cycles.
 
     Parameters
     ----------
     bench : Bench
-        Its thermometers are read when a cycle begins; one that fails leaves NaN.
+        Its thermometers are read at the start of each cycle; missing readings are NaN.
     settings : Settings
     probe : touch probe
     done : Dataset, optional
-        Cycles that an interrupted run holds.
+        Cycles of an interrupted run.
 
     Attributes
     ----------
     first : int
-        Number of the cycle that is due first.
+        Number of the first cycle to be made.
     touches : list of Touch
         Of every cycle, in order.
     """
@@ -71,10 +68,10 @@ class Record:
         self._timed: bool | None = None if done is None else "touch_time" in done
         self._latest = -math.inf  # contact, on the machine's clock, s
         self._start = ""
-        self._attrs = None if done is None else {name: done.attrs[name] for name in OF_THE_RUN}
+        self._attrs = None if done is None else {name: done.attrs[name] for name in RUN_ATTRIBUTES}
 
-    def begin(self) -> None:
-        """Begin a cycle: read every thermometer; a sensor or thermometer that fails is NaN, and counted."""
+    def start_cycle(self) -> None:
+        """Start a cycle: read all thermometers; missing temperatures are NaN and counted."""
         self._start = self._start or datetime.now(UTC).isoformat(timespec="milliseconds")
         self._temperature[:] = np.nan
         for name, thermometer in self._thermometers.items():
@@ -90,75 +87,75 @@ class Record:
                     self._invalid[f"{channel} unknown"] += 1
 
     def in_time(self, contacts: Iterable[Contact]) -> Iterator[Contact]:
-        """Yield contacts that a machine prints.
+        """Yield printed contacts.
 
         Raises
         ------
         InstrumentError
-            One of them was not made behind those of the cycle before: it is a line that came late, or twice.
+            A contact is not later than the previous cycle: its line was delayed or repeated.
         """
-        before = self._latest
+        previous = self._latest
         for contact in contacts:
-            if contact.time <= before:
+            if contact.time <= previous:
                 raise InstrumentError(
-                    f"Expected contacts of this cycle; the machine printed one of {contact.time:.3f} s, and the cycle "
-                    f"before ended at {before:.3f} s on its clock. Was an old line sent again, or the clock set back?"
+                    f"Expected contacts of this cycle; the machine printed one at {contact.time:.3f} s, and the "
+                    f"previous cycle ended at {previous:.3f} s on its clock. Check for repeated lines and the clock."
                 )
             self._latest = contact.time if math.isfinite(contact.time) else self._latest
             yield contact
 
     def refuse_unknown_balls(self, contacts: Sequence[Contact]) -> None:
-        """Refuse a cold cycle with a ball of which too little is known to compare anything with it.
+        """Check that the cold cycle has enough good touches of every ball.
 
         Raises
         ------
         InstrumentError
-            Names the balls, and what their touches came to.
+            Lists the balls without, and the flags of their touches.
         """
         flags: dict[int, Counter[str]] = {ball: Counter() for ball in range(len(self.settings.balls))}
         for (ball, _), contact in zip(self._order, contacts, strict=True):
             flags[ball][contact.flag or "good"] += 1
-        told = [
+        insufficient = [
             f"{name} ({', '.join(f'{count} {flag}' for flag, count in flags[ball].items())})"
             for ball, name in enumerate(touching.names(self.settings))
-            if flags[ball]["good"] < FEWEST
+            if flags[ball]["good"] < FEWEST_TOUCHES
         ]
-        if told:
+        if insufficient:
             raise InstrumentError(
-                f"The cold cycle has too few good touches of {'; '.join(told)}; expected {FEWEST} or more of each, "
-                "for all that follows is compared with them. Are the balls where the settings say, to the approach?"
+                f"The cold cycle has too few good touches of {'; '.join(insufficient)}; expected {FEWEST_TOUCHES} or "
+                "more of each, since it is the reference of all others. Check the positions of the balls (settings)."
             )
 
     def dataset(
-        self, contacts: Sequence[Contact], begin: float, end: float, origin: float, history: tuple[float, float]
+        self, contacts: Sequence[Contact], start: float, end: float, origin: float, history: tuple[float, float]
     ) -> xr.Dataset:
         """Return the raw dataset of one cycle.
 
         Parameters
         ----------
         contacts : sequence of Contact
-            In the order of ``touches``; those that a broken cycle lacks are ``not made``.
-        begin, end : float
-            Of the cycle, s since the cold one began. The end of the cold one alone counts.
+            In the order of ``touches``; those missing in an interrupted cycle are ``not made``.
+        start, end : float
+            Of the cycle, s since the start of the cold cycle. The end is used of the cold cycle alone.
         origin : float
-            What the machine's clock showed then, s.
+            Clock of the machine at the start of the cold cycle, s.
         history : (float, float)
-            Mean spindle speed (1/min) and mean feed (m/s) since the cycle before.
+            Mean spindle speed (1/min) and mean feed (m/s) since the previous cycle.
         """
         b, m = len(self.settings.balls), self.settings.touches
-        place, time = np.full((1, b, m, 3), np.nan), np.full((1, b, m), np.nan)
+        position, time = np.full((1, b, m, 3), np.nan), np.full((1, b, m), np.nan)
         flag = np.full((1, b, m), NOT_MADE, dtype=np.int8)
         for (ball, touch), contact in zip(self._order, contacts, strict=False):
-            place[0, ball, touch], time[0, ball, touch] = contact.position, contact.time - origin
+            position[0, ball, touch], time[0, ball, touch] = contact.position, contact.time - origin
             flag[0, ball, touch] = FLAGS.index(contact.flag) if contact.flag in FLAGS else NOT_MADE
             self._invalid.update([contact.flag] if contact.flag else [])
         self._invalid.update({"not made": len(self._order) - len(contacts)} if len(contacts) < len(self._order) else {})
         if self._timed is None:
             self._timed = bool(np.isfinite(time).any())
         if self._attrs is None:
-            self._attrs = dict(zip(OF_THE_RUN, (self._start, float(end), float(origin)), strict=True))
+            self._attrs = dict(zip(RUN_ATTRIBUTES, (self._start, float(end), float(origin)), strict=True))
         variables: dict[str, Any] = {
-            "touch": (("time", "ball", "touch", "direction"), place, _M),
+            "touch": (("time", "ball", "touch", "direction"), position, _M),
             "touch_flag": (("time", "ball", "touch"), flag, {"units": "1"}),
             "approach": (("ball", "touch", "direction"), -touching.normals(self.settings), {"units": "1"}),
             "tip_radius": ((), self.tip_radius, _M),
@@ -172,7 +169,7 @@ class Record:
         if self.noise is not None:
             variables["touch_noise"] = ((), self.noise, _M)
         coords: dict[str, Any] = {
-            "time": ("time", np.array([begin]), _S),
+            "time": ("time", np.array([start]), _S),
             "ball": touching.names(self.settings),
             "direction": list("xyz"),
         }
@@ -197,6 +194,6 @@ def _columns(thermometers: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _names(columns: Sequence[tuple[str, str]]) -> list[str]:
-    """Return the names of the sensors, with the thermometer's before them where two are alike."""
+    """Return the names of the sensors, preceded by the thermometer where names are equal."""
     count = Counter(channel for _, channel in columns)
     return [channel if count[channel] == 1 else f"{name}.{channel}" for name, channel in columns]

@@ -1,4 +1,4 @@
-"""Where a ball is touched: directions around it."""
+"""Directions in which a ball is touched."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 
 def touch_normals(touches: int, elevation: float = 0.0) -> Array:
-    """Return where a ball is touched as unit vectors from its centre, (touches, 3); the probe moves against them.
+    """Return the touches of a ball as unit vectors from its centre, (touches, 3); the probe moves against them.
 
-    All but the last lie around the ball, evenly spaced from +X on, ``elevation`` (rad) above its equator; the last one
-    is its top.
+    All but the last lie around the ball, evenly spaced starting at +X, ``elevation`` (rad) above its equator; the last
+    one is on top.
     """
     around = 2 * np.pi * np.arange(touches - 1) / (touches - 1)
     ring = np.stack([np.cos(around), np.sin(around), np.full_like(around, np.tan(elevation))], axis=1)
@@ -27,7 +25,7 @@ def touch_normals(touches: int, elevation: float = 0.0) -> Array:
 
 
 def normals(settings: Settings) -> Array:
-    """Return the directions in which each ball of the settings is touched, (ball, touch, 3)."""
+    """Return the touch directions of each ball of the settings, (ball, touch, 3)."""
     return np.tile(touch_normals(settings.touches, settings.elevation), (len(settings.balls), 1, 1))
 
 

@@ -1,4 +1,4 @@
-"""What the machine does between the cycles: turn the spindle, move the axes, and stand still for the probe."""
+"""The warm-up between the cycles: spindle speeds and moves of the axes, and standstill for the probe."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LOOK = 10.0
-"""Longest time without a look whether the machine is still well, s."""
-LOOK_AT_PROGRAM = 1.0
-"""The same while it runs a program, s."""
+STATE_INTERVAL = 10.0
+"""Longest interval of the checks of the machine's state, s."""
+PROGRAM_STATE_INTERVAL = 1.0
+"""The same while a program is executed, s."""
 
 
 class Warming:
-    """A machine that warms up by a schedule.
+    """A machine that warms up according to a schedule.
 
     Parameters
     ----------
@@ -35,14 +35,14 @@ class Warming:
         With ``state``, ``move_to``, ``spindle``, ``stop`` and ``elapse``.
     settings : Settings
     done : Dataset, optional
-        What an interrupted run holds: time went on since. A virtual machine that began anew is warmed up again first.
+        Cycles of an interrupted run. A virtual machine that was restarted is first warmed up again.
 
     Attributes
     ----------
     origin : float
-        What the machine's clock showed when the cold cycle began, s.
+        Clock of the machine at the start of the cold cycle, s.
     warm_from : float or None
-        When the warm-up began, s since ``origin``: when the cold cycle was over.
+        Start of the warm-up, s since ``origin``: the end of the cold cycle.
 
     Raises
     ------
@@ -53,83 +53,85 @@ class Warming:
     def __init__(self, control: Any, settings: Settings, done: xr.Dataset | None) -> None:
         self.control, self.settings = control, settings
         self.warm_from: float | None = None
-        self._turned = self._way = 0.0  # revolutions per minute times seconds, and metres, since the cycle before
-        state = self._fit_state()
-        self._speed = math.nan  # whatever it does now, it is told
+        self._turned = self._path = 0.0  # 1/min s, and m, since the previous cycle
+        state = self._ready_state()
+        self._speed = math.nan  # unknown: the first speed is always commanded
         self.origin = float(state["time"])
         self._since = 0.0
         if done is not None:
-            self._go_on(done, float(state["time"]))
+            self._resume(done, float(state["time"]))
 
     @property
     def now(self) -> float:
-        """Time since the cold cycle began, s."""
+        """Time since the start of the cold cycle, s."""
         return float(self.control.state()["time"]) - self.origin
 
     def warm_until(self, time: float) -> None:
-        """Warm up until a time since the cold cycle began, s; nothing before there was one."""
-        if self.warm_from is None or time - self.now < cycle.SHORTEST:
+        """Warm up until a time since the start of the cold cycle, s; does nothing before the cold cycle."""
+        if self.warm_from is None or time - self.now < cycle.SHORTEST_STEP:
             return
-        self.put_in(self.settings.to_warm_up)
+        self.change_tool(self.settings.to_warm_up)
         moves = 0
-        while time - (now := self.now) >= cycle.SHORTEST:
+        while time - (now := self.now) >= cycle.SHORTEST_STEP:
             speed, change = cycle.speed_at(self.settings, now - self.warm_from)
             self.turn(speed)
             moves = self._one_step(moves, min(time, change + self.warm_from) - now, time - now)
-            self._refuse_alarm("while it warmed up")
+            self._check_state("during the warm-up")
             self._turned += self._speed * (self.now - now)
 
     def _one_step(self, moves: int, until_change: float, left: float) -> int:
-        """Make the next move, where there is time for it, or wait a while; return how many moves were made."""
+        """Make the next move if there is time for it, else wait; return the number of moves made."""
         if self.settings.moves:
-            place = self.settings.moves[moves % len(self.settings.moves)]
-            way = math.dist(place, self.control.state()["commanded_position"])
-            seconds = way / self.settings.moves_feed
-            if cycle.SHORTEST < seconds <= left:
-                self.control.move_to(place, self.settings.moves_feed)
-                self._way += way
+            target = self.settings.moves[moves % len(self.settings.moves)]
+            distance = math.dist(target, self.control.state()["commanded_position"])
+            seconds = distance / self.settings.moves_feed
+            if cycle.SHORTEST_STEP < seconds <= left:
+                self.control.move_to(target, self.settings.moves_feed)
+                self._path += distance
                 return moves + 1
-            if seconds <= cycle.SHORTEST and len(set(self.settings.moves)) > 1:
+            if seconds <= cycle.SHORTEST_STEP and len(set(self.settings.moves)) > 1:
                 return moves + 1
-        self.control.elapse(min(until_change, LOOK))
+        self.control.elapse(min(until_change, STATE_INTERVAL))
         return moves
 
     def turn(self, speed: float) -> None:
-        """Turn the spindle at a speed, 1/min, if it does not already."""
+        """Set the spindle speed, 1/min, if it differs from the present one."""
         if speed != self._speed:
             self.control.spindle(speed)
             self._speed = speed
 
     def rest(self) -> None:
-        """Stop the spindle, put the probe in, and let the machine come to rest."""
+        """Stop the spindle, insert the probe, and let the machine settle."""
         turned = self._speed != 0
         self.turn(0.0)
-        self.put_in(self.settings.to_probe)
+        self.change_tool(self.settings.to_probe)
         if turned and self.settings.settle:
             self.control.elapse(self.settings.settle)
 
-    def put_in(self, lines: Sequence[str]) -> None:
-        """Change the tool by lines of a program, if there are any."""
+    def change_tool(self, lines: Sequence[str]) -> None:
+        """Change the tool by program lines, if there are any."""
         if not lines:
             return
         if not hasattr(self.control, "run_program"):
-            raise MethodError("to_probe, to_warm_up: the controller of this bench runs no programs; leave them out.")
+            raise MethodError(
+                "to_probe, to_warm_up: the controller of this bench executes no programs; remove these settings."
+            )
         run(self.control, "\n".join(["%", "(change of the tool)", *lines, "M30", "%", ""]))
 
     def history(self) -> tuple[float, float]:
-        """Return mean spindle speed (1/min) and mean feed (m/s) since this was last asked, and begin anew."""
+        """Return mean spindle speed (1/min) and mean feed (m/s) since the last call."""
         now = self.now
         seconds = now - self._since
-        means = (self._turned / seconds, self._way / seconds) if seconds > cycle.SHORTEST else (0.0, 0.0)
-        self._since, self._turned, self._way = now, 0.0, 0.0
+        means = (self._turned / seconds, self._path / seconds) if seconds > cycle.SHORTEST_STEP else (0.0, 0.0)
+        self._since, self._turned, self._path = now, 0.0, 0.0
         return means
 
-    def halt(self, *, anew: bool = True) -> str:
-        """Stop axes and spindle, ``anew`` over a new connection if need be; return why that failed, if it did."""
+    def stop(self, *, reconnect: bool = True) -> str:
+        """Stop axes and spindle, if necessary over a new connection; return the cause of a failure, empty if none."""
         try:
             self.control.stop(spindle=True)
         except InstrumentError as error:
-            if not anew:
+            if not reconnect:
                 return str(error)
             try:
                 self.control.close()
@@ -140,88 +142,86 @@ class Warming:
                 return str(again)
         return ""
 
-    def _fit_state(self) -> dict[str, Any]:
+    def _ready_state(self) -> dict[str, Any]:
         state: dict[str, Any] = self.control.state()
-        why = trouble(state) or ("not homed" if state["homed"] is False else "")
-        why = why or ("" if state["enabled"] else "not enabled")
-        if why:
-            raise InstrumentError(f"The machine is {why}; nothing was moved")
+        cause = fault(state) or ("not homed" if state["homed"] is False else "")
+        cause = cause or ("" if state["enabled"] else "not enabled")
+        if cause:
+            raise InstrumentError(f"The machine is {cause}; nothing was moved")
         return state
 
-    def _refuse_alarm(self, when: str) -> None:
-        if why := trouble(self.control.state()):
-            raise InstrumentError(f"The machine is {why}; it went so {when}")
+    def _check_state(self, when: str) -> None:
+        if cause := fault(self.control.state()):
+            raise InstrumentError(f"The machine is {cause}; this occurred {when}")
 
     # ------------------------------------------------------------------ after an interruption
 
-    def _go_on(self, done: xr.Dataset, clock: float) -> None:
-        """Take up the clock of an interrupted run."""
-        begins, ends = done["time"].values.astype(float), _ends(done)
+    def _resume(self, done: xr.Dataset, clock: float) -> None:
+        """Continue the clock of an interrupted run."""
+        starts, ends = done["time"].values.astype(float), _ends(done)
         cold = float(done.attrs["cold_cycle_seconds"])
         if not self.control.identify().simulated:
             self.origin = clock - age(done)
             self.warm_from = cold
         elif (
-            clock - float(done.attrs["clock_origin"]) >= ends[-1] - cycle.SHORTEST
-        ):  # the same virtual machine, still there
+            clock - float(done.attrs["clock_origin"]) >= ends[-1] - cycle.SHORTEST_STEP
+        ):  # the same virtual machine, still running
             self.origin = float(done.attrs["clock_origin"])
             self.warm_from = cold
         else:
-            log.info("the virtual machine is warmed up anew, to %.0f s", ends[-1])
-            for begin, end in zip(begins, ends, strict=True):
-                self.warm_until(begin)
-                self.turn(0.0)  # it stood still for the probe
+            log.info("the virtual machine is warmed up again, to %.0f s", ends[-1])
+            for start, end in zip(starts, ends, strict=True):
+                self.warm_until(start)
+                self.turn(0.0)  # standstill during the probing
                 self.control.elapse(max(end - self.now, 0.0))
                 self.warm_from = cold
-        self._since, self._turned, self._way = float(begins[-1]), 0.0, 0.0
+        self._since, self._turned, self._path = float(starts[-1]), 0.0, 0.0
 
 
 def run(control: Any, text: str) -> None:
-    """Run a program to its end.
+    """Execute a program to its end.
 
     Raises
     ------
     InstrumentError
-        The control refuses it, or goes into alarm or emergency stop meanwhile.
+        The controller refuses it, or goes into alarm or emergency stop.
     """
     control.run_program(text)
     while True:
         state = control.state()
-        if why := trouble(state):
-            raise InstrumentError(f"The machine is {why}; it went so while its program ran")
+        if cause := fault(state):
+            raise InstrumentError(f"The machine is {cause}; this occurred while its program was executed")
         if not state["running"]:
             return
-        control.elapse(LOOK_AT_PROGRAM)
+        control.elapse(PROGRAM_STATE_INTERVAL)
 
 
-def trouble(state: dict[str, Any]) -> str:
-    """Return what a controller's state says against moving on: emergency stop or alarms; empty if nothing."""
+def fault(state: dict[str, Any]) -> str:
+    """Return the emergency stop or the alarms in a controller's state; empty if there are none."""
     if state["estop"]:
         return "in emergency stop"
     return f"in alarm: {'; '.join(state['alarms'])}" if state["alarms"] else ""
 
 
 def age(done: xr.Dataset) -> float:
-    """Return how long ago the cold cycle of an interrupted run began, s.
+    """Return the time since the start of the cold cycle of an interrupted run, s.
 
     Raises
     ------
     MethodError
-        The run does not say when that was.
+        The run does not state its start.
     """
     try:
-        began = datetime.fromisoformat(str(done.attrs["start"]))
+        start = datetime.fromisoformat(str(done.attrs["start"]))
     except (KeyError, ValueError):
-        raise MethodError(
-            "The interrupted run does not say when it began (attribute start); start a new one."
-        ) from None
-    return (datetime.now(UTC) - began).total_seconds()
+        raise MethodError("The interrupted run does not state its start (attribute start); start a new run.") from None
+    return (datetime.now(UTC) - start).total_seconds()
 
 
 def _ends(done: xr.Dataset) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return when the last touch of each cycle was, s; its begin where that is not known."""
-    begins = done["time"].values.astype(float)
+    """Return the time of the last touch of each cycle, s; its start if unknown."""
+    starts = done["time"].values.astype(float)
     if "touch_time" not in done:
-        return begins
-    times = done["touch_time"].values.reshape(len(begins), -1)
-    return np.asarray(np.fmax(np.fmax.reduce(times, axis=1), begins))
+        return starts
+    times = done["touch_time"].values.reshape(len(starts), -1)
+    return np.asarray(np.fmax(np.fmax.reduce(times, axis=1), starts))

@@ -1,6 +1,6 @@
-"""How good any unbiased estimate can be: the Cramer-Rao bound, from the whole information matrix written out.
+"""Cramer-Rao bound of any unbiased estimate, from the complete information matrix.
 
-It is kept apart from the estimator on purpose: dense, from true places, without its elimination.
+It is deliberately independent of the estimator: dense, from true positions, without elimination.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from errormotion.methods.normal_vector.identification.rigid import knot_weights
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.freedoms import Motion
 
-    Array = Array
-
 
 def bound(
-    place: Array,
+    position: Array,
     normal: Array,
     motion: Motion,
     *,
@@ -29,29 +27,29 @@ def bound(
     touch_time: Array | None = None,
     reach: Literal["touch", "ball"] = "touch",
 ) -> Array:
-    """Return the least covariance of the twists of all cycles, (cycles, 6, 6), m and rad; NaN for unseen freedoms.
+    """Return the least covariance of the twists of all cycles, (cycles, 6, 6), m and rad; NaN where not determined.
 
     Parameters
     ----------
-    place : ndarray (b, m, 3)
-        Where the tip touches each of b balls m times, m.
+    position : ndarray (b, m, 3)
+        Positions of the tip at the m touches of each of b balls, m.
     normal : ndarray (b, m, 3)
-        Unit vectors from the ball's centre to the tip.
+        Unit vectors from the centre of the ball to the tip.
     motion : Motion
-        What can move.
+        The errors to determine.
     noise : float
         Standard deviation of a touch along its normal, m.
     cycles : int
-        The cold one included.
+        Number of cycles, including the cold one.
     time : ndarray (k,), optional
-        To which the twists belong, s; with ``touch_time`` where the drift within a cycle counts.
+        Times of the twists, s; with ``touch_time`` if the drift within a cycle is considered.
     touch_time : ndarray (k, b, m), optional
     reach : "touch" or "ball"
-        What is unknown and the same in all cycles: a reach for every touch, or centre and radius of every ball.
-        Where every cycle makes every touch it is all the same to the twists.
+        The unknowns common to all cycles: a reach for every touch, or centre and radius of every ball. If every cycle
+        has every touch, both give the same twists.
     """
-    b, m, _ = place.shape
-    H = motion.design(motion.lever(place), normal).reshape(b * m, -1)
+    b, m, _ = position.shape
+    H = motion.design(motion.lever(position), normal).reshape(b * m, -1)
     p = H.shape[1]
     if time is not None and touch_time is not None:
         cycles = len(time)

@@ -1,25 +1,21 @@
-"""Least squares of cycles that hang together only with their neighbours, and with offsets that all of them share.
+"""Least squares of cycles that are coupled with their neighbours alone, and with offsets common to all of them.
 
 The normal equations are
 
     [T  G] [x]   [r]
     [G' D] [d] = [s]
 
-T block tridiagonal over the cycles, d the shared offsets. Elimination goes along the cycles, so that time and memory
-grow with their number alone.
+T is block tridiagonal over the cycles, d are the shared offsets. Elimination proceeds along the cycles, so that time
+and memory are proportional to their number.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from errormotion.arrays import Array
-
-if TYPE_CHECKING:
-    Array = Array
 
 
 @dataclass(frozen=True)
@@ -29,14 +25,14 @@ class Solved:
     Attributes
     ----------
     x : ndarray (n, p)
-        Of the cycles.
+        Unknowns of the cycles.
     offset : ndarray (q,)
-        Shared by them.
+        Shared offsets.
     own : ndarray (n, p, p)
-        Covariance of each cycle's x were the offsets known.
+        Covariance of x of each cycle for known offsets.
     shared : ndarray (n, p, q)
-        What one standard uncertainty of each of q independent parts of the offsets adds to x: the covariance of x is
-        ``own + shared shared'``.
+        Effect on x of one standard uncertainty of each of q independent components of the offsets: the covariance of x
+        is ``own + shared shared'``.
     """
 
     x: Array
@@ -53,7 +49,7 @@ def solve(T: Array, after: Array, G: Array, D: Array, r: Array, s: Array) -> Sol
     T : ndarray (n, p, p)
         Diagonal blocks.
     after : ndarray (n - 1, p, p)
-        Blocks that couple each cycle (rows) with the next one (columns).
+        Blocks that couple each cycle (rows) with the next (columns).
     G : ndarray (n, p, q)
     D : ndarray (q, q)
     r : ndarray (n, p)
@@ -62,14 +58,13 @@ def solve(T: Array, after: Array, G: Array, D: Array, r: Array, s: Array) -> Sol
     Raises
     ------
     numpy.linalg.LinAlgError
-        They are singular.
+        The equations are singular.
     """
     n = len(T)
     inverse = np.empty_like(T)
     right = np.concatenate([r[:, :, None], G], axis=2)
     back = np.empty_like(after)
-    loose = not after.any()
-    if loose:
+    if not after.any():
         inverse[:] = np.linalg.inv(T)
         y = inverse @ right
     else:

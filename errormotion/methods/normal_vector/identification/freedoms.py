@@ -1,11 +1,11 @@
-"""Which freedoms balls on the table show, and which they cannot.
+"""Errors that balls on the table determine.
 
-The tip always sits at the same place of the spindle: a machine that commands it to p brings it to p + e(p),
+The position of the tip in the spindle is constant. The machine commands p, and the tip is at p + e(p),
 
     e(p) = E + (R - 1) M (p - f)
 
-with E the displacement at the functional point f, R the turn of the frame of axes relative to the table, and M = 1 for
-the axes that carry the tool, 0 for those that carry the workpiece: their way is no lever of the tool's side.
+with E the displacement at the functional point f, R the rotation of the frame of axes relative to the table, and M = 1
+for the axes that carry the tool, 0 for those that carry the workpiece: their travel is no lever of the tool side.
 """
 
 from __future__ import annotations
@@ -22,17 +22,14 @@ from errormotion.kinematics.iso import DOF
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Array = Array
-
-FEWEST = 3
-"""Balls that are asked for."""
+FEWEST_BALLS = 3
 FLAT = 1e-3
-"""Balls count as in one line, or at one height, when they leave it by less than this share of their spread."""
+"""Largest deviation of balls that count as lying in one line or at one height, relative to their spread."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What can move, and where it is stated.
+    """The errors of a machine, and their functional point.
 
     Attributes
     ----------
@@ -52,26 +49,26 @@ class Motion:
 
     @property
     def seen(self) -> tuple[int, ...]:
-        """Freedoms that balls can show at all: a turn shows where the tool's way has a lever to its axis."""
+        """Errors that balls can determine: a rotation if the travel of the tool has a lever to its axis."""
         lever = self.carries
         return (0, 1, 2, *(3 + k for k in range(3) if lever[[j for j in range(3) if j != k]].any()))
 
-    def lever(self, place: Array) -> Array:
-        """Return M (p - f) of places (..., 3), m."""
-        return (place - self.point) * self.carries
+    def lever(self, position: Array) -> Array:
+        """Return M (p - f) of positions (..., 3), m."""
+        return (position - self.point) * self.carries
 
     def error(self, twist: Array, lever: Array) -> Array:
-        """Return e of twists (..., 6) at levers (..., 3); the rotation is exact, a rotation vector."""
-        return twist[..., :3] + turned(twist[..., 3:], lever) - lever
+        """Return e of twists (..., 6) at levers (..., 3); the rotation vector is applied exactly."""
+        return twist[..., :3] + rotated(twist[..., 3:], lever) - lever
 
     def design(self, lever: Array, normal: Array) -> Array:
-        """Return how the error along unit vectors (..., 3) at turned levers (..., 3) follows the seen freedoms."""
+        """Return the derivative of the error along unit vectors (..., 3), at rotated levers (..., 3), (..., p)."""
         full = np.concatenate([normal, np.cross(lever, normal)], axis=-1)
         return np.asarray(full[..., list(self.seen)])
 
 
-def turned(rotation: Array, vector: Array) -> Array:
-    """Return vectors (..., 3) turned by rotation vectors (..., 3), by Rodrigues' formula."""
+def rotated(rotation: Array, vector: Array) -> Array:
+    """Return vectors (..., 3) rotated by rotation vectors (..., 3), by Rodrigues' formula."""
     square = np.sum(rotation**2, axis=-1, keepdims=True)
     angle = np.sqrt(square)
     first = np.sinc(angle / np.pi)
@@ -86,38 +83,38 @@ def spread(centres: Array) -> float:
 
 
 def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
-    """Raise MethodError where balls at centres (ball, 3), m, leave open what they could show."""
-    if len(centres) < FEWEST:
+    """Raise MethodError if balls at centres (ball, 3), m, leave errors undetermined that balls can determine."""
+    if len(centres) < FEWEST_BALLS:
         raise MethodError(
-            f"Expected {FEWEST} balls or more on the table, better four; found {len(centres)} "
-            f"({', '.join(names) or 'none'}). Set up more: the balls are what the machine's turns are seen by."
+            f"Expected {FEWEST_BALLS} balls or more on the table, preferably four; found {len(centres)} "
+            f"({', '.join(names) or 'none'}). Set up more balls: they are needed to determine the rotations."
         )
     motion = Motion(tool_axes, centres.mean(axis=0))
-    loose = undetermined(centres, motion)
-    if not loose:
+    unknown = undetermined(centres, motion)
+    if not unknown:
         return
     if spread(centres) == 0:
-        raise MethodError(f"Balls {', '.join(names)} all lie at one place; expected places far apart.")
+        raise MethodError(f"Balls {', '.join(names)} have the same position; expected positions far apart.")
     away = centres - centres.mean(axis=0)
     size = np.linalg.svd(away, compute_uv=False)
-    turns = ", ".join(DOF[k] for k in loose)
+    missing = ", ".join(DOF[k] for k in unknown)
     if tool_axes == "XYZ":
         off = size[1] / np.sqrt(len(centres))
         raise MethodError(
-            f"Balls {', '.join(names)} lie in one line, to {off * 1e3:.3g} mm: turns about it do not show ({turns}). "
-            "Set up one ball away from the line, as far as the table allows."
+            f"Balls {', '.join(names)} lie in one line, within {off * 1e3:.3g} mm: rotations about it are not "
+            f"determined ({missing}). Set up one ball as far from this line as the table allows."
         )
     axes_of_tool = " and ".join(tool_axes)
     heights = ", ".join(f"{value * 1e3:.4g}" for value in centres[:, "XYZ".index(tool_axes[0])])
     raise MethodError(
-        f"Where {axes_of_tool} alone carries the tool, turns show only by balls at different places along "
-        f"{axes_of_tool}; these lie at {tool_axes[0]} = {heights} mm, so that {turns} cannot be told from "
-        "displacements. Put some balls on posts. (Is tool_axes right for this machine?)"
+        f"If {axes_of_tool} alone carries the tool, rotations are determined only by balls at different positions "
+        f"along {axes_of_tool}; these lie at {tool_axes[0]} = {heights} mm, so that {missing} cannot be distinguished "
+        "from displacements. Put some balls on posts, and check tool_axes."
     )
 
 
 def undetermined(centres: Array, motion: Motion) -> list[int]:
-    """Return the freedoms, of those that balls can show, that balls at centres (ball, 3), m, leave open."""
+    """Return the errors in ``motion.seen`` that balls at centres (ball, 3), m, leave undetermined."""
     design = np.stack([motion.design(motion.lever(centres), np.tile(axis, (len(centres), 1))) for axis in np.eye(3)])
     A = design.reshape(-1, len(motion.seen))
     A = A / np.where(np.array(motion.seen) < 3, 1.0, spread(centres) or 1.0)

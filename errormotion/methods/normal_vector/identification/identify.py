@@ -1,4 +1,4 @@
-"""From touches to the errors of every cycle."""
+"""Identification: from touches to the errors of every cycle."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
@@ -22,20 +22,18 @@ from errormotion.methods.normal_vector.identification.spheres import Centres, ce
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3
-"""Chance at which sound touches are called noisier than stated."""
-COVERED = 0.975
-SMALL = 1e-4
-"""Parts of what the cycles share are told one by one down to this share of the greatest variance."""
+"""Probability at which touches with the stated noise are reported as noisier."""
+QUANTILE = 0.975
+SMALLEST_SOURCE = 1e-4
+"""Smallest variance of a common source, relative to the largest one, that is stated separately."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Twists (k, 6), their covariance (k, 6, 6) and what the cycles share (k, 6, q); NaN where not known."""
+    """Twists (k, 6), their covariance (k, 6, 6) and effects common to all cycles (k, 6, q); NaN where unknown."""
 
     twist: Array
     covariance: Array
@@ -48,7 +46,7 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
     Raises
     ------
     MethodError
-        The data do not determine the motion, or contradict what is stated of the balls.
+        The data do not determine the motion, or contradict the stated balls.
     """
     notes: list[str] = []
     data = read(raw, settings, notes)
@@ -65,7 +63,7 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
         smallest_move=settings.smallest_move,
     )
     factor = _noise_factor(cleaned.fit, stated, settings, notes)
-    _tell(cleaned, data, notes)
+    notes += _exclusions(cleaned, data)
     best = _rigid_estimate(cleaned, motion, factor, len(data.seen.cycle_time))
     time = _times(cleaned, data, settings)
     seen = data.seen.without(cleaned.wrong)
@@ -74,7 +72,7 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
     if settings.procedure == "normals" and other is None:
         raise MethodError("procedure = normals: " + notes[-1])
     chosen = other if settings.procedure == "normals" and other is not None else best
-    influence = _told_apart(chosen)
+    influence = _sources(chosen)
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -99,25 +97,25 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
 
 
 def _motion(data: Readings, settings: Settings) -> Motion:
-    """Check the balls and return what can move."""
+    """Return the model of the motion; check the balls."""
     seen, names = data.seen, data.names
     ever = np.any(seen.valid, axis=(0, 2))
     if not ever.all():
         lost = ", ".join(name for name, there in zip(names, ever, strict=True) if not there)
-        raise MethodError(f"Ball {lost} was never touched: leave it out of the data, or touch it.")
+        raise MethodError(f"Ball {lost} was never touched: remove it from the data, or touch it.")
     check_jumps(seen, names, settings.ball_tolerance)
     if seen.touched:
         touched = seen.valid.any(axis=0).sum(axis=1)
         if (touched < 4).any():
             i = int(np.argmin(touched))
             raise MethodError(
-                f"Ball {names[i]} was touched at {touched[i]} places; a sphere needs four or more, better five: around "
-                "it and on top."
+                f"Ball {names[i]} was touched in {touched[i]} directions; a sphere needs four, preferably five: "
+                "around it and on top."
             )
         centre, radius = rigid.spheres(seen)
     else:
         count = np.maximum(seen.valid[..., 0].sum(axis=0), 1)[:, None]
-        centre = np.where(seen.valid[..., :1], seen.place[:, :, 0], 0.0).sum(axis=0) / count
+        centre = np.where(seen.valid[..., :1], seen.position[:, :, 0], 0.0).sum(axis=0) / count
         radius = np.full(len(names), np.nan)
     check_balls(centre, radius, data, settings.ball_tolerance)
     check_layout(centre, names, data.tool_axes)
@@ -129,22 +127,23 @@ def _noise_factor(found: rigid.Rigid, stated: bool, settings: Settings, notes: l
     """Return the variance of a number of weight 1."""
     if found.freedom < 1 and not stated:
         raise MethodError(
-            "The noise of a touch is not stated (touch_noise), and no touch is left over to tell it from. State it."
+            "The noise of a touch is not stated (touch_noise), and there are no redundant touches to estimate it. "
+            "State it."
         )
     if not stated:
         variance = found.chi2 / found.freedom
         notes.append(
-            f"The noise of a touch is not stated; {np.sqrt(variance) * 1e6:.3g} um by the residuals, with "
+            f"The noise of a touch is not stated; {np.sqrt(variance) * 1e6:.3g} um from the residuals, with "
             f"{found.freedom} degrees of freedom."
         )
-        return float(variance * (stats.t.ppf(COVERED, found.freedom) / stats.norm.ppf(COVERED)) ** 2)
-    if found.freedom > 0 and found.chi2 > stats.chi2.ppf(1 - FALSE_ALARM, found.freedom):
+        return float(variance * (special.stdtrit(found.freedom, QUANTILE) / special.ndtri(QUANTILE)) ** 2)
+    if found.freedom > 0 and found.chi2 > special.chdtri(found.freedom, FALSE_ALARM):
         ratio = found.chi2 / found.freedom
         raised = settings.noise == "auto"
-        what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
+        what = "the uncertainties were increased" if raised else "the stated noise was used (noise = stated)"
         notes.append(
-            f"The touches scatter {np.sqrt(ratio):.3g} times as much as stated; {what}. Do the balls move as one rigid "
-            "body, and do the right axes carry the tool (tool_axes)?"
+            f"The touches scatter {np.sqrt(ratio):.3g} times as much as stated; {what}. Check the mounting of the "
+            "balls and the axes that carry the tool (tool_axes)."
         )
         return float(ratio) if raised else 1.0
     return 1.0
@@ -171,13 +170,13 @@ def _normals_estimate(
     factor: float,
     notes: list[str],
 ) -> Estimate | None:
-    """Return what the published construction makes of four of the balls; None, with a note, where it does not hold."""
+    """Return the result of the published construction from four balls; None, with a note, if it is not applicable."""
     names = data.names
     chosen = settings.normals_balls or tuple(names[:4])
     if motion.tool_axes != "XYZ":
         notes.append(
-            "The normals of planes through balls say nothing here: where axes carry the workpiece, a turn of their "
-            "frame shears the picture of the balls and does not turn it."
+            "The normals of planes through balls are not applicable: where axes carry the workpiece, a rotation of "
+            "their frame shears the apparent arrangement of the balls instead of rotating it."
         )
         return None
     if len(names) < 4:
@@ -186,14 +185,14 @@ def _normals_estimate(
     if missing := [name for name in chosen if name not in names]:
         raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
     four = [names.index(name) for name in chosen]
-    at_once = centres(_at_cycle_time(seen, cleaned, motion, settings), cleaned.fit.anchor, cleaned.fit.reach)
-    centre, cofactor = at_once.centre[:, four], factor * at_once.cofactor[:, four]
+    simultaneous = centres(_at_cycle_time(seen, cleaned, motion, settings), cleaned.fit.anchor, cleaned.fit.reach)
+    centre, cofactor = simultaneous.centre[:, four], factor * simultaneous.cofactor[:, four]
     for move in cleaned.moves:
         if move.ball in four:
             centre[move.cycle :] = np.nan
     known = np.all(np.isfinite(centre), axis=(1, 2))
     if not known[0]:
-        notes.append("The normals are not known: one of their balls is missing in the cold cycle.")
+        notes.append("The normals are unknown: one of their balls is missing in the cold cycle.")
         return None
     if not normals.planes_apart(centre[0]):
         notes.append(normals.ONE_PLANE)
@@ -213,71 +212,74 @@ def _normals_estimate(
 def _at_cycle_time(
     seen: rigid.Observations, cleaned: Cleaned, motion: Motion, settings: Settings
 ) -> rigid.Observations:
-    """Return the touches as they would have been had all of a cycle been made at once."""
+    """Return the touches corrected for the drift within each cycle, as if made simultaneously."""
     if not settings.interpolate or not seen.touched or not np.ptp(seen.time):
         return seen
     used, found = cleaned.used, cleaned.fit
     weights = rigid.knot_weights(found.time, np.where(seen.valid, seen.time, 0.0)[used], interpolate=True)
-    lever = motion.lever(seen.place[used])
+    lever = motion.lever(seen.position[used])
     drift = motion.error(rigid.at_times(weights, found.twist), lever)
     drift -= motion.error(found.twist[:, None, None], lever)
-    place = seen.place.copy()
-    place[used] += np.where(seen.valid[used][..., None], drift, 0.0)
-    return replace(seen, place=place)
+    position = seen.position.copy()
+    position[used] += np.where(seen.valid[used][..., None], drift, 0.0)
+    return replace(seen, position=position)
 
 
-def _told_apart(estimate: Estimate) -> Array:
-    """Return what the cycles share as a few independent sources, (source, k, 6)."""
+def _sources(estimate: Estimate) -> Array:
+    """Return the effects common to all cycles as a few independent sources, (source, k, 6)."""
     u = np.sqrt(np.einsum("kii->ki", estimate.covariance))
     F = np.where(u[..., None] > 0, estimate.shared / np.where(u > 0, u, 1.0)[..., None], 0.0)
     F = np.nan_to_num(F).reshape(-1, F.shape[2])
     values, vectors = np.linalg.eigh(F.T @ F)
-    vectors = vectors[:, values > SMALL * max(values[-1], 1e-300)][:, ::-1]
+    vectors = vectors[:, values > SMALLEST_SOURCE * max(values[-1], 1e-300)][:, ::-1]
     return np.moveaxis(estimate.shared @ vectors, 2, 0)
 
 
 def _times(cleaned: Cleaned, data: Readings, settings: Settings) -> Array:
-    """Return the time of each cycle: the mean of its touches where these are known and count, else its begin."""
+    """Return the time of each cycle: the mean of its touches if these have times and are used, else its start."""
     time = data.seen.cycle_time.copy()
     if not (settings.interpolate and data.timed):
         return time
-    mean, some = rigid.mean_time(data.seen), data.seen.valid.any(axis=(1, 2))
-    time[some] = mean[some]
+    mean, known = rigid.mean_time(data.seen), data.seen.valid.any(axis=(1, 2))
+    time[known] = mean[known]
     time[cleaned.used] = cleaned.fit.time
     return time
 
 
-def _tell(cleaned: Cleaned, data: Readings, notes: list[str]) -> None:
+def _exclusions(cleaned: Cleaned, data: Readings) -> list[str]:
+    """Return notes on outliers, balls that moved, and cycles without a result."""
+    notes: list[str] = []
     names = data.names
     wrong = cleaned.wrong.any(axis=2) if not data.seen.touched else cleaned.wrong
     if wrong.any():
         count = int(wrong.sum())
         k, i = (int(index) for index in np.argwhere(wrong)[0][:2])
         what = "touches" if data.seen.touched else "centres"
-        notes.append(f"{count} wrong {what} left out, the first of ball {names[i]} in cycle {k}.")
+        notes.append(f"{count} outliers among the {what} were excluded, the first of ball {names[i]} in cycle {k}.")
     for move in cleaned.moves:
         shift = ", ".join(f"{value * 1e6:.2g}" for value in move.shift)
-        also = f" It may also have been {' or '.join(names[i] for i in move.others)}." if move.others else ""
+        also = f" It may also have been ball {' or '.join(names[i] for i in move.others)}." if move.others else ""
         notes.append(
             f"Ball {names[move.ball]} moved before cycle {move.cycle} "
-            f"({data.seen.cycle_time[move.cycle]:g} s), as the machine sees it by about ({shift}) um; left out from "
-            f"there on.{also}"
+            f"({data.seen.cycle_time[move.cycle]:g} s), by about ({shift}) um as measured; excluded from this cycle "
+            f"on.{also}"
         )
     if len(cleaned.moves) > 1:
         notes.append(
-            "More than one ball seems to have moved. Do they stand firm, and do the right axes carry the tool "
-            "(tool_axes)? A machine that does not move as one rigid frame looks alike."
+            "More than one ball appears to have moved. Check their mounting and the axes that carry the tool "
+            "(tool_axes). A machine that does not move as one rigid frame has the same effect."
         )
     lost = sorted(set(range(len(data.seen.cycle_time))) - set(cleaned.used.tolist()))
     if lost:
         shown = ", ".join(map(str, lost[:8])) + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
         notes.append(f"{len(lost)} cycles do not determine the motion and are unknown: {shown}.")
+    return notes
 
 
 def _coordinates(raw: xr.Dataset, data: Readings, time: Array) -> dict[str, Any]:
     coords: dict[str, Any] = {
         "time": ("time", time, {"units": "s"}),
-        "cycle_time": ("time", data.seen.cycle_time, {"units": "s", "long_name": "begin of the probing cycle"}),
+        "cycle_time": ("time", data.seen.cycle_time, {"units": "s", "long_name": "start of the probing cycle"}),
         "ball": data.names,
         "direction": list("xyz"),
         "direction_": list("xyz"),
@@ -317,24 +319,28 @@ def _extras(
     u, u_best = (np.sqrt(np.einsum("kii->ki", part.covariance)) for part in (plain, best))
     loss = np.where(u_best > 0, u / np.where(u_best > 0, u_best, 1.0), np.nan)
     extras = {
-        "centre": (("time", "ball", "direction"), measured.centre, {**metre, "long_name": "as the machine sees it"}),
+        "centre": (
+            ("time", "ball", "direction"),
+            measured.centre,
+            {**metre, "long_name": "apparent centre in machine coordinates"},
+        ),
         "centre_covariance": (
             ("time", "ball", "direction", "direction_"),
             factor * measured.cofactor,
-            {"units": "m^2", "long_name": "by what is new in every cycle"},
+            {"units": "m^2", "long_name": "from the touches of the cycle itself"},
         ),
         "ball_displacement": (
             ("time", "ball", "direction"),
             measured.centre - measured.centre[0],
-            {**metre, "long_name": "since the cold cycle, as the machine sees it: against its own error"},
+            {**metre, "long_name": "apparent, since the cold cycle: opposite to the error"},
         ),
-        "residual": (each, residual, {**metre, "long_name": "measured less fitted distance"}),
+        "residual": (each, residual, {**metre, "long_name": "measured minus fitted distance"}),
         "left_out": (
             each,
             flag.astype(np.int8),
-            {"long_name": "0 = used, 1 = missing, 2 = wrong touch, 3 = ball had moved, 4 = cycle not determined"},
+            {"long_name": "0 = used, 1 = missing, 2 = outlier, 3 = ball had moved, 4 = cycle not determined"},
         ),
-        "ball_moved": (("time", "ball"), moved, {"long_name": "1 from the cycle on before which the ball moved"}),
+        "ball_moved": (("time", "ball"), moved, {"long_name": "1 from the first cycle after a move of the ball"}),
         "normals_errors": (dof, plain.twist, {"long_name": "by the normals of two planes; m, rad"}),
         "normals_covariance": ((*dof, "dof_"), plain.covariance, {"long_name": "m^2, m rad, rad^2"}),
         "normals_loss": (
@@ -354,5 +360,5 @@ def _steps(cleaned: Cleaned, settings: Settings) -> list[str]:
         else "normals of two planes through four balls, Cayley"
     ]
     if cleaned.wrong.any():
-        steps.append(f"{int(cleaned.wrong.sum())} wrong touches left out")
-    return steps + [f"ball {move.ball + 1} left out from cycle {move.cycle} on" for move in cleaned.moves]
+        steps.append(f"{int(cleaned.wrong.sum())} outliers excluded")
+    return steps + [f"ball {move.ball + 1} excluded from cycle {move.cycle} on" for move in cleaned.moves]

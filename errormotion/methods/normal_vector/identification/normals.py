@@ -1,38 +1,33 @@
-"""The published construction: the turn of two planes through four balls, by Cayley's transform (Yang et al., 2.2, 2.3).
+"""The published construction: rotation of two planes through four balls, by Cayley's transform (Yang et al., 2.2, 2.3).
 
-With h a plane's unit normal as the warm machine sees it and H as the cold one did, H = R h and
+With h the unit normal of a plane as measured by the warm machine and H by the cold one, H = R h and
 
     H - h = U (H + h),    U = [u]x,    R = (I + U) (I - U)^-1.
 
-U is singular, as every 3 x 3 antisymmetric matrix is, and need not be inverted: the equation is linear in u,
-u x (H + h) = H - h, three equations of rank two for each normal, six of rank three for both. The displacement then
-follows from the mean of the four centres. (In the paper's eq. (5) the sign of the term in row 2, column 3 has to be
+U is singular, like every 3 x 3 antisymmetric matrix, and is not inverted: the equation is linear in u,
+u x (H + h) = H - h, with three equations of rank two for each normal, and six of rank three for both. The displacement
+follows from the mean of the four centres. (In eq. (5) of the paper the sign of the term in row 2, column 3 must be
 negative, as in its eqs. (1) to (3).)
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.methods.normal_vector.identification.freedoms import turned
-
-if TYPE_CHECKING:
-    Array = Array
+from errormotion.methods.normal_vector.identification.freedoms import rotated
 
 STEP = 1e-6
-"""Step of the derivative, m; its square over the balls' distances is far below rounding of a twist."""
+"""Step of the derivative, m; its square over the distances of the balls is far below the rounding of a twist."""
 
 PARALLEL = 1e-3
-"""Sine of the angle between the planes below which they count as one."""
+"""Sine of the angle between the planes below which they count as parallel."""
 ONE_PLANE = (
-    "The normals are not known: their four balls lie in one plane, so that both normals are one, and a turn about it "
-    "does not show in them."
+    "The normals are unknown: their four balls lie in one plane, so that both normals are equal, and a rotation about "
+    "them is not determined."
 )
-"""What to say of such balls."""
+"""Note on such balls."""
 
 
 def plane_normals(centre: Array) -> Array:
@@ -43,13 +38,13 @@ def plane_normals(centre: Array) -> Array:
 
 
 def planes_apart(centre: Array) -> bool:
-    """Return whether the two planes through centres (4, 3) differ enough to show the turn about their normals."""
+    """Return whether the planes through centres (4, 3) differ enough to determine the rotation about their normals."""
     first, second = plane_normals(centre)
     return bool(np.linalg.norm(np.cross(first, second)) > PARALLEL)
 
 
 def cayley_rotation(before: Array, after: Array) -> Array:
-    """Return the rotation vectors (..., 3), rad, that turn unit vectors ``before`` (..., n, 3) into ``after``."""
+    """Return the rotation vectors (..., 3), rad, that rotate unit vectors ``before`` (..., n, 3) into ``after``."""
     A = -cross_matrix(after + before)  # u x v = -[v]x u
     difference = after - before
     A = A.reshape(*A.shape[:-3], -1, 3)
@@ -62,16 +57,16 @@ def cayley_rotation(before: Array, after: Array) -> Array:
 def twist(cold: Array, now: Array, point: Array) -> Array:
     """Return the twists (..., 6) at ``point`` from centres ``cold`` (4, 3) and ``now`` (..., 4, 3), all m.
 
-    The tool's side moves against the way that the balls seem to move.
+    The displacement of the tool side is opposite to the apparent displacement of the balls.
     """
     rotation = cayley_rotation(plane_normals(now), plane_normals(cold))
     middle = now.mean(axis=-2)
-    displacement = cold.mean(axis=-2) - point - turned(rotation, middle - point)
+    displacement = cold.mean(axis=-2) - point - rotated(rotation, middle - point)
     return np.concatenate([displacement, rotation], axis=-1)
 
 
 def jacobian(cold: Array, point: Array) -> Array:
-    """Return how the twist follows the centres now, (6, 4, 3); it follows the cold ones with the opposite sign."""
+    """Return the derivative of the twist by the present centres, (6, 4, 3); by the cold ones it is the negative."""
     steps = STEP * np.eye(12).reshape(12, 4, 3)
     return np.asarray(((twist(cold, cold + steps, point) - twist(cold, cold - steps, point)) / (2 * STEP)).T).reshape(
         6, 4, 3
@@ -82,7 +77,7 @@ def covariance(cold: Array, now: Array, point: Array, centres: Array) -> Array:
     """Return the covariance (k, 6, 6) of the twists.
 
     It follows from the covariances ``now`` (k, 4, 3, 3) and ``cold`` (4, 3, 3) of the centres, m^2. ``centres`` (4, 3),
-    m, are those of the cold state; motions are too small to change the derivative.
+    m, are those of the cold state; the errors are too small to change the derivative.
     """
     J = jacobian(centres, point)
     return np.asarray(np.einsum("ubi,kbij,vbj->kuv", J, now + cold, J, optimize=True))

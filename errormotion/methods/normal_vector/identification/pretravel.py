@@ -1,10 +1,10 @@
-"""The pre-travel map of a probe, from touches all over a ball of known radius.
+"""Pre-travel map of a probe, from touches distributed over a ball of known radius.
 
-Where the probe trips, the tip p is by R + r - s(n) away from the middle c of the ball: R and r are the radii of ball
-and tip, n the direction from c to p, s the pre-travel. c and the coefficients of s are found together. How many degrees
-s has is decided by the error at touches that are left out one by one. The covariance has, beside the noise, what all
-touches share: how well the radii are known, how round the ball is, and by how much the machine itself measures longer
-in one direction than in another over the size of the ball.
+When the probe trips, the tip p is at the distance R + r - s(n) from the centre c of the ball: R and r are the radii of
+ball and tip, n the direction from c to p, s the pre-travel. c and the coefficients of s are estimated together. The
+highest degree of s is selected by leave-one-out cross-validation. In addition to the noise, the covariance contains the
+errors common to all touches: the uncertainty of the radii, the roundness of the ball, and the scale and squareness
+errors of the machine over the size of the ball.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from pydantic import Field
+from scipy.stats import median_abs_deviation
 
 from errormotion.arrays import Array
 from errormotion.datasets import provenance
@@ -27,18 +28,17 @@ from errormotion.datasets.units import Length
 from errormotion.errors import FitError
 from errormotion.plugins import PluginSettings, Touch
 
-SPARE = 4
-"""Touches more than unknowns, at least."""
-_ROUNDS = 20
-_OUTSIDE = 5.0  # robust standard deviations: a touch so far from the others is left out
-_MOST_LEFT_OUT = 0.1
-_MAD = 1.4826  # standard deviations of a normal distribution for one median absolute deviation
-_OVAL = 0.27  # rms of a surface over the sphere for one peak to valley, where it is an ellipsoid
-_WEAK = 1e-6  # smallest singular value of the design, in largest ones
+REDUNDANCY = 4
+"""Smallest number of touches beyond the number of unknowns."""
+_ITERATIONS = 20
+_OUTLIER = 5.0  # distance from the other touches, in robust standard deviations
+_MOST_OUTLIERS = 0.1  # fraction of the touches
+_OVAL = 0.27  # rms of the surface of an ellipsoid over the sphere for one peak to valley
+_SINGULAR = 1e-6  # smallest singular value of the design relative to the largest one
 
 
 class PretravelSettings(PluginSettings):
-    """What is known of the ball, the tip and the machine."""
+    """Properties of the ball, the tip and the machine."""
 
     ball_radius: Length = Field(description="radius of the ball, from its calibration", gt=0)
     ball_radius_uncertainty: Length = Field(default=0.5e-6, description="its standard uncertainty", ge=0)
@@ -46,10 +46,10 @@ class PretravelSettings(PluginSettings):
     tip_radius: Length = Field(description="radius of the tip", gt=0)
     tip_radius_uncertainty: Length = Field(default=1e-6, description="its standard uncertainty", ge=0)
     strain: float = Field(
-        default=10e-6, description="by how much the machine's scales and right angles may be off, m/m, one sigma", ge=0
+        default=10e-6, description="standard uncertainty of the machine's scales and squareness, m/m", ge=0
     )
     serial_number: str = Field(default="", description="serial number of the probe; unknown if not given")
-    highest: int = Field(default=5, description="highest degree that is tried", ge=0, le=HIGHEST)
+    highest: int = Field(default=5, description="highest degree of the candidates", ge=0, le=HIGHEST)
 
 
 def calibrating_touches(
@@ -62,20 +62,20 @@ def calibrating_touches(
     standoff: float = 2e-3,
     overtravel: float = 1e-3,
 ) -> list[Touch]:
-    """Return touches all over a ball, evenly spread, along its normals.
+    """Return touches evenly distributed over a ball, along its normals.
 
     Parameters
     ----------
     centre : (3,)
-        Of the ball as far as it is known, m.
+        Approximate centre of the ball, m.
     ball_radius, tip_radius : float
         m.
     count : int
-        How many.
+        Number of touches.
     lowest : float
-        Elevation of the lowest ones, rad; the ball's post is below.
+        Elevation of the lowest touches, rad; the post of the ball is below.
     standoff, overtravel : float
-        Where the touch begins before the expected place of contact, and where it ends behind, m.
+        Distances of start and end of a touch before and beyond the expected contact, m.
     """
     k = np.arange(count)
     z = 1.0 - (1.0 - math.sin(lowest)) * (k + 0.5) / count
@@ -85,10 +85,10 @@ def calibrating_touches(
     contact = ball_radius + tip_radius
     starts = np.asarray(centre) + (contact + standoff) * n
     targets = np.asarray(centre) + (contact - overtravel) * n
-    return [Touch(_place(start), _place(target)) for start, target in zip(starts, targets, strict=True)]
+    return [Touch(_tuple(start), _tuple(target)) for start, target in zip(starts, targets, strict=True)]
 
 
-def _place(point: Array) -> tuple[float, float, float]:
+def _tuple(point: Array) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in point)
     return x, y, z
 
@@ -99,7 +99,7 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
     Parameters
     ----------
     touch : (n, 3)
-        Places of the tip where the probe tripped, m, in the machine's coordinates; rows with NaN gave none.
+        Positions of the tip when the probe tripped, m, machine coordinates; rows with NaN are ignored.
     settings : PretravelSettings
 
     Returns
@@ -109,21 +109,21 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
     Raises
     ------
     FitError
-        Too few touches, or touches that do not surround enough of the ball.
+        Too few touches, or touches that do not surround the ball sufficiently.
     """
     given = np.asarray(touch, dtype=float).reshape(-1, 3)
     points = given[np.isfinite(given).all(axis=1)]
-    if len(points) < 4 + SPARE:
+    if len(points) < 4 + REDUNDANCY:
         raise FitError(
-            f"Expected at least {4 + SPARE} touches of the ball; found {len(points)}. For lobes 40 or more make sense"
+            f"Expected at least {4 + REDUNDANCY} touches of the ball; found {len(points)}. 40 or more are recommended"
         )
     contact = settings.ball_radius + settings.tip_radius
     used = np.ones(len(points), dtype=bool)
     while True:
-        tried = _tried(points[used], contact, settings.highest)
-        best = min(tried, key=lambda each: each.cross_validated)
+        candidates = _candidates(points[used], contact, settings.highest)
+        best = min(candidates, key=lambda each: each.cross_validated)
         worst = _worst(best.left_out_residual)
-        if worst is None or used.sum() <= math.ceil((1 - _MOST_LEFT_OUT) * len(points)):
+        if worst is None or used.sum() <= math.ceil((1 - _MOST_OUTLIERS) * len(points)):
             break
         used[np.flatnonzero(used)[worst]] = False
     degrees, orders = terms_up_to(best.highest)
@@ -143,8 +143,8 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
             "left_out": (~used).astype(int),
             "reach": _widest_gap(normals[used]),
             "noise": noise,
-            "cross_validated": [each.cross_validated for each in tried],
-            "highest": [each.highest for each in tried],
+            "cross_validated": [each.cross_validated for each in candidates],
+            "highest": [each.highest for each in candidates],
             "ball_radius": settings.ball_radius,
             "tip_radius": settings.tip_radius,
         },
@@ -158,7 +158,7 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
 
 @dataclass(frozen=True)
 class _Fit:
-    """Centre and coefficients with a highest degree; rows and residuals of the touches."""
+    """Centre and coefficients for one highest degree; design and residuals of the touches."""
 
     highest: int
     centre: Array
@@ -169,32 +169,34 @@ class _Fit:
 
     @property
     def cross_validated(self) -> float:
-        """Rms error at touches left out, m."""
+        """Rms of the cross-validation residuals, m."""
         return float(np.sqrt(np.mean(self.left_out_residual**2)))
 
 
-def _tried(points: Array, contact: float, highest: int) -> list[_Fit]:
-    tried = []
+def _candidates(points: Array, contact: float, highest: int) -> list[_Fit]:
+    candidates = []
     for degree in (0, *range(2, highest + 1)):
         unknowns = len(terms_up_to(degree)[0]) + 3
-        if len(points) >= unknowns + SPARE and (fit := _fit(points, contact, degree)) is not None:
-            tried.append(fit)
-    if not tried:
-        raise FitError("The touches do not surround enough of the ball to find its middle; touch it from more sides")
-    return tried
+        if len(points) >= unknowns + REDUNDANCY and (fit := _fit(points, contact, degree)) is not None:
+            candidates.append(fit)
+    if not candidates:
+        raise FitError(
+            "The touches do not surround the ball sufficiently to determine its centre; touch it from more sides"
+        )
+    return candidates
 
 
 def _fit(points: Array, contact: float, highest: int) -> _Fit | None:
-    """Find middle and coefficients together; None where the touches do not determine them."""
+    """Estimate centre and coefficients together; None if the touches do not determine them."""
     degrees, orders = terms_up_to(highest)
     centre = _first_centre(points)
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         offset = points - centre
         distance = np.linalg.norm(offset, axis=1)
         n = offset / distance[:, None]
         A = np.hstack([harmonics(n, degrees, orders), -n])  # R + r - |p - c| = H b - n dc
         values = np.linalg.svd(A, compute_uv=False)
-        if values[-1] < _WEAK * values[0]:
+        if values[-1] < _SINGULAR * values[0]:
             return None
         found = np.linalg.lstsq(A, contact - distance, rcond=None)[0]
         centre = centre + found[-3:]
@@ -207,7 +209,7 @@ def _fit(points: Array, contact: float, highest: int) -> _Fit | None:
 
 
 def _first_centre(points: Array) -> Array:
-    """Return the middle of the sphere through all points, by linear algebra."""
+    """Return the centre of the sphere through all points, by linear least squares."""
     mean = points.mean(axis=0)
     p = points - mean
     A = np.hstack([2 * p, np.ones((len(p), 1))])
@@ -215,14 +217,14 @@ def _first_centre(points: Array) -> Array:
 
 
 def _worst(residual: Array) -> int | None:
-    """Return the number of the touch that does not belong to the others; None if all do."""
+    """Return the index of the largest outlier; None if there is none."""
     off = np.abs(residual - np.median(residual))
     worst = int(np.argmax(off))
-    return worst if off[worst] > _OUTSIDE * _MAD * float(np.median(off)) else None
+    return worst if off[worst] > _OUTLIER * median_abs_deviation(residual, scale="normal") else None
 
 
 def _covariance(fit: _Fit, normals: Array, contact: float, settings: PretravelSettings) -> tuple[float, Array]:
-    """Return the noise of a touch and the covariance of the coefficients, all sources."""
+    """Return the noise of a touch and the covariance of the coefficients from all sources."""
     A, free = fit.design, len(fit.residual) - fit.design.shape[1]
     noise = float(np.sqrt((fit.residual**2).sum() / free))
     inverse = np.linalg.pinv(A)
@@ -236,7 +238,7 @@ def _covariance(fit: _Fit, normals: Array, contact: float, settings: PretravelSe
 
 
 def _shared(n: Array, contact: float, settings: PretravelSettings) -> list[Array]:
-    """Return what errors that all touches share do to each of them, one sigma, m."""
+    """Return the effects on each touch of the errors common to all touches, one standard uncertainty, m."""
     radii = math.hypot(settings.ball_radius_uncertainty, settings.tip_radius_uncertainty)
     shared = [np.full(len(n), radii)]
     oval = _OVAL * settings.ball_roundness / math.sqrt(5.0)  # of each of the five terms of degree 2
@@ -247,7 +249,7 @@ def _shared(n: Array, contact: float, settings: PretravelSettings) -> list[Array
 
 
 def _widest_gap(normals: Array) -> float:
-    """Return the largest angle between a touch and the one next to it, rad."""
+    """Return the largest angle between a touch and its nearest neighbour, rad."""
     cosine = normals @ normals.T
     np.fill_diagonal(cosine, -1.0)
     return float(np.arccos(np.clip(cosine.max(axis=1), -1.0, 1.0)).max())

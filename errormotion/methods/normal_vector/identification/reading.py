@@ -1,4 +1,4 @@
-"""What identification takes out of a raw dataset: arrays in a fixed order, with names, and first doubts."""
+"""Input of the identification from a raw dataset: arrays in a fixed order, names, and first checks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-    Array = Array
-
 FLAGS = {1: "no trip", 2: "tripped at the start", 3: "repeat differs", 4: "not made"}
-"""What a touch's flag says; 0 is a good touch."""
+"""Meanings of the flags of touches; 0 is a good touch."""
 _AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
 
 
@@ -34,14 +32,14 @@ class Readings:
     seen : Observations
         With unit weights (1 / noise^2 where the noise is stated).
     names : list of str
-        Of the balls.
+        Names of the balls.
     tool_axes : str
     noise : float
-        Stated standard deviation of a number, m; 1 where the weights are stated covariances; NaN where nothing is.
+        Stated standard deviation of a number, m; 1 if the weights are stated covariances; NaN if neither is stated.
     nominal : ndarray (b, 3) or None
-        Rough centres, m.
+        Approximate centres, m.
     radius : ndarray (b,)
-        Nominal radius of ball and tip, m; NaN where not known.
+        Nominal radius of ball plus tip, m; NaN if unknown.
     timed : bool
         Whether the time of each touch is known.
     """
@@ -61,21 +59,21 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     Raises
     ------
     MethodError
-        Nothing measured, no cold cycle, or balls that are not where and what they are said to be.
+        No data, no cold cycle, or invalid ``tool_axes``, noise or covariances.
     """
-    touched = "touch" in raw.variables  # it bears the name of a dimension, so that xarray calls it a coordinate
+    touched = "touch" in raw.variables  # has the name of a dimension, so that xarray treats it as a coordinate
     names = _names(raw)
-    begin = _array(raw, "time", "time")
-    place = _array(raw, "touch", "time", "ball", "touch", "direction") if touched else _coordinates(raw)
-    valid = np.all(np.isfinite(place), axis=-1)
+    start = _array(raw, "time", "time")
+    position = _array(raw, "touch", "time", "ball", "touch", "direction") if touched else _coordinates(raw)
+    valid = np.all(np.isfinite(position), axis=-1)
     if "touch_flag" in raw:
         flag = _array(raw, "touch_flag", "time", "ball", "touch")
-        _tell_flags(flag, notes)
+        notes += _flag_notes(flag)
         valid = valid & ~(flag > 0)
     if not valid.any():
-        raise MethodError("Expected touches of balls; found none that is good. Did the probe trip at all?")
+        raise MethodError("Expected touches of balls; found none that is good. Check the function of the probe.")
     if settings.reference == "cold":
-        _check_cold(begin, valid)
+        _check_cold(start, valid)
     lost = int(valid.size - valid.sum()) // (1 if touched else 3)
     if lost:
         what = "touches" if touched else "centres"
@@ -84,18 +82,16 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     time = (
         _array(raw, "touch_time", "time", "ball", "touch")
         if timed
-        else np.broadcast_to(begin[:, None, None], valid.shape)
+        else np.broadcast_to(start[:, None, None], valid.shape)
     )
     if timed:
         valid = valid & np.isfinite(time)
         _check_times(time, valid)
     elif settings.interpolate and touched:
-        notes.append(
-            "The times of the touches are not in the data (touch_time): drift within a cycle is not corrected."
-        )
+        notes.append("The data have no times of the touches (touch_time): drift within a cycle is not corrected.")
     weight, noise = _weights(raw, settings, valid, touched)
-    place = np.where(valid[..., None], place, 0.0)
-    seen = Observations(place, weight, np.where(valid, time, 0.0), begin, touched)
+    position = np.where(valid[..., None], position, 0.0)
+    seen = Observations(position, weight, np.where(valid, time, 0.0), start, touched)
     nominal = _array(raw, "ball_nominal", "ball", "direction") if "ball_nominal" in raw else None
     radius = np.full(len(names), np.nan)
     if "ball_radius" in raw and touched:
@@ -105,13 +101,13 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
         raise MethodError(f"tool_axes: expected the linear axes that carry the tool, such as XYZ or Z; found '{axes}'")
     if "tool_axes" in raw.attrs and axes != settings.tool_axes and "tool_axes" in settings.model_fields_set:
         notes.append(
-            f"The data say that {axes or 'no axis'} carries the tool; the setting {settings.tool_axes} was not used."
+            f"The data state that {axes or 'no axis'} carries the tool; the setting {settings.tool_axes} was not used."
         )
     return Readings(seen, names, axes, noise, nominal, radius, timed)
 
 
 def check_balls(centre: Array, radius: Array, data: Readings, tolerance: float) -> None:
-    """Raise MethodError where balls found at ``centre`` (b, 3) with ``radius`` (b,), m, are not as stated."""
+    """Raise MethodError if balls found at ``centre`` (b, 3) with ``radius`` (b,), m, differ from the stated ones."""
     nominal = data.nominal
     if nominal is not None and np.isfinite(nominal).all():
         away = np.linalg.norm(centre[:, None] - nominal, axis=2)
@@ -121,76 +117,76 @@ def check_balls(centre: Array, radius: Array, data: Readings, tolerance: float) 
             j = int(np.argmin(away[i]))
             if j != i and away[i, j] < min(tolerance, off[i] / 2):
                 raise MethodError(
-                    f"Ball {data.names[i]} was found where ball {data.names[j]} should be: are they swapped, in the "
-                    "program or in ball_nominal? Expected the same order in both."
+                    f"Ball {data.names[i]} was found at the position of ball {data.names[j]}: expected the same order "
+                    "of the balls in the program and in ball_nominal."
                 )
             raise MethodError(
-                f"Ball {data.names[i]} was found {off[i] * 1e3:.4g} mm from its rough place; expected within "
-                f"{tolerance * 1e3:g} mm (ball_tolerance). Are both in m and in machine coordinates?"
+                f"Ball {data.names[i]} was found {off[i] * 1e3:.4g} mm from its nominal position; expected within "
+                f"{tolerance * 1e3:g} mm (ball_tolerance). Check that both are in m and in machine coordinates."
             )
     wrong = np.abs(radius - data.radius) > tolerance
     if wrong.any():
         i = int(np.argmax(wrong))
         raise MethodError(
             f"The touches of ball {data.names[i]} lie on a sphere of radius {radius[i] * 1e3:.4g} mm; expected "
-            f"{data.radius[i] * 1e3:.4g} mm, ball and tip together. Are ball_radius and tip_radius right, and in m?"
+            f"{data.radius[i] * 1e3:.4g} mm, ball plus tip. Check ball_radius and tip_radius, and their unit (m)."
         )
 
 
 def check_jumps(seen: Observations, names: list[str], tolerance: float) -> None:
-    """Raise MethodError where touches of a cycle lie far from those of the others."""
+    """Raise MethodError if touches of a cycle are far from those of the other cycles."""
     valid = seen.valid
-    place = np.where(valid[..., None], seen.place, np.nan)
-    middle = np.nanmedian(place, axis=0) if valid.any(axis=0).all() else _median(place)
-    off = np.linalg.norm(place - middle, axis=-1)
+    position = np.where(valid[..., None], seen.position, np.nan)
+    median = np.nanmedian(position, axis=0) if valid.any(axis=0).all() else _median(position)
+    off = np.linalg.norm(position - median, axis=-1)
     if not np.nanmax(off) > tolerance:
         return
     k, i, j = np.unravel_index(int(np.nanargmax(off)), off.shape)
-    other = np.linalg.norm(place[k, i, j] - middle[:, j], axis=-1)
+    other = np.linalg.norm(position[k, i, j] - median[:, j], axis=-1)
     other[i] = np.inf
     where = f"In cycle {k} ball {names[i]}"
     if np.nanmin(other) < tolerance:
         raise MethodError(
-            f"{where} was touched where ball {names[int(np.nanargmin(other))]} is in the other cycles: expected the "
-            "same order of the balls in all cycles. Was the program changed, or a touch lost in the record?"
+            f"{where} was touched at the position of ball {names[int(np.nanargmin(other))]} in the other cycles: "
+            "expected the same order of the balls in all cycles. Check the program and the record for lost touches."
         )
     raise MethodError(
-        f"{where} was touched {off[k, i, j] * 1e3:.4g} mm from where it is touched in the other cycles; expected "
-        f"within {tolerance * 1e3:g} mm (ball_tolerance). Was the ball knocked over, or was something else touched?"
+        f"{where} was touched {off[k, i, j] * 1e3:.4g} mm from its touches in the other cycles; expected within "
+        f"{tolerance * 1e3:g} mm (ball_tolerance). Check whether the ball was displaced or another object was touched."
     )
 
 
-def _median(place: Array) -> Array:
+def _median(position: Array) -> Array:
     import warnings
 
-    with warnings.catch_warnings():  # directions that were never touched have no median
+    with warnings.catch_warnings():  # directions without touches have no median
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(place, axis=0))
+        return np.asarray(np.nanmedian(position, axis=0))
 
 
-def _check_cold(begin: Array, valid: NDArray[np.bool_]) -> None:
-    late = len(begin) > 1 and begin[0] > (begin[1] - begin[0]) / 2
+def _check_cold(start: Array, valid: NDArray[np.bool_]) -> None:
+    late = len(start) > 1 and start[0] > (start[1] - start[0]) / 2
     if late:
         raise MethodError(
-            f"The cold cycle is missing: expected the first cycle at 0 s; found it at {begin[0]:g} s. Probe the cold "
-            'machine, or take the first cycle as it is for the reference (reference = "first").'
+            f"The cold cycle is missing: expected the first cycle at 0 s; found it at {start[0]:g} s. Probe the cold "
+            'machine, or use the first cycle as the reference (reference = "first").'
         )
     if not valid[0].any():
         raise MethodError(
-            "The cold cycle is missing: cycle 0 holds no good touch. Probe the cold machine, or leave the empty cycle "
-            'out and take the first one that there is for the reference (reference = "first").'
+            "The cold cycle is missing: cycle 0 has no good touch. Probe the cold machine, or remove the empty cycle "
+            'and use the first remaining one as the reference (reference = "first").'
         )
 
 
 def _check_times(time: Array, valid: NDArray[np.bool_]) -> None:
     first = np.min(np.where(valid, time, np.inf), axis=(1, 2))
     last = np.max(np.where(valid, time, -np.inf), axis=(1, 2))
-    done = np.flatnonzero(valid.any(axis=(1, 2)))
-    for before, after in pairwise(done):
+    used = np.flatnonzero(valid.any(axis=(1, 2)))
+    for before, after in pairwise(used):
         if last[before] > first[after]:
             raise MethodError(
-                f"touch_time: expected cycle {before} to end before cycle {after} begins; found {last[before]:g} s and "
-                f"{first[after]:g} s. Are the touches' times on the clock of `time`?"
+                f"touch_time: expected cycle {before} to end before cycle {after} starts; found {last[before]:g} s and "
+                f"{first[after]:g} s. The times of the touches must be on the clock of `time`."
             )
 
 
@@ -203,7 +199,7 @@ def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touc
         if stated is None:
             return diagonal, float("nan")
         if not stated > 0:
-            raise MethodError(f"expected touch_noise above 0, found {stated:g} m; leave it out where it is not known")
+            raise MethodError(f"touch_noise: expected more than 0 m; found {stated:g} m. Omit it if it is unknown.")
         return diagonal, stated
     if "centre_covariance" not in raw:
         return diagonal, float("nan")
@@ -212,7 +208,7 @@ def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touc
     known = np.all(np.isfinite(C), axis=(2, 3)) & there
     if (there & ~known).any():
         raise MethodError(
-            "centre_covariance: expected a covariance for every centre; found NaN. Leave it out if unknown."
+            "centre_covariance: expected a covariance for every centre; found NaN. Omit it if it is unknown."
         )
     C = np.where(known[..., None, None], C, np.eye(3))
     if not (np.linalg.eigvalsh(C) > 0).all():
@@ -220,15 +216,15 @@ def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touc
     return np.linalg.inv(C) * known[..., None, None], 1.0
 
 
-def _tell_flags(flag: Array, notes: list[str]) -> None:
-    for value in np.unique(flag[np.isfinite(flag)]):
-        if value > 0:
-            count = int(np.count_nonzero(flag == value))
-            notes.append(f"{count} touches are flagged: {FLAGS.get(int(value), f'flag {value:g}')}.")
+def _flag_notes(flag: Array) -> list[str]:
+    counts = [
+        (value, int(np.count_nonzero(flag == value))) for value in np.unique(flag[np.isfinite(flag)]) if value > 0
+    ]
+    return [f"{count} touches are flagged: {FLAGS.get(int(value), f'flag {value:g}')}." for value, count in counts]
 
 
 def _coordinates(raw: xr.Dataset) -> Array:
-    """Return the centres as three numbers each that are measured at one place, (k, b, 3, 3)."""
+    """Return the centres, each repeated for its three coordinates, (k, b, 3, 3)."""
     centre = _array(raw, "centre", "time", "ball", "direction")
     return np.array(np.broadcast_to(centre[:, :, None], (*centre.shape, 3)))
 

@@ -1,15 +1,15 @@
-"""The motion of every probing cycle, from all touches of all balls at once.
+"""The motion of every probing cycle, from all touches of all balls together.
 
-A touch of ball i in direction j at time t puts the tip's centre at p where the machine says so, and truly at p + e(p),
+In a touch of ball i in direction j at time t the commanded position of the tip is p, and the true one p + e(p),
 
     |p + e(p, t) - b_i| = reach_ij + noise
 
-``reach_ij`` is ball and tip radius, the ball's form there, the probe's pre-travel in that direction and what the axes
-are off by: the same in every cycle, so that none of it has to be known. Unknown are the twists of all cycles but the
-cold one, whose twist is zero, and all reaches; b_i only says across what the reaches are measured and comes from a
-sphere through them. Between the cycles the twist follows a parabola through three of them, or stays as it is.
+``reach_ij`` is the sum of ball and tip radius, form of the ball, pre-travel in this direction and geometric error of
+the axes: it is the same in every cycle, and none of its parts needs to be known. Unknowns are the twists of all cycles
+except the cold one, whose twist is zero, and all reaches; b_i only defines the directions of the reaches and results
+from a sphere fit. Between the cycles the twist follows a parabola through three of them, or is constant.
 
-Where a dataset has centres only, p is the centre, and p + e(p, t) = b_i takes the place of the three coordinates.
+For a dataset of centres, p is the centre, and p + e(p, t) = b_i replaces the equation for each of the coordinates.
 """
 
 from __future__ import annotations
@@ -23,37 +23,35 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError, MethodError
 from errormotion.kinematics.fits import fit_sphere
 from errormotion.methods.normal_vector.identification import chain
-from errormotion.methods.normal_vector.identification.freedoms import FLAT, Motion, spread, turned
+from errormotion.methods.normal_vector.identification.freedoms import FLAT, Motion, rotated, spread
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
-
-SETTLED = 1e-12
-"""Change of the twist, m and rad, at which the iteration ends: far below any noise, above rounding at 4 m."""
-MOST_STEPS = 25
+CONVERGED = 1e-12
+"""Change of the twist, m and rad, at which the iteration ends: far below any noise, above the rounding at 4 m."""
+MOST_ITERATIONS = 25
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What was probed, in k cycles, on b balls, m numbers each: touches, or the coordinates of a centre.
+    """Data of k cycles, b balls and m numbers each: touches, or the coordinates of a centre.
 
     Attributes
     ----------
-    place : ndarray (k, b, m, 3)
-        Commanded places, m; 0 where nothing was measured.
+    position : ndarray (k, b, m, 3)
+        Commanded positions, m; 0 where not measured.
     weight : ndarray (k, b, m, m)
-        Inverse covariance of the numbers of a ball, 1/m^2; 0 where nothing was measured.
+        Inverse covariance of the numbers of a ball, 1/m^2; 0 where not measured.
     time : ndarray (k, b, m)
         Of each, s.
     cycle_time : ndarray (k,)
         s.
     touched : bool
-        Whether they are touches.
+        Whether the data are touches.
     """
 
-    place: Array
+    position: Array
     weight: Array
     time: Array
     cycle_time: Array
@@ -61,19 +59,19 @@ class Observations:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """What was measured, (k, b, m)."""
+        """Which numbers were measured, (k, b, m)."""
         return np.diagonal(self.weight, axis1=2, axis2=3) > 0
 
     def without(self, wrong: NDArray[np.bool_]) -> Observations:
-        """Return the observations less those that are wrong, (k, b, m)."""
+        """Return the observations without the outliers ``wrong`` (k, b, m)."""
         keep = (~wrong).astype(float)
         return replace(self, weight=self.weight * keep[..., :, None] * keep[..., None, :])
 
     def cycles(self, which: NDArray[np.intp]) -> Observations:
-        """Return some of the cycles."""
+        """Return the selected cycles."""
         return replace(
             self,
-            place=self.place[which],
+            position=self.position[which],
             weight=self.weight[which],
             time=self.time[which],
             cycle_time=self.cycle_time[which],
@@ -82,31 +80,31 @@ class Observations:
 
 @dataclass(frozen=True)
 class Rigid:
-    """The fit; covariances are for the weights of the observations.
+    """The fit; covariances refer to the weights of the observations.
 
     Attributes
     ----------
     twist : ndarray (k, 6)
-        m, rad; 0 in the first cycle and for freedoms that no ball shows.
+        m, rad; 0 in the first cycle and for errors that are not determined.
     own : ndarray (k, 6, 6)
-        Covariance without what the cycles share.
+        Covariance without the contribution common to all cycles.
     shared : ndarray (k, 6, q)
-        What one standard uncertainty of each of q independent parts of the reaches adds.
+        Effect of one standard uncertainty of each of q independent components of the reaches.
     time : ndarray (k,)
-        To which the twists belong, s.
+        Times of the twists, s.
     anchor : ndarray (b, 3)
         Centres of the balls in the first cycle, m.
     reach : ndarray (b, m)
-        m; NaN where never measured. Of centres: their coordinates.
+        m; NaN if never measured. For centres: their coordinates.
     residual : ndarray (k, b, m)
-        Measured less fitted, m; NaN where not measured.
+        Measured minus fitted, m; NaN where not measured.
     normal : ndarray (k, b, m, 3)
-        Unit vectors along which was measured.
+        Unit vectors of the measuring directions.
     design : ndarray (k, b, m, p)
-        How each number follows the p seen freedoms of its time.
+        Derivative of each number by the p determined errors at its time.
     chi2 : float
     freedom : int
-        Numbers less unknowns.
+        Degrees of freedom.
     """
 
     twist: Array
@@ -133,56 +131,55 @@ def fit(seen: Observations, motion: Motion, *, interpolate: bool = True) -> Rigi
     Raises
     ------
     MethodError
-        A ball without four touches around it, fewer than two cycles, or a problem that has no one answer.
+        A ball with fewer than four touches, fewer than two cycles, or a singular problem.
     """
     k = len(seen.cycle_time)
     if k < 2:
         raise MethodError(
-            f"Expected the cold cycle and at least one more; found {k} that determine the motion. Probe again."
+            f"Expected the cold cycle and at least one more; found {k} that determine the motion. Repeat the probing."
         )
     time = mean_time(seen) if interpolate else seen.cycle_time
     to_knots = knot_weights(time, seen.time, interpolate)
     twist, anchor = np.zeros((k, 6)), spheres(seen)[0] if seen.touched else None
-    for _ in range(MOST_STEPS):
-        before = twist
+    for _ in range(MOST_ITERATIONS):
+        previous = twist
         twist, solved, parts = _step(seen, motion, to_knots, twist, anchor)
-        change = np.abs(twist - before).max()
-        if change < SETTLED:
+        change = np.abs(twist - previous).max()
+        if change < CONVERGED:
             break
         if anchor is not None:
-            true = seen.place + motion.error(at_times(to_knots, twist), motion.lever(seen.place))
+            true = seen.position + motion.error(at_times(to_knots, twist), motion.lever(seen.position))
             anchor = _spheres(true, seen.valid, anchor)[0]
     else:
         raise MethodError(
-            f"The fit has not settled after {MOST_STEPS} steps (last change {change:.2g} m or rad). Are the balls in "
-            "the same order in every cycle, and the places in m?"
+            f"The fit has not converged after {MOST_ITERATIONS} iterations (last change {change:.2g} m or rad). Check "
+            "that the balls have the same order in every cycle, and that positions are in m."
         )
     return _result(seen, motion, twist, solved, parts, anchor, time)
 
 
 def determined(seen: Observations, motion: Motion) -> NDArray[np.bool_]:
-    """Return which cycles determine the motion by themselves, (k,)."""
-    normal = _directions(seen.place, spheres(seen)[0]) if seen.touched else _axes(seen.place)
-    H = motion.design(motion.lever(seen.place), normal)
+    """Return which cycles determine the motion alone, (k,)."""
+    normal = _directions(seen.position, spheres(seen)[0]) if seen.touched else _axes(seen.position)
+    H = motion.design(motion.lever(seen.position), normal)
     valid = seen.valid
-    places = seen.place[valid]
-    H = H / np.where(np.array(motion.seen) < 3, 1.0, spread(places) if len(places) else 1.0)
+    positions = seen.position[valid]
+    H = H / np.where(np.array(motion.seen) < 3, 1.0, spread(positions) if len(positions) else 1.0)
     N = np.einsum("kbmp,kbm,kbmq->kpq", H, valid.astype(float), H)
     eigenvalues = np.linalg.eigvalsh(N)
     return np.asarray((eigenvalues[:, 0] > FLAT**2 * eigenvalues[:, -1]) & (eigenvalues[:, -1] > 0))
 
 
 def mean_time(seen: Observations) -> Array:
-    """Return the mean time of what each cycle measured, (k,), s."""
+    """Return the mean time of the data of each cycle, (k,), s."""
     valid = seen.valid
     return np.asarray(np.sum(np.where(valid, seen.time, 0.0), axis=(1, 2)) / np.maximum(valid.sum(axis=(1, 2)), 1))
 
 
 def knot_weights(time: Array, at: Array, interpolate: bool) -> Array:
-    """Return how the twist at times ``at`` (k, b, m) follows those of the cycle before, its own and the next.
+    """Return the weights of the twists of the previous, the same and the next cycle in that at times ``at`` (k, b, m).
 
-    In the first cycle, which is the reference state, nothing drifts; behind the last but one the drift goes on
-    straight.
+    There is no drift within the first cycle, which is the reference state; in the last cycle the drift is linear.
     """
     weights = np.zeros((*at.shape, 3))
     weights[..., 1] = 1.0
@@ -199,29 +196,29 @@ def knot_weights(time: Array, at: Array, interpolate: bool) -> Array:
 
 
 def at_times(to_knots: Array, twist: Array) -> Array:
-    """Return the twists at the times that the weights (k, b, m, 3) belong to, (k, b, m, 6)."""
+    """Return the twists at the times of the weights (k, b, m, 3), (k, b, m, 6)."""
     edge = np.zeros((1, 6))
     around = np.stack([np.concatenate([edge, twist[:-1]]), twist, np.concatenate([twist[1:], edge])], axis=1)
     return np.asarray(np.einsum("kbms,ksd->kbmd", to_knots, around))
 
 
 def spheres(seen: Observations) -> tuple[Array, Array]:
-    """Return centres (b, 3) and radii (b,) of spheres through the touches of each ball, m, as if nothing drifted."""
-    return _spheres(seen.place, seen.valid)
+    """Return centres (b, 3) and radii (b,) of spheres through the touches of each ball without drift, m."""
+    return _spheres(seen.position, seen.valid)
 
 
-def _spheres(place: Array, valid: NDArray[np.bool_], about: Array | None = None) -> tuple[Array, Array]:
-    """Return the spheres through the mean place of each ball's touches in each direction.
+def _spheres(position: Array, valid: NDArray[np.bool_], about: Array | None = None) -> tuple[Array, Array]:
+    """Return the spheres through the mean position of each ball's touches in each direction.
 
-    ``about`` (b, 3), m, are their centres nearly: then directions and distances are averaged apart. A mean of places
-    lies within the sphere that they are on.
+    With approximate centres ``about`` (b, 3), m, directions and distances are averaged separately, since the mean of
+    positions on a sphere lies inside it.
     """
     count = valid.sum(axis=0)
     each = np.maximum(count, 1)[..., None]
     if about is None:
-        mean = np.where(valid[..., None], place, 0.0).sum(axis=0) / each
+        mean = np.where(valid[..., None], position, 0.0).sum(axis=0) / each
     else:
-        away = np.where(valid[..., None], place - about[:, None], 0.0)
+        away = np.where(valid[..., None], position - about[:, None], 0.0)
         length = np.linalg.norm(away, axis=-1, keepdims=True)
         direction = (away / np.where(length > 0, length, 1.0)).sum(axis=0)
         direction /= np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 0.5)
@@ -233,35 +230,35 @@ def _spheres(place: Array, valid: NDArray[np.bool_], about: Array | None = None)
         except FitError as error:
             raise MethodError(
                 f"Ball {i + 1} has no sphere through its touches in {int((count[i] > 0).sum())} directions: {error}. "
-                "Touch every ball five times or more: around it and on top."
+                "Touch every ball five times or more, around it and on top."
             ) from error
     return np.array([sphere.centre for sphere in found]), np.array([sphere.radius for sphere in found])
 
 
-def _directions(place: Array, anchor: Array) -> Array:
-    away = place - anchor[:, None]
+def _directions(position: Array, anchor: Array) -> Array:
+    away = position - anchor[:, None]
     length = np.linalg.norm(away, axis=-1, keepdims=True)
     return np.asarray(away / np.where(length > 0, length, 1.0))
 
 
-def _axes(place: Array) -> Array:
-    return np.broadcast_to(np.eye(3), (*place.shape[:2], 3, 3))
+def _axes(position: Array) -> Array:
+    return np.broadcast_to(np.eye(3), (*position.shape[:2], 3, 3))
 
 
 def _step(
     seen: Observations, motion: Motion, to_knots: Array, twist: Array, anchor: Array | None
 ) -> tuple[Array, chain.Solved, tuple[Array, Array, Array]]:
-    """Return the twists after one Gauss-Newton step, its solution, and misfit, normals and design where it began."""
-    lever = motion.lever(seen.place)
+    """Return the twists after one Gauss-Newton step, its solution, and the misfit, normals and design before it."""
+    lever = motion.lever(seen.position)
     now = at_times(to_knots, twist)
-    true = seen.place + motion.error(now, lever)
+    true = seen.position + motion.error(now, lever)
     if anchor is None:
-        normal, misfit = _axes(seen.place), np.diagonal(true, axis1=2, axis2=3)
+        normal, misfit = _axes(seen.position), np.diagonal(true, axis1=2, axis2=3)
     else:
         normal = _directions(true, anchor)
         misfit = np.linalg.norm(true - anchor[:, None], axis=-1)
-    H = motion.design(turned(now[..., 3:], lever), normal)
-    solved = _normal_equations(seen, H, to_knots, misfit, spread(seen.place[seen.valid]), motion)
+    H = motion.design(rotated(now[..., 3:], lever), normal)
+    solved = _normal_equations(seen, H, to_knots, misfit, spread(seen.position[seen.valid]), motion)
     after = twist.copy()
     after[1:, list(motion.seen)] += solved.x
     return after, solved, (misfit, normal, H)
@@ -270,7 +267,7 @@ def _step(
 def _normal_equations(
     seen: Observations, H: Array, to_knots: Array, misfit: Array, length: float, motion: Motion
 ) -> chain.Solved:
-    """Set up and solve: twists (changes) of all cycles but the first, reaches of all balls and directions."""
+    """Solve for the changes of the twists of all cycles except the first, and the reaches."""
     k, b, m, p = H.shape
     scale = np.where(np.array(motion.seen) < 3, 1.0, 1.0 / length)
     A = (to_knots[..., :, None] * (H * scale)[..., None, :]).reshape(k, b, m, 3 * p)
@@ -278,7 +275,7 @@ def _normal_equations(
     misfit = np.where(seen.valid, misfit, 0.0)
     Wy = (seen.weight @ misfit[..., None])[..., 0]
     local = np.einsum("kbmp,kbmq->kpq", A, WA, optimize=True).reshape(k, 3, p, 3, p)
-    N = [np.zeros((k, p, p)) for _ in range(3)]  # blocks that couple a cycle with itself, the next, the next but one
+    N = [np.zeros((k, p, p)) for _ in range(3)]  # coupling of a cycle with itself, the next and the second next
     g, r = np.zeros((k, p, b * m)), np.zeros((k, p))
     own_g = np.moveaxis(WA, 3, 1).reshape(k, 3, p, b * m)
     own_r = -np.einsum("kbmp,kbm->kp", A, Wy).reshape(k, 3, p)
@@ -301,8 +298,8 @@ def _normal_equations(
         solved = chain.solve(T * unit, after * unit, G * unit, D * unit, right * unit, s * unit)
     except np.linalg.LinAlgError as error:
         raise MethodError(
-            "The touches do not determine the motion of every cycle. Are all balls missing in the cold cycle that "
-            "others show?"
+            "The touches do not determine the motion of every cycle. Check that the cold cycle contains the balls of "
+            "the other cycles."
         ) from error
     x = solved.x.reshape(-1, p)[: k - 1] * scale
     pairs = solved.own.reshape(-1, 2, p, 2, p)
@@ -314,12 +311,12 @@ def _normal_equations(
 
 
 def _shifted(k: int, by: int) -> tuple[slice, slice]:
-    """Return cycles whose neighbour ``by`` further on exists, and these neighbours; the first cycle is fixed."""
+    """Return the cycles that have a neighbour at the distance ``by``, and these neighbours; the first is fixed."""
     return slice(max(0, -by), k - max(0, by)), slice(max(0, by), k - max(0, -by))
 
 
 def _paired(N: list[Array], g: Array, r: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the equations of all cycles but the first, two and two taken together."""
+    """Return the equations of all cycles except the first, in pairs."""
     n, p = len(r) - 1, r.shape[1]
     odd = n % 2
     pairs = (n + odd) // 2

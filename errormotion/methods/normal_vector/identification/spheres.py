@@ -1,4 +1,4 @@
-"""The centre of every ball in every cycle, from its own touches alone."""
+"""The centre of every ball in every cycle, from its touches alone."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.rigid import Observations
 
-    Array = Array
-
-STEPS = 12
-FLAT = 1e-6
+MOST_ITERATIONS = 12
+SINGULAR = 1e-6
+"""Smallest eigenvalue relative to the largest one below which a matrix counts as singular."""
 
 
 @dataclass(frozen=True)
 class Centres:
-    """Centres of balls as the machine sees them.
+    """Apparent centres of the balls.
 
     Attributes
     ----------
     centre : ndarray (k, b, 3)
-        m; NaN where the touches leave it open.
+        m; NaN where the touches do not determine it.
     cofactor : ndarray (k, b, 3, 3)
-        Covariance for unit weights of the touches: by their scatter, which is new in every cycle.
+        Covariance for unit weights of the touches, from their scatter in this cycle alone.
     """
 
     centre: Array
@@ -35,21 +34,21 @@ class Centres:
 
 
 def centres(seen: Observations, anchor: Array, reach: Array) -> Centres:
-    """Return the places from which every touch of a ball is as far away as its reach says.
+    """Return the centres at a distance of the reach from every touch of a ball, by least squares.
 
-    The reaches (b, m), m, hold what all cycles share, so that the radius is not free in each of them anew: what is
-    left is the intersection of spheres around the tip's places, found by Gauss-Newton from ``anchor`` (b, 3), m.
+    The reaches (b, m), m, contain everything common to all cycles, so that the radius is not a free parameter of each
+    cycle: the centre is the intersection of spheres around the tip, by Gauss-Newton from ``anchor`` (b, 3), m.
     """
     valid = seen.valid & np.isfinite(reach)
     weight = seen.weight * valid[..., None] * valid[..., None, :]
     if not seen.touched:
         known = np.all(valid, axis=-1)
-        centre = np.where(known[..., None], seen.place[:, :, 0], np.nan)
+        centre = np.where(known[..., None], seen.position[:, :, 0], np.nan)
         return Centres(centre, _inverse(weight))
-    centre = np.broadcast_to(anchor, (len(seen.place), *anchor.shape)).copy()
+    centre = np.broadcast_to(anchor, (len(seen.position), *anchor.shape)).copy()
     cofactor = np.full((*centre.shape, 3), np.nan)
-    for _ in range(STEPS):
-        away = seen.place - centre[:, :, None]
+    for _ in range(MOST_ITERATIONS):
+        away = seen.position - centre[:, :, None]
         length = np.linalg.norm(away, axis=-1)
         normal = away / np.where(length > 0, length, 1.0)[..., None]
         misfit = np.where(valid, length - reach, 0.0)
@@ -64,8 +63,8 @@ def centres(seen: Observations, anchor: Array, reach: Array) -> Centres:
 
 
 def _inverse(N: Array) -> Array:
-    """Return the inverse of matrices (..., 3, 3); NaN for those that have none."""
+    """Return the inverse of matrices (..., 3, 3); NaN for singular ones."""
     size = np.linalg.eigvalsh(N)
-    sound = size[..., 0] > FLAT * size[..., -1]
+    sound = size[..., 0] > SINGULAR * size[..., -1]
     safe = np.where(sound[..., None, None], N, np.eye(3))
     return np.asarray(np.where(sound[..., None, None], np.linalg.inv(safe), np.nan))

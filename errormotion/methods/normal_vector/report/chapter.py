@@ -1,4 +1,4 @@
-"""The chapter of a warm-up seen by probing balls: errors and temperatures, balls, residuals, normals, sensors."""
+"""Chapter of a warm-up with probed balls: errors and temperatures, balls, residuals, normals, sensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from errormotion.methods.normal_vector.report import drawings as normal_vector_figures
+from errormotion.methods.normal_vector.report import drawings
 from errormotion.methods.normal_vector.report.view import (
     FLAGS,
     MISSING,
@@ -41,36 +41,36 @@ from errormotion.report.text import finite, fixed, integer, listed, significant
 
 __all__ = ["is_normal_vector", "part"]
 
-_BEHIND = (
-    "The tip always sits at the same place of the spindle. A tilt of the spindle behind the last axis therefore only "
-    "displaces all balls alike: it is in the displacements, and in no rotation. The rotations are those of the "
-    "frame of axes against the table."
+_TILT = (
+    "The position of the tip in the spindle is constant. A tilt of the spindle relative to the last axis therefore "
+    "displaces all balls equally: it is part of the displacements, and of no rotation. The rotations are those of the "
+    "frame of axes relative to the table."
 )
 _TOUCHES = "touches of the cycle itself"
 _KINDS = (
     (MISSING, "missing"),
-    (WRONG, "wrong"),
+    (WRONG, "outliers"),
     (MOVED, "of a ball that had moved"),
     (UNDETERMINED, "of a cycle that is not determined"),
 )
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one result; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one result; ``key`` makes the identifiers of its figures unique."""
     errors = source.errors
     seen = probing(errors, source.raw)
     found = sensors.of_dataset(errors, source)
-    beside = (seen.balls, seen.centre[0]) if len(seen.centre) else None
+    balls = (seen.balls, seen.centre[0]) if len(seen.centre) else None
     return Part(
-        "Errors of a warm-up by probing balls",
+        "Thermal errors by probing of balls",
         _key_figures(seen),
         _summary(errors, seen, found),
         [
             Section("errors", "Errors and temperatures", errors_over_time(source, f"{key}-errors", seen)),
-            Section("balls", "Balls", [normal_vector_figures.balls(seen, f"{key}-balls"), _balls(seen)]),
+            Section("balls", "Balls", [drawings.balls(seen, f"{key}-balls"), _balls(seen)]),
             Section("residuals", "Touches and residuals", _residuals(seen, f"{key}-residuals")),
-            Section("normals", "The published normals beside the fit", _normals(seen, f"{key}-normals")),
-            Section("sensors", "Temperature sensors", sensors.blocks(found, f"{key}-sensors", beside)),
+            Section("normals", "Published normals compared with the fit", _normals(seen, f"{key}-normals")),
+            Section("sensors", "Temperature sensors", sensors.blocks(found, f"{key}-sensors", balls)),
             Section("uncertainty", "Uncertainty", _uncertainty(errors, seen)),
             Section("quality", "Data quality", _quality(source)),
             Section("provenance", "Provenance", provenance.blocks(source)),
@@ -80,8 +80,8 @@ def part(source: Source, key: str) -> Part:
 
 def _strongest(seen: Probing, first: int) -> tuple[int, float] | None:
     """Return cycle and length, SI, of the largest displacement (0) or rotation (3)."""
-    some = seen.values[:, first : first + 3]
-    length = np.where(np.isfinite(some).any(axis=1), np.sqrt(np.nansum(some**2, axis=1)), np.nan)
+    three = seen.values[:, first : first + 3]
+    length = np.where(np.isfinite(three).any(axis=1), np.sqrt(np.nansum(three**2, axis=1)), np.nan)
     if not np.isfinite(length).any() or not np.nanmax(length) > 0:
         return None
     k = int(np.nanargmax(length))
@@ -106,7 +106,9 @@ def _key_figures(seen: Probing) -> list[KeyFigure]:
         figures.append(KeyFigure("residual", Cell(fixed(1e6 * rms, 2)), "µm", note))
     cost = finite(np.median, seen.loss)
     if math.isfinite(cost):
-        figures.append(KeyFigure("cost of the normals", Cell(fixed(cost, 2)), "×", "in uncertainty, median"))
+        figures.append(
+            KeyFigure("uncertainty of the normals", Cell(fixed(cost, 2)), "×", "relative to the fit, median")
+        )
     return figures
 
 
@@ -119,7 +121,7 @@ def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> 
     words = [
         f"{integer(cycles)} cycles over {integer(len(seen.balls))} balls in "
         f"{fixed(float(np.ptp(seen.time)) / 60 if cycles else math.nan, 1)} min; "
-        + ("the errors of all are known." if known == cycles else f"the errors of {integer(cycles - known)} are not.")
+        + ("all errors are known." if known == cycles else f"the errors of {integer(cycles - known)} are unknown.")
     ]
     for first, what, (unit, size) in ((0, "displacement", unit_at(0)), (3, "rotation", unit_at(3))):
         strongest = _strongest(seen, first)
@@ -129,25 +131,24 @@ def _summary(errors: xr.Dataset, seen: Probing, found: list[sensors.Sensor]) -> 
     speed = errors["spindle_speed"].values if "spindle_speed" in errors else np.array([])
     if np.isfinite(speed).any():
         words.append(
-            f"Between cycles the spindle turned at up to {integer(finite(np.max, np.abs(speed)))} /min on the mean."
+            f"The highest mean spindle speed between two cycles was {integer(finite(np.max, np.abs(speed)))} /min."
         )
     if found:
         words.append(sensors.warmest(found))
     out = {name: int((seen.left_out == kind).sum()) for kind, name in _KINDS}
     if any(out.values()):
-        told = listed([f"{integer(count)} {name}" for name, count in out.items() if count])
-        words.append(f"Of {integer(seen.left_out.size)} {seen.what} these do not count: {told}.")
-    gone = [seen.balls[i] for i in seen.moved_balls]
-    if gone:
-        words.append(f"Moved on the table: {listed(gone)}.")
+        counts = listed([f"{integer(count)} {name}" for name, count in out.items() if count])
+        words.append(f"Excluded of {integer(seen.left_out.size)} {seen.what}: {counts}.")
+    if seen.moved_balls:
+        words.append(f"Moved on the table: {listed([seen.balls[i] for i in seen.moved_balls])}.")
     unseen = [name for i, name in enumerate(FREEDOMS) if not np.isfinite(seen.values[:, i]).any()]
     if unseen:
-        words.append(f"Not observed: {listed(unseen)}. Reported as unknown, not as zero.")
+        words.append(f"Not determined: {listed(unseen)}. Reported as unknown, not as zero.")
     return words
 
 
 def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
-    """Return errors, temperatures and what was done to the machine on one time axis, and the table of the errors."""
+    """Return errors, temperatures and working parameters on one time axis, and the table of the errors."""
     errors = source.errors
     names = timeline.sensor_names(errors)
     values = errors["temperature"].transpose("time", "sensor").values if names else np.empty((len(seen.time), 0))
@@ -157,13 +158,13 @@ def errors_over_time(source: Source, key: str, seen: Probing) -> list[Block]:
         *timeline.working(errors, held=True),
     ]
     if not panels:
-        return [Text("No error is known at any time.", "warning"), _table(errors, seen)]
+        return [Text("The errors are unknown at all times.", "warning"), _table(errors, seen)]
     done = events(source)
     point = ", ".join(fixed(1e3 * float(value), 1) for value in np.atleast_1d(errors.attrs["functional_point"]))
     caption = (
-        f"Errors of the tool's side against the workpiece's at ({point}) mm since the cold cycle, and on the same time "
-        "axis the temperatures and what the spindle did. Bands: expanded uncertainty, k = 2 (about 95 %). Speed and "
-        f"feed are means since the cycle before.{timeline.events_in_words(done)}"
+        f"Errors of the tool side relative to the workpiece side at ({point}) mm since the cold cycle, temperatures "
+        "and spindle speed on one time axis. Bands: expanded uncertainty, k = 2 (about 95 %). Speed and feed are means "
+        f"since the previous cycle.{timeline.events_in_words(done)}"
     )
     words = ". ".join(panel.in_words() for panel in panels)
     figure = Figure(timeline.draw(seen.time, panels, key, done), caption, f"Over time: {words}.")
@@ -177,11 +178,11 @@ def _table(errors: xr.Dataset, seen: Probing) -> Table:
 
 def _balls(seen: Probing) -> Block:
     if not seen.balls:
-        return Text("The result names no balls.", "note")
+        return Text("The result lists no balls.", "note")
     rows: list[list[Cell | str]] = []
-    size = np.where(seen.sound, np.linalg.norm(seen.displacement, axis=2), np.nan)
+    size = np.where(seen.well_known, np.linalg.norm(seen.displacement, axis=2), np.nan)
     for i, name in enumerate(seen.balls):
-        known = np.flatnonzero(seen.sound[:, i])
+        known = np.flatnonzero(seen.well_known[:, i])
         lost = Cell("—", reason="never determined")
         if not known.size:
             rows.append([name, *[lost] * 7, "no cycle"])
@@ -191,7 +192,7 @@ def _balls(seen: Probing) -> Block:
             [
                 name,
                 *(fixed(1e3 * v, 3) for v in seen.centre[known[0], i]),
-                # Both the cold and the last centre are uncertain, each by its own touches.
+                # The cold and the last centre have independent uncertainties from their own touches.
                 *(
                     estimate(1e6 * v, 2e6 * math.hypot(a, b), reason="not determined")
                     for v, a, b in zip(
@@ -199,20 +200,20 @@ def _balls(seen: Probing) -> Block:
                     )
                 ),
                 fixed(1e6 * largest, 1),
-                f"from cycle {integer(int(np.argmax(seen.moved[:, i])))} on" if seen.moved[:, i].any() else "no",
+                f"from cycle {integer(int(np.argmax(seen.moved[:, i])))}" if seen.moved[:, i].any() else "no",
             ]
         )
     return Table(
-        "Centres of the balls as the machine sees them: cold, and their displacement at the last cycle in "
-        "which they were determined. After ±: expanded uncertainty, k = 2.",
-        ["ball", "x / mm", "y / mm", "z / mm", "x / µm", "y / µm", "z / µm", "largest / µm", "moved by itself"],
+        "Apparent centres of the balls: in the cold cycle, and displacement in the last cycle in which they were "
+        "determined. After ±: expanded uncertainty, k = 2.",
+        ["ball", "x / mm", "y / mm", "z / mm", "x / µm", "y / µm", "z / µm", "largest / µm", "moved on the table"],
         rows,
         [("", 1), ("cold", 3), ("displacement", 4), ("", 1)],
     )
 
 
 def _residuals(seen: Probing, key: str) -> list[Block]:
-    found: list[Block] = [normal_vector_figures.residuals(seen, key)]
+    found: list[Block] = [drawings.residuals(seen, key)]
     if not seen.balls or not seen.left_out.size:
         return found
     rows: list[list[Cell | str]] = []
@@ -231,21 +232,21 @@ def _residuals(seen: Probing, key: str) -> list[Block]:
         )
     found.append(
         Table(
-            f"The {seen.what} by ball: those used and their residuals, and those left out because they are missing or "
-            "wrong, the ball had moved, or the cycle is not determined.",
-            ["ball", "used", "missing", "wrong", "ball moved", "cycle lost", "rms / µm", "largest / µm"],
+            f"The {seen.what} by ball: used ones with their residuals, and those that are missing, outliers, of a ball "
+            "that had moved, or of a cycle that is not determined.",
+            ["ball", "used", "missing", "outliers", "ball moved", "cycle lost", "rms / µm", "largest / µm"],
             rows,
             [("", 1), (seen.what, 5), ("residual", 2)],
         )
     )
     noise = fixed(1e6 * seen.noise, 3)
-    found.append(Text(f"A touch was taken to scatter by {noise} µm (one standard deviation)."))
+    found.append(Text(f"Standard deviation of a touch used in the identification: {noise} µm."))
     found += _flagged(seen)
     return found
 
 
 def _flagged(seen: Probing) -> list[Block]:
-    """Say what the probe itself remarked while measuring."""
+    """Return the flags that the probe set."""
     if seen.flag is None:
         return []
     if not seen.flag.any():
@@ -263,9 +264,11 @@ def _normals(seen: Probing, key: str) -> list[Block]:
     found: list[Block] = []
     if seen.by_normals:
         found.append(
-            Text("The result of this page is by the published normals, and not by the fit of all touches.", "note")
+            Text(
+                "The result of this page is that of the published normals, not that of the fit of all touches.", "note"
+            )
         )
-    figure = normal_vector_figures.normals(seen, key)
+    figure = drawings.normals(seen, key)
     found.append(figure)
     if isinstance(figure, Text):
         return found
@@ -274,7 +277,7 @@ def _normals(seen: Probing, key: str) -> list[Block]:
         unit, size = unit_at(i)
         reason = seen.reason(i)
         apart = _rms((seen.normals[:, i] - seen.values[:, i]) / size) if not seen.by_normals else math.nan
-        own = "the result is the normals' own" if seen.by_normals else reason
+        own = "the result is that of the normals" if seen.by_normals else reason
         last = np.flatnonzero(np.isfinite(seen.normals[:, i]))
         value = (
             estimate(seen.normals[last[-1], i] / size, 2 * seen.normals_u[last[-1], i] / size, reason=reason)
@@ -292,9 +295,9 @@ def _normals(seen: Probing, key: str) -> list[Block]:
         )
     found.append(
         Table(
-            "The published normals. Cost: standard uncertainty by the normals over that of the fit of all "
-            "touches. After ±: expanded uncertainty, k = 2.",
-            ["error", "unit", "last known", "rms, less the fit", "cost, median", "cost, largest"],
+            "The published normals. Ratio: standard uncertainty by the normals over that of the fit of all touches. "
+            "After ±: expanded uncertainty, k = 2.",
+            ["error", "unit", "last known", "rms, minus fit", "ratio, median", "ratio, largest"],
             rows,
         )
     )
@@ -303,19 +306,17 @@ def _normals(seen: Probing, key: str) -> list[Block]:
 
 def _uncertainty(errors: xr.Dataset, seen: Probing) -> list[Block]:
     if seen.last is None:
-        return [Text("No cycle determines the errors, and there is no uncertainty to part.", "warning")]
+        return [Text("No cycle determines the errors.", "warning")]
     made = budget.table(errors.isel(time=seen.last), f"in the last known cycle, {_when(seen, seen.last)}")
     own = budget.readable("independent")
     rows = [[_TOUCHES if row[0] == own else row[0], *row[1:]] for row in made.rows]
     return [
         replace(made, rows=rows),
-        Text(
-            "The cold cycle is the reference of all others: its own touches are uncertain too, and all cycles share it."
-        ),
-        Text(_BEHIND, "note"),
+        Text("The cold cycle is the reference of all others: the uncertainty of its touches is common to all cycles."),
+        Text(_TILT, "note"),
     ]
 
 
 def _quality(source: Source) -> list[Block]:
     found: list[Block] = [Text(note, "warning") for note in remarks(source.errors)]
-    return [*found, *quality.sentences(source.errors, source.raw)] or [Text("The method had nothing to remark.")]
+    return [*found, *quality.sentences(source.errors, source.raw)] or [Text("The method reported no remarks.")]

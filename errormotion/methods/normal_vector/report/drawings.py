@@ -1,4 +1,4 @@
-"""Drawings of probed balls: where they went, and what of the touches is left over."""
+"""Drawings of probed balls: displacements and residuals."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from errormotion.report.document import Block, Figure, Text
 from errormotion.report.text import SECOND_OF_ARC, UM, finite, fixed, integer, listed
 from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw, enlargement
 
-_ARROW = 0.22  # longest displacement drawn, share of the diagonal of the balls
+_LONGEST = 0.22  # drawn length of the longest displacement, relative to the diagonal of the balls
 _FAINT, _SOFT = "#c3c8d0", "#6f7680"
 _SHADES = ("#a9c8e4", "#6f9fce", "#2f6fb0", "#12386b")  # quarters of the record, earliest first
-_CYCLES = 240  # drawn of each ball's way
-_DOTS = 600  # residuals drawn of each ball
-_MANY = 8  # balls drawn
+_MOST_CYCLES = 240  # drawn for each ball
+_MOST_DOTS = 600  # residuals drawn for each ball
+_MOST_BALLS = 8  # panels of residuals
 
 
 def balls(seen: Probing, key: str) -> Block:
-    """Return the balls in space with their displacement since the cold cycle, enlarged, coloured by time."""
+    """Return the balls in space with their magnified displacement since the cold cycle, coloured by time."""
     cold = _cold(seen)
     there = np.flatnonzero(np.isfinite(cold).all(axis=1))
-    size = np.where(seen.sound, np.linalg.norm(seen.displacement, axis=2), np.nan)
+    size = np.where(seen.well_known, np.linalg.norm(seen.displacement, axis=2), np.nan)
     if not there.size or not np.nan_to_num(size[:, there]).any():
-        return Text("The result holds no displacements of balls, and there is nothing to draw.", "note")
+        return Text("The result contains no displacements of balls.", "note")
     longest = finite(np.max, size[:, there])
     span = float(np.linalg.norm(np.ptp(cold[there], axis=0)))
-    factor = enlargement(longest, max(_ARROW * span, 2 * longest))
+    factor = enlargement(longest, max(_LONGEST * span, 2 * longest))
     parts: list[Lines | Dots | Ellipsoids] = [Lines(_table(cold[there]), _FAINT, 0.6)]
     feet = cold[there] * (1, 1, 0) + (0, 0, _floor(cold[there]))
     parts.append(Lines(np.stack([cold[there], feet], axis=1), _FAINT, 0.5, dash="2 2"))
-    whole, own = _ways(seen, cold, factor)
+    whole, own = _paths(seen, cold, factor)
     for shade, ends in zip(_SHADES, whole, strict=True):
         if len(ends):
             parts.append(Lines(ends, shade, 1.3))
@@ -51,26 +51,26 @@ def balls(seen: Probing, key: str) -> Block:
         parts.append(Dots(ends, canvas.BLACK, 1.6))
     k, i = np.unravel_index(int(np.nanargmax(np.where(np.isfinite(size), size, -1.0))), size.shape)
     gone = [seen.balls[j] for j in seen.moved_balls]
-    poor = int((np.isfinite(seen.displacement).all(axis=2) & ~seen.sound).sum())
+    poor = int((np.isfinite(seen.displacement).all(axis=2) & ~seen.well_known).sum())
     caption = (
-        f"Balls on the table where they were cold (grey), and where the machine saw them go: displacements "
-        f"{integer(factor)} times enlarged, pale in the first quarter of the record, dark in the last, with a black "
-        f"point at the last known cycle. The longest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. "
-        "The tool's side went the other way."
+        f"Balls on the table in the cold cycle (grey), and their apparent displacements, magnified {integer(factor)} "
+        "times: pale in the first quarter of the record, dark in the last, with a black point at the last known cycle. "
+        f"The largest is {fixed(1e6 * float(size[k, i]), 1)} µm, of {seen.balls[i]}. The displacement of the tool side "
+        "is opposite."
+        + (f" Red, dashed: {listed(gone)}, which moved on the table and was not used afterwards." if gone else "")
         + (
-            f" Red and broken: {listed(gone)}, which moved on the table and counts no more from then on."
-            if gone
+            f" Not drawn: {integer(poor)} centres that are poorly determined because of missing touches."
+            if poor
             else ""
         )
-        + (f" Not drawn: {integer(poor)} centres that lost touches leave nearly free." if poor else "")
-        + " The buttons turn it, as do the arrow keys after a click on one."
+        + " The buttons rotate the drawing, as do the arrow keys after a click on one."
     )
-    alt = f"Balls {listed(seen.balls)} in space with their displacements, {integer(factor)} times enlarged."
+    alt = f"Balls {listed(seen.balls)} in space with their displacements, magnified {integer(factor)} times."
     return Figure(draw(Scene(parts), key), caption, alt)
 
 
 def _cold(seen: Probing) -> np.ndarray:
-    """Return the centres less their displacement: where the balls were in the cold cycle, (ball, 3)."""
+    """Return the centres in the cold cycle, (ball, 3)."""
     first = seen.centre - seen.displacement
     cold = np.full(first.shape[1:], np.nan)
     for i in range(first.shape[1]):
@@ -81,7 +81,7 @@ def _cold(seen: Probing) -> np.ndarray:
 
 
 def _last(seen: Probing, ball: int) -> int | None:
-    known = np.flatnonzero(seen.sound[:, ball])
+    known = np.flatnonzero(seen.well_known[:, ball])
     return int(known[-1]) if known.size else None
 
 
@@ -90,38 +90,38 @@ def _floor(cold: np.ndarray) -> float:
 
 
 def _table(cold: np.ndarray) -> np.ndarray:
-    """Return the edges of a rectangle under the balls, a little larger than they need, (4, 2, 3)."""
-    room = 0.08 * np.ptp(cold[:, :2], axis=0)
-    (x0, y0), (x1, y1) = cold[:, :2].min(axis=0) - room, cold[:, :2].max(axis=0) + room
+    """Return the edges of a rectangle below the balls, with a margin, (4, 2, 3)."""
+    margin = 0.08 * np.ptp(cold[:, :2], axis=0)
+    (x0, y0), (x1, y1) = cold[:, :2].min(axis=0) - margin, cold[:, :2].max(axis=0) + margin
     corners = np.array([[x, y, _floor(cold)] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 
-def _ways(seen: Probing, cold: np.ndarray, factor: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return steps from cycle to cycle by quarter of the record, and those of balls that had moved: each (k, 2, 3)."""
+def _paths(seen: Probing, cold: np.ndarray, factor: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the steps between cycles by quarter of the record, and those of balls that had moved: each (k, 2, 3)."""
     parts: list[list[np.ndarray]] = [[] for _ in _SHADES]
     own: list[np.ndarray] = []
-    begin, span = seen.time[0], max(float(np.ptp(seen.time)), 1e-9)
+    start, span = seen.time[0], max(float(np.ptp(seen.time)), 1e-9)
     for i in range(len(seen.balls)):
-        known = np.flatnonzero(seen.sound[:, i])
-        known = known[np.unique(np.linspace(0, known.size - 1, _CYCLES).astype(int))] if known.size else known
-        place = cold[i] + factor * seen.displacement[known, i]
-        for a, b, k in zip(place, place[1:], known[1:], strict=False):
+        known = np.flatnonzero(seen.well_known[:, i])
+        known = known[np.unique(np.linspace(0, known.size - 1, _MOST_CYCLES).astype(int))] if known.size else known
+        position = cold[i] + factor * seen.displacement[known, i]
+        for a, b, k in zip(position, position[1:], known[1:], strict=False):
             step = np.stack([a, b])
             if seen.moved[k, i]:
                 own.append(step)
             else:
-                quarter = int(min(len(_SHADES) * (seen.time[k] - begin) / span, len(_SHADES) - 1e-9))
+                quarter = int(min(len(_SHADES) * (seen.time[k] - start) / span, len(_SHADES) - 1e-9))
                 parts[quarter].append(step)
     return [np.array(steps) for steps in parts], np.array(own)
 
 
 def residuals(seen: Probing, key: str) -> Block:
-    """Return the residuals of every ball over time, what does not count marked."""
+    """Return the residuals of every ball over time; excluded ones are marked."""
     given = np.isfinite(seen.residual)
     if not given.any():
-        return Text("The result holds no residuals.", "note")
-    shown = list(range(min(len(seen.balls), _MANY)))
+        return Text("The result contains no residuals.", "note")
+    shown = list(range(min(len(seen.balls), _MOST_BALLS)))
     kept = given & seen.used
     top = 1e6 * finite(np.max, np.abs(seen.residual[kept])) if kept.any() else 1.0
     top = 1.15 * max(top, 2.2e6 * seen.noise if np.isfinite(seen.noise) else 0.0, 1e-3)
@@ -139,12 +139,12 @@ def residuals(seen: Probing, key: str) -> Block:
         panels[-1].set_xlim(time.values[0] - margin, time.values[-1] + margin)
 
     out = np.array([int((seen.left_out == kind).sum()) for kind in (MISSING, WRONG, MOVED, UNDETERMINED)])
-    marks = ((0, "red bars at the foot: missing"), (1, "crosses: wrong, left out"), (2, "squares: the ball had moved"))
+    marks = ((0, "red bars at the bottom: missing"), (1, "crosses: outliers"), (2, "squares: the ball had moved"))
     words = [word for k, word in marks if out[k]] + (["triangles: cycle not determined"] if out[3] else [])
-    told = f" {'; '.join(words).capitalize()}; at the upper edge where no residual is known." if words else ""
-    fewer = f" The first {_MANY} of {len(seen.balls)} balls are drawn." if len(seen.balls) > _MANY else ""
+    legend = f" {'; '.join(words).capitalize()}; at the upper edge if the residual is unknown." if words else ""
+    fewer = f" The first {_MOST_BALLS} of {len(seen.balls)} balls are drawn." if len(seen.balls) > _MOST_BALLS else ""
     band = " Band: twice the noise of a touch." if np.isfinite(seen.noise) else ""
-    caption = f"Residuals of the {seen.what} by ball over time: measured minus fitted distance.{band}{told}{fewer}"
+    caption = f"Residuals of the {seen.what} by ball over time: measured minus fitted distance.{band}{legend}{fewer}"
     rms = 1e6 * float(np.sqrt(finite(np.mean, seen.residual[kept] ** 2)))
     alt = f"Residuals of {integer(int(kept.sum()))} {seen.what}; root mean square {fixed(rms, 3)} µm."
     return Figure(canvas.draw(paint, key, canvas.stack_height(heights)), caption, alt)
@@ -156,7 +156,7 @@ def _residuals_of(axes: Axes, seen: Probing, ball: int, time: np.ndarray, top: f
     across = time[:, None] + 0.5 * step * ((np.arange(m) + 0.5) / m - 0.5)
     y, kind = 1e6 * seen.residual[:, ball], seen.left_out[:, ball]
     used = np.argwhere(np.isfinite(y) & (kind == 0))
-    used = used[:: -(-len(used) // _DOTS)] if len(used) > _DOTS else used
+    used = used[:: -(-len(used) // _MOST_DOTS)] if len(used) > _MOST_DOTS else used
     axes.plot(across[tuple(used.T)], y[tuple(used.T)], ".", color=canvas.BLUE, markersize=3.2, markeredgewidth=0)
     for what, look, colour in (
         (WRONG, "x", canvas.BLACK),
@@ -178,12 +178,11 @@ def _residuals_of(axes: Axes, seen: Probing, ball: int, time: np.ndarray, top: f
 
 
 def normals(seen: Probing, key: str) -> Block:
-    """Return the published construction less the fit of all touches, and its cost, over time."""
+    """Return the published construction minus the fit of all touches, and its relative uncertainty, over time."""
     shown = [i for i in range(6) if np.isfinite(seen.normals[:, i]).any() and np.isfinite(seen.loss[:, i]).any()]
     if not shown:
         return Text(
-            "What the published normals make of the balls is not part of this result; the remarks on the data's "
-            "quality say why.",
+            "The result contains no published normals; the reason is stated under data quality.",
             "note",
         )
     panels = []
@@ -206,11 +205,11 @@ def normals(seen: Probing, key: str) -> Block:
         for i in shown
     ]
     panels.append(
-        timeline.Panel("Cost: standard uncertainty by the normals over that of the fit", "", cost, 1.1, legend=True)
+        timeline.Panel("Standard uncertainty by the normals over that of the fit", "", cost, 1.1, legend=True)
     )
     spans = "; ".join(panel.in_words() for panel in panels)
     caption = (
-        "The published construction, the turn of the normals of two planes through four balls, beside the fit of all "
-        "touches: what it makes otherwise, and below what it costs in uncertainty; 1 would be nothing."
+        "The published construction (rotation of the normals of two planes of four balls) compared with the fit of "
+        "all touches: difference, and ratio of the standard uncertainties."
     )
-    return Figure(timeline.draw(seen.time, panels, key), caption, f"Normals against fit. {spans}.")
+    return Figure(timeline.draw(seen.time, panels, key), caption, f"Normals compared with the fit. {spans}.")

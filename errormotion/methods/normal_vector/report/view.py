@@ -1,4 +1,4 @@
-"""What a result of probing balls holds, as plain arrays over cycles, balls and touches, whatever of it is missing."""
+"""The result of probing balls as arrays over cycles, balls and touches; NaN for missing variables."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from errormotion.report.budget import FREEDOMS
 from errormotion.report.provenance import read
 
 USED, MISSING, WRONG, MOVED, UNDETERMINED = range(5)
-"""What ``left_out`` says of a touch."""
+"""Values of ``left_out``."""
 
 FLAGS = ("", "no trip", "tripped at the start", "repeat differs", "not made")
-"""What the raw dataset's ``touch_flag`` says of a touch, by its number."""
+"""Meanings of ``touch_flag`` in the raw dataset."""
 
 
 def is_normal_vector(errors: xr.Dataset) -> bool:
@@ -25,13 +25,13 @@ def is_normal_vector(errors: xr.Dataset) -> bool:
     return errors.attrs.get("method") == "normal_vector" and errors["EX"].dims == ("time",)
 
 
-_POOR = 5.0
-"""Times the median uncertainty of the centres, beyond which one is no longer drawn."""
+LARGEST_UNCERTAINTY = 5.0
+"""Uncertainty of a centre, relative to the median of all, above which it is not drawn."""
 
 
 @dataclass(frozen=True)
 class Probing:
-    """A warm-up seen by probing, SI; NaN where something is not known.
+    """Result of a warm-up with probing, SI; NaN where unknown.
 
     Attributes
     ----------
@@ -41,23 +41,23 @@ class Probing:
     values, sigma : (t, 6)
         Errors and standard uncertainties.
     centre, centre_u : (t, ball, 3)
-        Of the balls, as the machine sees them.
+        Apparent centres of the balls.
     displacement : (t, ball, 3)
         Of the centres since the cold cycle.
     moved : (t, ball) of bool
-        Where a ball had moved on its own.
+        Whether a ball had moved on the table.
     residual, left_out : (t, ball, touch)
-        Of touches, or of coordinates where only centres were given.
+        Of touches, or of coordinates if only centres were given.
     flag : (t, ball, touch) of int, or None
-        What the probe said of each touch; None where it is not known.
+        Flags of the probe; None if unknown.
     normals, normals_u, loss : (t, 6)
-        By the published construction, and its standard uncertainty over that of the fit.
+        Published construction: errors, standard uncertainty, and this over that of the fit.
     noise : float
         Of a touch, as used.
     by_touch : bool
         Whether residuals are of touches.
     by_normals : bool
-        Whether the result itself is by the published construction.
+        Whether the result itself is that of the published construction.
     tool_axes : str
     """
 
@@ -82,46 +82,46 @@ class Probing:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Touches that count, (t, ball, touch)."""
+        """Used touches, (t, ball, touch)."""
         return np.asarray(self.left_out == USED)
 
     @property
-    def sound(self) -> NDArray[np.bool_]:
-        """Centres that are known about as well as others, (t, ball): a lost touch can leave one nearly free."""
+    def well_known(self) -> NDArray[np.bool_]:
+        """Centres with usual uncertainty, (t, ball): with missing touches a centre can be nearly undetermined."""
         worst = np.max(self.centre_u, axis=2) if self.centre_u.size else np.empty(self.displacement.shape[:2])
         known = worst[np.isfinite(worst)]
-        limit = _POOR * float(np.median(known)) if known.size else np.inf
+        limit = LARGEST_UNCERTAINTY * float(np.median(known)) if known.size else np.inf
         there = np.isfinite(self.displacement).all(axis=2)
         return np.asarray(there & ~(worst > limit))
 
     @property
     def moved_balls(self) -> list[int]:
-        """Balls that moved on their own at any time."""
+        """Balls that moved on the table at any time."""
         return [i for i in range(len(self.balls)) if bool(self.moved[:, i].any())]
 
     @property
     def last(self) -> int | None:
-        """Last cycle with a known error; None where there is none."""
+        """Last cycle with a known error; None if there is none."""
         known = np.flatnonzero(np.isfinite(self.values).any(axis=1))
         return int(known[-1]) if known.size else None
 
     @property
     def what(self) -> str:
-        """Word for what the residuals are of."""
+        """Name of the measured numbers."""
         return "touches" if self.by_touch else "coordinates"
 
     def reason(self, index: int) -> str:
-        """Return why a freedom is unknown throughout."""
+        """Return the reason why an error is unknown in all cycles."""
         if self.tool_axes and self.tool_axes != "XYZ" and index >= 3:
             return (
-                f"not seen: of the axes only {' and '.join(self.tool_axes)} move the tool, and the balls do not "
-                "show this rotation of the frame of axes"
+                f"not determined: only {' and '.join(self.tool_axes)} carry the tool, and the balls do not show this "
+                "rotation of the frame of axes"
             )
-        return "not observed by this method"
+        return "not determined by this method"
 
 
 def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
-    """Return the view of a dataset; ``raw`` tells what the probe said of each touch."""
+    """Return the arrays of a dataset; the flags of the probe are in ``raw``."""
     each = "touch" if "residual" not in errors or "touch" in errors["residual"].dims else "direction"
     t, b = errors.sizes["time"], errors.sizes.get("ball", 0)
     m = errors.sizes.get(each, 0) if "residual" in errors else 0
@@ -164,7 +164,7 @@ def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
 
 
 def _flags(raw: xr.Dataset | None, shape: tuple[int, ...]) -> NDArray[np.int64] | None:
-    """Return the probe's flags where the raw dataset holds them for the same touches."""
+    """Return the flags of the probe if the raw dataset contains them for the same touches."""
     if raw is None or "touch_flag" not in raw or set(raw["touch_flag"].dims) != {"time", "ball", "touch"}:
         return None
     flag = np.asarray(raw["touch_flag"].transpose("time", "ball", "touch").values)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
-
-import numba
-
-Function = TypeVar("Function", bound=Callable[..., Any])
+from errormotion.compiling import Compiler
 
 CHUNK = 1024
 """Targets that one thread adds up."""
@@ -21,9 +16,7 @@ EXACT = {"contract", "nsz"}
 """Products and sums may be fused."""
 
 
-def compiled(**options: Any) -> Callable[[Function], Function]:
-    """Compile with numba: cached on disk, without the interpreter's lock."""
-    return cast(Callable[[Function], Function], numba.njit(cache=True, nogil=True, error_model="numpy", **options))
+compiled = Compiler("the loops for large networks of stations and targets", seconds=30, error_model="numpy")
 
 
 @compiled()

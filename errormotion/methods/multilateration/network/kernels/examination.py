@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+from numba import prange
 
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
@@ -98,7 +98,7 @@ def _datum_alone(
 def _datum_shared(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags, centre: Array, sums: Array
 ) -> None:  # pragma: no cover - compiled
-    for part in numba.prange(len(sums)):
+    for part in prange(len(sums)):
         _datum_part(weight, station, extra, target, carries, centre, part, sums[part])
 
 
@@ -219,7 +219,7 @@ def _examine_shared(
     weight: Array, station: Array, extra: Array, target: Array, carries: Flags,
     centre: Array, W: Array, shift: Array, H: Array, K: Array, covariance: Array, redundancy: Array,
 ) -> None:  # pragma: no cover - compiled  # fmt: skip
-    for part in numba.prange((len(target) + CHUNK - 1) // CHUNK):
+    for part in prange((len(target) + CHUNK - 1) // CHUNK):
         _examine_part(
             weight, station, extra, target, carries, centre, W, shift, H, K, covariance, redundancy, part
         )  # fmt: skip

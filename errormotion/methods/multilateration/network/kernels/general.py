@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+from numba import prange
 
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.kernels.compiling import CHUNK, FAST, MANY, chunks, compiled
@@ -324,7 +324,7 @@ def _reduce_shared(
 ) -> tuple[Array, float]:  # pragma: no cover - compiled  # fmt: skip
     q, count = 4 * len(station) + len(value) + 1, chunks(place.shape[1])
     sums, moved = np.zeros((count, q, q)), np.zeros(count)
-    for part in numba.prange(count):
+    for part in prange(count):
         moved[part] = reduce_part(reading, weight, station, dead_path, extra, value, place, part, sums[part])
     return total(sums), math.sqrt(moved.max())
 
@@ -348,7 +348,7 @@ def _settle_shared(
     place: Array, nominal: Array, centre: Array, openness: Array,
 ) -> Array:  # pragma: no cover - compiled  # fmt: skip
     sums = np.zeros((chunks(place.shape[1]), 16))
-    for part in numba.prange(len(sums)):
+    for part in prange(len(sums)):
         _settle_part(
             reading, weight, station, dead_path, extra, value, place, part, nominal, centre, openness, sums[part]
         )
@@ -420,7 +420,7 @@ def _screen_shared(
 ) -> tuple[int, float]:  # pragma: no cover - compiled
     parts, m = chunks(place.shape[1]), place.shape[1]
     largest, count = np.zeros((parts, 1)), np.zeros(parts, dtype=np.int64)
-    for part in numba.prange(parts):
+    for part in prange(parts):
         count[part] = screen_four(
             reading, weight, station, dead_path, place, part * CHUNK, min(m, (part + 1) * CHUNK), factor, weak,
             largest[part],

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.kernels.compiling import compiled
 from errormotion.methods.multilateration.network.model import Stations, directions
 from errormotion.methods.multilateration.network.start import initial_stations
 
@@ -19,8 +18,6 @@ _SOME = 1000
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    Array = Array
 
 WEAK = 10.0
 """So many times as uncertain as the middle one, the stations known. Of m targets one of sqrt(m) times is harmless to
@@ -61,14 +58,13 @@ def carriers(openness: Array) -> NDArray[np.bool_]:
     return np.asarray(openness <= _limit(len(openness)) ** 2 * _middle(openness, max(1, len(openness) // _SOME)))
 
 
-@compiled()
-def _middle(openness: Array, every: int) -> float:  # pragma: no cover - compiled
+def _middle(openness: Array, every: int) -> float:
     """Return the median of every so many-th value, of all where none of these is finite; 0 where none is."""
-    some = openness[::every]
-    some = some[some < np.inf]
-    if len(some) == 0:
-        some = openness[openness < np.inf]
-    return float(np.median(some)) if len(some) > 0 else 0.0
+    for some in (openness[::every], openness):
+        known = some[some < np.inf]
+        if len(known):
+            return float(np.median(known))
+    return 0.0
 
 
 def _limit(targets: int) -> float:
