@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
+from scipy.special import chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -245,7 +246,7 @@ def fit_machine(
     freedom = 3 * len(position) - 6 - float(found.determined.sum())
     ratio = found.left / max(freedom, 1.0)
     scale, notes = 1.0, []
-    if freedom > 0 and found.left > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if freedom > 0 and found.left > chdtri(freedom, FALSE_ALARM):
         scale = ratio
         notes.append(
             f"Errors of the axes leave {np.sqrt(ratio):.3g} times as much of the targets' errors as their uncertainty "

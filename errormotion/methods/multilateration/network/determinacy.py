@@ -92,21 +92,21 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
     refuse_nowhere(information)
-    values, motions, sigma, loose = _freedoms(information, basis, stations.place, target)
+    values, motions, sigma, loose = freedoms(information, basis, stations.place, target)
     if not loose.any():
         return values
     centre = target.mean(axis=0)
     k = int(np.count_nonzero(loose))
-    freedoms = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
+    named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
     raise MethodError(
         f"expected places of stations and targets whose distances fix them all, found {k} "
-        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {freedoms}. "
+        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {named}. "
         f"What is special: {_reason(rough, target)}"
     )
 
 
-def _freedoms(
+def freedoms(
     information: Array, basis: Array, place: Array, target: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Return eigenvalues of the information with its diagonal made 1, and for each the motion by one deviation.

@@ -81,11 +81,7 @@ class Problem:
 
     def basis(self, stations: Stations, centre: Array) -> Array:
         """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
-        T = stations.motions(centre)[self.free]
-        size = np.linalg.norm(T, axis=0)
-        Z = np.zeros((len(self.free), len(T) - 6))
-        Z[self.free] = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
-        return Z
+        return stations.complement(centre, self.free)
 
     def reduce(self, stations: Stations, place: Array) -> Sums:
         """Move the targets (3, m) in place and return what they say about the stations."""

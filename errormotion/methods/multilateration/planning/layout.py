@@ -124,7 +124,7 @@ def optimise(
     """
     import nlopt
 
-    from errormotion.methods.multilateration.planning.bound import bound
+    from errormotion.methods.multilateration.planning.bound import predicted_uncertainty
 
     u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
     if len(corners) < LEAST:
@@ -144,14 +144,12 @@ def optimise(
         if lacking := _lacking(seen):
             return _PENALTY * (1.0 + lacking)
         try:
-            if worth is not None:
-                return weighed(worth(U), power)
-            with np.errstate(all="ignore"):  # in what is said about a loose freedom, which nobody reads here
-                network = bound(u, U, noise=noise, seen=seen)
-        except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
+            sigma = predicted_uncertainty(seen / noise, U, u) if worth is None else worth(U)
+        except np.linalg.LinAlgError:
             return _PENALTY
-        sigma = uncertainty(network.target_covariance)
-        return weighed(sigma, power) if np.isfinite(sigma).all() else _PENALTY
+        if sigma is None or (worth is None and not np.isfinite(sigma).all()):  # a freedom is loose there
+            return _PENALTY
+        return weighed(sigma, power)
 
     def weighed(sigma: Array, power: float | None) -> float:
         known = np.isfinite(sigma)
