@@ -300,7 +300,7 @@ def test_far_off_rough_places_do_no_harm():
         ({"target": np.zeros((9, 3))}, r"expected displacements \(station, target\)"),
         ({"noise": 0.0}, "expected a positive standard deviation"),
         ({"noise": np.ones(3)}, "expected noise as one value"),
-        ({"station": np.zeros((3, 3))}, "expected rough places"),
+        ({"station": np.zeros((3, 3))}, "expected approximate positions"),
         ({"extra": np.zeros((1, 4, 3))}, "expected further parameters"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a layout will be worth, before anything is measured: the Cramer-Rao bound of targets and stations.
+"""Predicted uncertainty of a layout: the Cramer-Rao bound of targets and stations.
 
 The covariance of a network depends on places and noise alone. Estimates of `solver` reach it as long as the stations'
 uncertainty is small against their distances. The formulation of the paper, L_j = |u_1 - U_j|, takes the first target's
@@ -105,14 +105,14 @@ def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array
 def relative_bound(
     target: ArrayLike, station: ArrayLike, *, noise: float = 1e-6, first: int = 0
 ) -> tuple[Array, Array, Network]:
-    """Return what the formulation relative to one target is worth.
+    """Return the covariances of the formulation relative to one target.
 
     Returns
     -------
     target_covariance, joint_covariance : ndarray (m, 3, 3), (4 n, 4 n)
-        True covariances of its estimates, in the datum of the free network.
+        Of its estimates, in the datum of the free network.
     stated : Network
-        What it would state itself, the readings of that target taken for exact.
+        As the formulation states it, with the readings of that target taken as exact.
     """
     n, m = len(np.asarray(station)), len(np.asarray(target))
     sigma = np.full((n, m), float(noise))

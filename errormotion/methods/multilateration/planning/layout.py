@@ -1,6 +1,6 @@
-"""Where to place the tracker: the layout from which the targets become least uncertain.
+"""Optimal positions of the tracker: the layout with the least uncertain targets.
 
-What a layout is worth follows from places alone (see `bound`). Places are searched for within boxes, from many starts,
+The uncertainty follows from positions alone (see `bound`). Positions are searched within boxes, from many starts,
 first with a smooth stand-in for the largest uncertainty of all targets, then with that itself.
 """
 
@@ -67,7 +67,7 @@ def route(layout: Layout) -> list[int]:
     left = list(range(len(position)))
     order = [left.pop(int(np.argmin(position.sum(axis=1))))]
     while left:
-        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at once
+        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at the same time
         order.append(left.pop(int(np.argmin(away))))
     return order
 
@@ -102,7 +102,7 @@ def optimise(
     noise : float
         Standard deviation of a reading, m.
     start : array_like (n, 3), optional
-        Places to begin with, m. The answer is never worse than they are, moved into their boxes.
+        Start positions, m. The result is never worse than these, moved into their boxes.
     minimise : {"largest", "mean"}
         Which uncertainty.
     seed : int
@@ -196,7 +196,7 @@ def optimise(
         starts = [best, *everywhere, *(np.array(x) for x in tried[:_STARTS])]
         starts = [search(nlopt.LN_SBPLX, x, _LOCAL, _POWER) for x in starts]
         best = min([best, *starts], key=cost)
-        # The largest of many uncertainties has edges along which a search creeps: begun anew it goes on.
+        # The largest of many uncertainties has edges along which a search is slow: a new search continues.
         for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * (_ROUNDS if thorough else 1):
             best = search(algorithm, best, _LOCAL)
     if cost(best) >= _PENALTY:
