@@ -1,4 +1,4 @@
-"""Artefacts for a line profiler: pieces of a known shape that stand on the table of the virtual machine."""
+"""Artefacts for a line profiler: pieces of known shape on the table of the virtual machine."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Artefact:
         return float(self.parameters[0]), float(self.parameters[1])
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return z at x, y (which broadcast), m; NaN beside the artefact."""
+        """Return z at x, y (which broadcast), m; NaN outside the artefact."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
         out = np.empty(x.size)
         surfaces.heights(self.shape, self.parameters, self.table, x.ravel(), y.ravel(), out)
@@ -81,8 +81,8 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     values = np.asarray(z(*grid), dtype=float)
     if values.shape != grid[0].shape or not np.isfinite(values).all():
         raise BenchError(
-            f"The surface of an artefact gives one finite height (m) for each place; it gave shape {values.shape} with "
-            f"{int(np.sum(~np.isfinite(values)))} values that are not finite, for places of shape {grid[0].shape}."
+            f"The surface of an artefact gives one finite height (m) for each position; it gave shape {values.shape} "
+            f"with {int(np.sum(~np.isfinite(values)))} values that are not finite, for shape {grid[0].shape}."
         )
     table = np.ascontiguousarray(spline_filter(values, order=3, mode="mirror"))
     return Artefact(name, surfaces.FREEFORM, np.array([*half_size, x[0], y[0], 1 / KNOTS]), table)

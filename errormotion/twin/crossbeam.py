@@ -1,7 +1,7 @@
 """The crossbeam of the gantry as it warms up, and scans of artefacts by the line profiler in its spindle.
 
-The carriage O20 rides on the crossbeam along Y. The tool frame O30 hangs from it by the ``lever`` (x_y, 0, z_y), the
-profiler frame O40 stands in O30 at the ``pose`` H. With the carriage at y and its error E (a displacement of its origin
+The carriage O20 rides on the crossbeam along Y. The tool frame O30 is shifted by the ``lever`` (x_y, 0, z_y), the
+profiler frame O40 is in O30 at the ``pose`` H. With the carriage at y and its error E (a displacement of its origin
 and a rotation), a point (x, 0, z) of a profile lies in the machine at
 
     (0, y, 0) + E (lever + H (x, 0, z)).
@@ -31,7 +31,7 @@ _STEADY = {
 LEVER = (-0.9, 0.0, -2.051)
 #: pose of the profiler in the tool frame before the seed turns it: lift, m
 LIFT = -0.174
-#: how far off an artefact stands, m, and how crooked, rad (one sigma)
+#: misalignment of an artefact: shift, m, and rotation, rad (one sigma)
 PLACE, TURN = 0.2e-3, 3e-3
 
 _ARTEFACT = 3
@@ -55,7 +55,7 @@ class Crossbeam:
     lever : ndarray, (3,)
         From the carriage to the tool frame, m.
     own : ndarray, (6,)
-        Steady error of the carriage beside that of the guide, m and rad, with the time constant of the screw.
+        Steady error of the carriage in addition to that of the guide, m and rad, with the time constant of the screw.
     """
 
     travel: tuple[float, float]
@@ -65,9 +65,9 @@ class Crossbeam:
     own: Array = field(default_factory=lambda: np.zeros(6))
 
     def twist(self, t: ArrayLike, y: ArrayLike) -> Array:
-        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t (s) and places y (m).
+        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t (s), positions y (m).
 
-        Times and places broadcast. Before time 0 all is cold.
+        Times and positions broadcast. Before time 0 all is cold.
         """
         t, y = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(y, dtype=float))
         half = (self.travel[1] - self.travel[0]) / 2
@@ -81,7 +81,7 @@ class Crossbeam:
         return np.asarray(twist + grown[..., :1] * self.own)
 
     def carriage(self, t: float, y: Array, middle: float, motion: str) -> Array:
-        """Return where the carriage is at commanded places y (n,), poses (n, 4, 4) in the machine, m."""
+        """Return the poses of the carriage at commanded positions y (n,), poses (n, 4, 4) in the machine, m."""
         going = np.tile(np.eye(4), (y.size, 1, 1))
         going[:, 1, 3] = y
         if motion == "axis":
@@ -91,20 +91,20 @@ class Crossbeam:
         there[1, 3] = middle
         return there @ displaced(self.twist(t, middle)).as_matrix() @ going
 
-    def carriage_at(self, t: Array, places: Array) -> Array:
-        """Return where the carriage is at times t (n,) since the warm-up began, s, and commanded places (n, 3), m.
+    def carriage_at(self, t: Array, positions: Array) -> Array:
+        """Return the poses of the carriage at times t (n,) of the warm-up, s, and commanded positions (n, 3), m.
 
         Returns
         -------
         ndarray, (n, 4, 4)
             Poses in the machine, m. Z moves the spindle in the carriage and not the carriage.
         """
-        going = np.tile(np.eye(4), (len(places), 1, 1))
-        going[:, :2, 3] = places[:, :2]
-        return np.asarray(going @ displaced(self.twist(t, places[:, 1])).as_matrix())
+        going = np.tile(np.eye(4), (len(positions), 1, 1))
+        going[:, :2, 3] = positions[:, :2]
+        return np.asarray(going @ displaced(self.twist(t, positions[:, 1])).as_matrix())
 
     def artefact_pose(self, seed: int, position: float) -> Array:
-        """Return where the artefact of a position stands, (4, 4) in the machine, m: under the profiler, crooked."""
+        """Return the pose of the artefact at a position, (4, 4) in the machine, m: below the profiler, misaligned."""
         bits = int(np.float64(position).view(np.int64))
         rng = np.random.default_rng([abs(seed), int(seed < 0), _ARTEFACT, bits & 0x7FFFFFFFFFFFFFFF, int(bits < 0)])
         off = rng.normal(0, [PLACE] * 3 + [TURN] * 3)
@@ -112,9 +112,9 @@ class Crossbeam:
         return np.asarray(displaced(off).as_matrix())
 
     def pocket_pose(self, position: float) -> Array:
-        """Return where a pocket is that the cold machine has cut at a position of the axis, (4, 4) in the machine, m.
+        """Return the pose of a pocket cut by the cold machine at a position of the axis, (4, 4) in the machine, m.
 
-        Its middle is where the tool frame was.
+        Its centre is the origin of the tool frame at that time.
         """
         pose = np.eye(4)
         pose[:3, 3] = self.lever + np.array([0.0, position, 0.0])
@@ -132,7 +132,7 @@ class Crossbeam:
 
 
 def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
-    """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a profiler set up by hand."""
+    """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a misaligned profiler."""
     steady = np.zeros((len(LAGS), len(_STEADY), 4))
     for k, terms in enumerate(_STEADY.values()):
         for lag, coefficients in enumerate(terms):

@@ -1,4 +1,4 @@
-"""A line profiler in the spindle: what it is, what is wrong with it, and the profiles that it takes."""
+"""The line profiler in the spindle: its properties, its disturbances, and its profiles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _JITTER_Y, _BLOBS, _STREAMS = 1, 2, 10
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What a real profiler does to the heights. Zero switches a part off; the greatest slope, infinity.
+    """Disturbances of the heights of a real profiler. Zero disables one; infinity disables the limit of slope.
 
     Attributes
     ----------
@@ -75,14 +75,14 @@ class Disturbances:
 
 @dataclass(frozen=True)
 class Profiler:
-    """A line profiler: it reads z of its own frame at places x of its own frame, in the plane y = 0.
+    """A line profiler: it reads z of its own frame at positions x of its own frame, in the plane y = 0.
 
     Attributes
     ----------
     points : int
         Of a profile.
     pitch : float
-        m; point i stands at x = (i - points // 2) * pitch.
+        m; point i is at x = (i - points // 2) * pitch.
     low, high : float
         Measuring range in z, m.
     disturbances : Disturbances
@@ -97,7 +97,7 @@ class Profiler:
 
     @property
     def x(self) -> Array:
-        """Places of the points along the profile, m, shape (point,)."""
+        """Positions of the points along the profile, m, shape (point,)."""
         return np.asarray((np.arange(self.points) - self.points // 2) * self.pitch, dtype=float)
 
     def scan(self, artefact: Artefact, poses: Array, *, key: tuple[int, ...] = (0,)) -> Array:
@@ -106,7 +106,7 @@ class Profiler:
         Parameters
         ----------
         artefact : Artefact
-            What stands there.
+            The artefact.
         poses : ndarray, (line, 4, 4)
             Takes coordinates of the profiler's frame at each line to those of the artefact's; m. Jitter along the feed
             shifts a line in the direction from its neighbour before to its neighbour behind.

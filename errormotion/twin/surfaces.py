@@ -28,7 +28,7 @@ _GOLDEN, _S11 = np.uint64(0x9E3779B97F4A7C15), np.uint64(11)
 
 @compiled
 def weights(f: float) -> tuple[float, float, float, float, float, float, float, float]:
-    """Return the four cubic B-splines at a place 0 <= f < 1 between two knots, and their derivatives."""
+    """Return the four cubic B-splines at a position 0 <= f < 1 between two knots, and their derivatives."""
     g = 1.0 - f
     return (
         g * g * g / 6.0,
@@ -80,7 +80,7 @@ def surface(shape: int, p: Array, table: Array, x: float, y: float) -> tuple[flo
 
 @compiled
 def edge_distance(shape: int, p: Array, x: float, y: float) -> float:
-    """Return how far a place is from the nearest edge, m, negative beside the artefact."""
+    """Return the distance of a position from the nearest edge, m, negative outside the artefact."""
     inside = min(p[0] - abs(x), p[1] - abs(y))
     if shape == SPHERE:
         inside = min(inside, p[2] - math.hypot(x, y))
@@ -115,7 +115,7 @@ def profile(
     x : ndarray, (point,)
         m, along the line.
     out : ndarray, (point,)
-        z in the profiler's frame, m; NaN beside the artefact, and where the surface is steeper than ``steepest``.
+        z in the profiler's frame, m; NaN outside the artefact, and where the surface is steeper than ``steepest``.
     edge : ndarray, (point,)
         Distance to the nearest edge, m.
     """
@@ -219,7 +219,7 @@ def scan(
 
 @compiled
 def heights(shape: int, p: Array, table: Array, x: Array, y: Array, out: Array) -> None:
-    """Fill ``out`` (n,) with the heights of an artefact at places x, y (n,), m; NaN beside it."""
+    """Fill ``out`` (n,) with the heights of an artefact at positions x, y (n,), m; NaN outside it."""
     for i in range(x.size):
         out[i] = math.nan
         if edge_distance(shape, p, x[i], y[i]) >= 0.0:

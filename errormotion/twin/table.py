@@ -1,4 +1,4 @@
-"""What stands on the table of the gantry, and what the line profiler sees of it as the carriage passes."""
+"""Artefacts on the table of the gantry, and the readings of the line profiler in a pass of the carriage."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
 from errormotion.twin.profiler import Profiler
 
-#: from one artefact to the next where nobody says otherwise, m
+#: default distance of artefacts, m
 SPACING = 0.2
-#: how much further than the artefact itself the profiler is asked, m: an artefact is off its place by 0.2 mm (one
+#: margin around an artefact in which the profiler is evaluated, m: an artefact is off its position by 0.2 mm (one
 #: sigma), and the profiler, whose frame leans by some mrad, sees 20 mm up and down
 BESIDE = 3e-3
-#: lines computed at once; their noise does not depend on where a stream begins
+#: lines computed at once; their noise does not depend on the start of a stream
 CHUNK = 64
 
 
@@ -30,9 +30,9 @@ class Target:
     Attributes
     ----------
     artefact : Artefact
-        What it is.
+        Its shape.
     pose : ndarray, (4, 4)
-        Where it stands, in the machine, m.
+        Its pose in the machine, m.
     position : float
         Of the axis over its middle, m.
     """
@@ -78,16 +78,16 @@ class Table:
         """Yield which of increasing positions (n,) of the axis lie over which piece, None over none, in order."""
         first = 0
         for target in self.targets:
-            begin, end = (int(place) for place in np.searchsorted(y, target.reach))
-            if first < begin:
-                yield slice(first, begin), None
-            if begin < end:
-                yield slice(begin, end), target
+            start, end = (int(place) for place in np.searchsorted(y, target.reach))
+            if first < start:
+                yield slice(first, start), None
+            if start < end:
+                yield slice(start, end), target
             first = max(first, end)
         if first < y.size:
             yield slice(first, y.size), None
 
-    def scan(self, target: Target, profiler: Profiler, t: Array, places: Array, key: tuple[int, ...]) -> Array:
+    def scan(self, target: Target, profiler: Profiler, t: Array, positions: Array, key: tuple[int, ...]) -> Array:
         """Return the lines that the profiler takes of a piece, each under the error at its own moment.
 
         Parameters
@@ -97,8 +97,8 @@ class Table:
         profiler : Profiler
             Sees it.
         t : ndarray, (n,)
-            Time since the warm-up began, s, of each line; cold before 0.
-        places : ndarray, (n, 3)
+            Time since the warm-up started, s, of each line; cold before 0.
+        positions : ndarray, (n, 3)
             Commanded X, Y and Z, m.
         key : tuple of int
             Of the noise.
@@ -110,8 +110,8 @@ class Table:
         """
         alone = len(t) == 1
         if alone:  # a direction along the feed takes two lines
-            t, places = np.repeat(t, 2), places + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
-        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, places), target.pose, lift=places[:, 2])
+            t, positions = np.repeat(t, 2), positions + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
+        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, positions), target.pose, lift=positions[:, 2])
         heights = profiler.scan(target.artefact, lines, key=key)
         return heights[:1] if alone else heights
 
@@ -119,7 +119,7 @@ class Table:
 def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocket: float | None = None) -> Table:
     """Return a table with a swept free form at each position of the axis, m, and perhaps a circular pocket.
 
-    The free forms stand a little crooked under the profiler, as `Crossbeam.artefact_pose` says; the pocket was cut by
+    The free forms are slightly misaligned, see `Crossbeam.artefact_pose`; the pocket was cut by
     the cold machine itself at the position ``pocket`` and Z = 0.
 
     Raises
@@ -136,6 +136,6 @@ def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocke
 
 
 def default_positions(travel: tuple[float, float]) -> list[float]:
-    """Return the places of artefacts that fit a travel, one every 200 mm and as far from both ends, m."""
+    """Return the positions of artefacts that fit a travel, one every 200 mm and as far from both ends, m."""
     n = int(round((travel[1] - travel[0]) / SPACING, 6))
     return [round(travel[0] + SPACING * k, 9) for k in range(1, n)]
