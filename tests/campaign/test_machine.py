@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from errormotion import plugins
+from errormotion import datasets, plugins
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import load_bench, load_campaign
+from errormotion.campaign.runner import run
 from errormotion.errors import BenchError
+from errormotion.kinematics.description import MachineDescription
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Lab"\n'
 MACHINE = """\
@@ -113,6 +115,34 @@ def test_limits_outside_of_the_travel_are_refused(tmp_path: Path) -> None:
     two_axes = MACHINE.replace('Y = ["-250 mm", "250 mm"], ', "").replace("-Y", "")
     (found,) = mistakes(bench(tmp_path, two_axes + '[limits]\nY = ["0 mm", "1 mm"]\n'))
     assert found.startswith("limits.Y: the chain 'workpiece-C-X-bed-Z-spindle-tool' has no axis Y")
+
+
+def test_settings_that_are_not_stated_follow_from_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def machine_defaults(_self: object, machine: MachineDescription) -> dict[str, float]:
+        return {"level": machine.travel["Z"][1], "count": 7}
+
+    monkeypatch.setattr(plugins.get("methods", "ramp"), "machine_defaults", machine_defaults, raising=False)
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        'schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\n'
+        '[[test]]\nname = "a"\nmethod = "ramp"\nsettings = { count = 1 }\n'
+    )
+    bench(tmp_path, MACHINE)
+    settings = load_campaign(path).tests[0].settings
+    assert (settings.level, settings.count) == (0.46, 1)
+    bench(tmp_path, 'machine = "Mill"\n')
+    assert load_campaign(path).tests[0].settings.level != 0.46
+
+
+def test_raw_data_state_the_chain_of_the_axes_that_move(tmp_path: Path) -> None:
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        f'schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\nruns = "{tmp_path.as_posix()}/runs"\n'
+        '[[test]]\nname = "a"\nmethod = "ramp"\n'
+    )
+    bench(tmp_path, MACHINE)
+    (folder,) = run(load_campaign(path))
+    assert datasets.load(folder.raw).attrs["chain"] == "workpiece-X-Y-bed-Z-spindle-tool"
 
 
 def test_settings_that_contradict_the_machine_are_refused_when_the_campaign_is_read(
