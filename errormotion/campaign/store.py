@@ -23,6 +23,7 @@ import zarr
 from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
+from errormotion.campaign.folder import replace_text
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -286,16 +287,6 @@ def committed_length(path: Path, dim: str) -> int:
 
 def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(metadata.get("dimension_names") or ())  # a scalar has none
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
-    part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def _sync(path: Path) -> None:

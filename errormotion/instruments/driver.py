@@ -15,7 +15,7 @@ from errormotion.plugins import InstrumentInfo, PluginSettings
 class Driver:
     """Base of drivers with one transport.
 
-    A subclass has ``info`` and ``Settings``, says hello in ``_begin`` and goodbye in ``_end``, and talks through
+    A subclass has ``info`` and ``Settings``, starts the device in ``_begin``, stops it in ``_end``, and uses
     ``self.transport``.
 
     Parameters
@@ -47,12 +47,12 @@ class Driver:
         return self._transport
 
     def open(self) -> None:
-        """Open the connection and greet the device; idempotent.
+        """Open the connection and check the device; idempotent.
 
         Raises
         ------
         InstrumentError
-            Nobody there, or not the expected device.
+            No device answers, or not the expected device.
         """
         if self._transport is not None:
             return
@@ -83,17 +83,17 @@ class Driver:
         if kind is None:
             self.close()
             return
-        with suppress(InstrumentError):  # what happened inside says more than that closing fails as well
+        with suppress(InstrumentError):  # the first error states the cause
             self.close()
 
     def _connect(self) -> Transport:
         return open_transport(self.address, simulator=self.info.simulator, recorder=self._record)
 
     def _begin(self) -> None:
-        """Greet the device right after connecting."""
+        """Check the device right after connecting."""
 
     def _end(self) -> None:
-        """Leave the device in order right before closing."""
+        """Stop the device right before closing."""
 
     def _drop(self) -> None:
         transport, self._transport = self._transport, None

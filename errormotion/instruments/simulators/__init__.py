@@ -1,4 +1,4 @@
-"""Wire simulators: devices that speak the real protocols over real sockets and ptys, and ask the twin for the truth.
+"""Wire simulators: devices that speak the real protocols over real sockets and ptys, and query the twin for the truth.
 
 All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock.
 ``world("cframe", seed=3)`` returns it, so that a test can compare with the truth.

@@ -1,4 +1,4 @@
-"""What the simulated devices share: a place in a world, a wire, a fault, and answering by lines."""
+"""What the simulated devices share: a position in a world, a wire, a fault, and answering by lines."""
 
 from __future__ import annotations
 

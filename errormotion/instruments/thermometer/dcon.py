@@ -19,7 +19,7 @@ from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
 OPEN_SENSOR = 9999.0  # degC: this and more, either sign, is no temperature but an open or overrun input
-UNDER_RANGE = "-0000"  # the ADAM way to say the same
+UNDER_RANGE = "-0000"  # the ADAM way to state the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
 
 
@@ -91,7 +91,7 @@ class DconSettings(ThermometerSettings):
 
 
 class DconTemperature(Thermometer):
-    """A DCON thermocouple module: ``#AA`` asks for all inputs.
+    """A DCON thermocouple module: ``#AA`` requests all inputs.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class DconTemperature(Thermometer):
     settings: DconSettings
 
     def identify(self) -> Identity:
-        """Ask the module for its name and firmware."""
+        """Query the module for its name and firmware."""
         name, firmware = (self._ask(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
         return Identity(
             manufacturer="DCON",
@@ -156,7 +156,7 @@ class DconTemperature(Thermometer):
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
         if not answer.startswith(expected):
-            raise ProtocolError(f"'{request}': expected an answer that begins with '{expected}'; found '{answer}'")
+            raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'")
         return answer.removeprefix(expected)
 
     def _connect(self) -> Transport:

@@ -73,7 +73,7 @@ def open_lines(
     Parameters
     ----------
     url : str
-        ``tcp://host:port``, where a parameter ``name=port`` says where a further line is; ``sim://``; ``replay://``.
+        ``tcp://host:port``, where a parameter ``name=port`` states where a further line is; ``sim://``; ``replay://``.
     further : mapping of str to int
         Further lines by name, with the port where the address names none.
     simulator, timeout
@@ -84,7 +84,7 @@ def open_lines(
     Raises
     ------
     InstrumentError
-        Another scheme, nobody at one of the ports, a recording that is there already.
+        Another scheme, no device at one of the ports, a recording that is there already.
     """
     address = parse_address(url)
     lines: dict[str, Transport] = {}

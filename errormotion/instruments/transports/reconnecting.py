@@ -25,7 +25,7 @@ class ReconnectingTransport(Transport):
     connect : callable
         Opens a connection, or raises InstrumentError.
     timeout : float
-        Time limit of a silent read, s.
+        Time limit of a read without data, s.
     retry : float
         Least time between two attempts to connect, s.
     simulated : bool

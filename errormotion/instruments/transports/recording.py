@@ -112,7 +112,7 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
     if len(head) != 3 or head[0] != FORMAT:
         raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
     if len(lines) < 2 or not lines[-1].startswith("END "):
-        raise ReplayError(f"The recording {path} is cut off: its last line should begin with 'END'; record it again")
+        raise ReplayError(f"The recording {path} is cut off: its last line should start with 'END'; record it again")
     frames: list[tuple[str, bytes]] = []
     crc = 0
     for number, line in enumerate(lines[1:-1], start=2):

@@ -60,7 +60,7 @@ class SimulatedTransport(Transport):
         return self._inner.read(max_bytes, timeout)
 
     def handed_over(self, samples: int) -> None:
-        """Tell the simulator how far its reader is."""
+        """Report the reader's progress to the simulator."""
         self._device.handed_over(samples)
 
     def close(self) -> None:

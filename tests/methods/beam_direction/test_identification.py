@@ -127,12 +127,12 @@ def test_the_calibration_that_was_used_is_in_the_provenance(machine, calibration
     raw = simulation.raw(machine, FOUR, seed=3)
     known = InclinationCalibration.load(calibration)
     told = provenance.of(identify(raw, compensation=calibration))["calibration"]
-    assert told == known.told()
+    assert told == known.reference()
     assert told["name"] == "sensor"
     changed = InclinationCalibration(known.dataset.assign(mid_range=1e-3))
     renamed = InclinationCalibration(known.dataset.assign_attrs(name="other"))
-    assert changed.told()["hash"] != told["hash"]
-    assert renamed.told()["hash"] == told["hash"]
+    assert changed.reference()["hash"] != told["hash"]
+    assert renamed.reference()["hash"] == told["hash"]
     assert "calibration" not in provenance.of(identify(raw))
 
 
@@ -370,7 +370,7 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
     calibrate(holed).save(tmp_path / "holed.nc")
     raw = simulation.raw(machine, FOUR, seed=0)
     file = str(tmp_path / "holed.nc")
-    refused(raw, r"Plane 2: Calibration 'holed': .* leave a hole; nearest calibrated", compensation=file)
+    refused(raw, r"Plane 2: Calibration 'holed': .* in a hole between the calibrated settings; nearest calibrated", compensation=file)
     errors = identify(raw, compensation=file, extrapolate=True)
     assert "Plane 2: extrapolated. Calibration 'holed' does not speak for" in notes(errors)
     assert "Plane 1: extrapolated" not in notes(errors)

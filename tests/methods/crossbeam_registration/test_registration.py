@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
-from errormotion.methods.crossbeam_scan.identification.registration import prepare, register, solver
+from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
@@ -316,7 +316,8 @@ def test_one_thread_and_several_add_up_the_same(scanner, motion, monkeypatch):
     rng = np.random.default_rng(14)
     problem = Problem.of(prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, motion)))
     alone = problem.evaluate(State.of(motion))
-    monkeypatch.setattr(solver, "MANY", 0)
+    monkeypatch.setattr(kernels, "MANY", 0)
+    monkeypatch.setattr(kernels, "threads", lambda: 3)
     shared = problem.evaluate(State.of(motion))
     np.testing.assert_array_equal(shared.residual, alone.residual)
     np.testing.assert_allclose(shared.A, alone.A, rtol=1e-12)

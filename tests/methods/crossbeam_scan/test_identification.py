@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 
-import numba
 import numpy as np
 import pytest
 import xarray as xr
@@ -15,6 +14,7 @@ from errormotion.datasets import provenance
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.profiler import Disturbances, Profiler
@@ -301,16 +301,11 @@ def test_twice_is_the_same_to_the_bit(campaigns, found):
     assert_same(identify(campaigns[1]), found["free"][1])
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread is all there is")
-def test_one_thread_and_two_give_the_same_bits(campaigns):
-    before = numba.get_num_threads()
-    try:
-        runs = []
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            runs.append(identify(campaigns[2]))
-    finally:
-        numba.set_num_threads(before)
+def test_one_thread_and_two_give_the_same_bits(campaigns, monkeypatch):
+    runs = []
+    for threads in (1, 2):
+        monkeypatch.setattr(kernels, "threads", lambda threads=threads: threads)
+        runs.append(identify(campaigns[2]))
     assert_same(*runs)
 
 

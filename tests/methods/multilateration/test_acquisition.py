@@ -8,10 +8,10 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.methods.multilateration.acquisition.measure import Measuring, latest, measure_stations
+from errormotion.methods.multilateration.acquisition.measure import latest, measure_stations
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.settings import Measuring, Settings
 
 STATIONS = ((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5))
 LAYOUT = {"low": (-0.1, -0.1, 0.0), "high": (0.1, 0.1, 0.2), "count": (3, 3, 2), "stations": STATIONS}

@@ -8,9 +8,8 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
-from errormotion.methods.multilateration.planning.box import Box
-from errormotion.methods.multilateration.planning.sight import Planning, Sight, blocked
-from errormotion.methods.multilateration.settings import Layout
+from errormotion.methods.multilateration.planning.sight import Sight, blocked
+from errormotion.methods.multilateration.settings import Box, Layout, Planning
 
 CUBE = np.stack(np.meshgrid(*[np.linspace(-0.05, 0.05, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
 OPEN = Sight.of(Planning(acceptance=np.pi))

@@ -8,6 +8,7 @@ from scipy.stats import chi2, norm
 
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.network.model import Stations, jacobian, motions, readings
+from errormotion.methods.multilateration.network.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
@@ -257,7 +258,7 @@ def test_missing_distances_cost_what_the_bound_says():
     # Three distances give a place, but say nothing about the stations.
     assert network.freedom == 30 - 3 - 10
     assert network.uncertainty[11] > np.nanmedian(network.uncertainty)
-    assert any("no place (1 of them): 5" in note for note in network.notes)
+    assert any("no place (1 of them): 5" in note for note in notes_of(network))
 
 
 def test_a_worse_station_counts_less():

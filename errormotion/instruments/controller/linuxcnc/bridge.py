@@ -1,14 +1,14 @@
 #!/usr/bin/python3
-"""Stands between LinuxCNC and programs beyond its reach: JSON lines on a port of this computer.
+"""Connects LinuxCNC with other programs: JSON lines on a port of this computer.
 
 LinuxCNC's own Python module works only in the Python of the system, beside LinuxCNC. So this file runs there, as the
 ``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs nothing but that Python. A request is
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
-``{"id": 1, "ok": false, "error": "..."}``. While an order lasts, ``{"id": 1, "beat": 7, "time": 3.2}`` says five times
-a second that it does. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge began;
-what is unknown is null. Places are those of the machine (G53), without any offset of work or tool.
+``{"id": 1, "ok": false, "error": "..."}``. While an order lasts, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
+times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
+what is unknown is null. Positions are those of the machine (G53), without any offset of work or tool.
 
-Several clients may be there. One order at a time moves the machine. What a client has begun ends with its connection:
+Several clients may be there. One order at a time moves the machine. What a client has started ends with its connection:
 if that breaks, or the client dies, the bridge has LinuxCNC abort. Nothing that comes in can end the bridge.
 """
 
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 PORT = 5007
-POLL = 0.01  # s between two looks at an order
+POLL_INTERVAL = 0.01  # s between two looks at an order
 BEAT = 0.2  # s
 SETTLE = 5.0  # s that LinuxCNC may take to accept an order
 START = 30.0  # s
@@ -83,9 +83,9 @@ class Bridge:
     linuxcnc, hal : module
         LinuxCNC's two Python modules.
     programs : Path
-        Folder for the programs that clients hand over.
+        Folder for the programs that clients pass on.
     pins : tuple of str
-        What the names of HAL pins begin with that clients may set.
+        Prefix of the HAL pins that clients may set.
     load : str
         HAL pin with the load of the spindle, as a fraction of the rated one; empty where there is none.
     """
@@ -112,7 +112,7 @@ class Bridge:
         """Wait until LinuxCNC has started, for a while: until then its state means nothing."""
         until = time.monotonic() + START
         while not self.stat.linear_units > 0 and time.monotonic() < until:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
             self.stat.poll()
 
     # ------------------------------------------------------------------ requests
@@ -140,7 +140,7 @@ class Bridge:
             request = json.loads(line)
             number, op = request.pop("id"), request.pop("op")
             work = self._work.get(op)
-        except Exception as error:  # noqa: BLE001 - whatever comes in is no reason to die
+        except Exception as error:  # noqa: BLE001 - a request must not end the bridge
             client.send(self._failure(number, f"this is no request: {error!r}"))
             return
         if work is None:
@@ -199,11 +199,11 @@ class Bridge:
     def _failure(self, number: Any, text: str) -> dict[str, Any]:
         return {"id": number, "ok": False, "error": text, "time": self.time}
 
-    # ------------------------------------------------------------------ what LinuxCNC says
+    # ------------------------------------------------------------------ state of LinuxCNC
 
     @property
     def time(self) -> float:
-        """Seconds since the bridge began."""
+        """Seconds since the bridge started."""
         return time.monotonic() - self._began
 
     def _look(self) -> None:
@@ -227,7 +227,7 @@ class Bridge:
         return [self._unit * float(x) for x in places[:3]]
 
     async def identify(self) -> dict[str, Any]:
-        """Tell the version of LinuxCNC, the machine's name and its INI file."""
+        """Identify the version of LinuxCNC, the machine's name and its INI file."""
         self._look()
         ini = str(self.stat.ini_filename)
         machine = self.cnc.ini(ini).find("EMC", "MACHINE") if ini else None
@@ -244,7 +244,7 @@ class Bridge:
         return {name: [self._unit * x for x in pair] for name, pair in zip(AXES, limits)}  # noqa: B905
 
     async def state(self) -> dict[str, Any]:
-        """Tell what the machine does."""
+        """Return the state of the machine."""
         self._look()
         s = self.stat
         modes = {self.cnc.MODE_MANUAL: "manual", self.cnc.MODE_MDI: "mdi", self.cnc.MODE_AUTO: "automatic"}
@@ -352,13 +352,13 @@ class Bridge:
         return {"duration": self.time - began}
 
     async def probe(self, target: Any, feed: Any) -> dict[str, Any]:
-        """Move in a straight line until the probe trips; tell where it did, if it did."""
+        """Move in a straight line until the probe trips, and return its position."""
         await self._demand()
         goal, words = self._goal(target), _speed(feed, "G38.3")
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
         if math.dist(goal, self._metres(self.stat.position)) < REACHED:
-            raise RefusedError("the probe stands at the target already")
+            raise RefusedError("the probe is at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
         await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
@@ -376,7 +376,7 @@ class Bridge:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
 
     async def run_program(self, text: Any) -> dict[str, Any]:
-        """Run an NC program; return when it has begun."""
+        """Run an NC program; return when it has started."""
         await self._demand()
         if not isinstance(text, str) or not text.strip():
             raise RefusedError("expected the text of a program")
@@ -398,13 +398,13 @@ class Bridge:
         began = self.time
         try:
             while not await self._ended(program):
-                await asyncio.sleep(POLL)
+                await asyncio.sleep(POLL_INTERVAL)
             if self.alarms or self.stat.state == self.cnc.RCS_ERROR:
                 raise RefusedError(f"{program.what} ended early{await self._texts()}")
             self.outcome = {"duration": self.time - began}
         except RefusedError as error:
             self.outcome = error
-        except Exception as error:  # noqa: BLE001 - told to whoever asks how it ended
+        except Exception as error:  # noqa: BLE001 - reported when the result is requested
             self.outcome = RefusedError(f"{type(error).__name__}: {error}")
         finally:
             await self._rest()
@@ -413,9 +413,9 @@ class Bridge:
                 file.unlink()
 
     async def finish(self, client: Client) -> dict[str, Any]:
-        """Wait for the end of the program; tell how long it took."""
+        """Wait for the end of the program, and return its duration."""
         while self.program is not None and not client.gone:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
         if isinstance(self.outcome, RefusedError):
             raise self.outcome
         return self.outcome
@@ -452,7 +452,7 @@ class Bridge:
 
     def _goal(self, position: Any) -> list[float]:
         if not isinstance(position, list) or len(position) != 3:
-            raise RefusedError(f"expected a place X, Y, Z in m; found {position!r}")
+            raise RefusedError(f"expected a position X, Y, Z in m; found {position!r}")
         goal = [_number(x, "a coordinate in m") for x in position]
         for (axis, (low, high)), x in zip(self._travel().items(), goal):  # noqa: B905
             if not low <= x <= high:
@@ -460,7 +460,7 @@ class Bridge:
         return goal
 
     def _in_work_frame(self, place: list[float]) -> list[float]:
-        """Return a place of the machine in the coordinates in force: G54, G92 and the tool's offset."""
+        """Return a position of the machine in the coordinates in force: G54, G92 and the tool's offset."""
         s = self.stat
         work, extra, tool = (self._metres(offset) for offset in (s.g5x_offset, s.g92_offset, s.tool_offset))
         x, y, z = (p - w - t for p, w, t in zip(place, work, tool))  # noqa: B905
@@ -489,10 +489,10 @@ class Bridge:
         await self._ended(self.job)  # it may have been broken off already
         self.command.mdi(line)
         while not await self._ended(self.job):
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
 
     async def _ended(self, job: Job | None) -> bool:
-        """Whether LinuxCNC has done what it was told last; RefusedError where it was kept from it."""
+        """Whether LinuxCNC has done the last order; RefusedError where it was kept from it."""
         self._look()
         if job is not None and job.ended_by:
             raise RefusedError(f"{job.what} was broken off: {job.ended_by}")
@@ -503,7 +503,7 @@ class Bridge:
         return taken and self._idle()
 
     async def _go_on(self) -> None:
-        await asyncio.sleep(POLL)
+        await asyncio.sleep(POLL_INTERVAL)
         await self._ended(self.job)
 
     async def _settle(self, what: str, *, running: bool = False) -> None:
@@ -517,7 +517,7 @@ class Bridge:
             if time.monotonic() > until:
                 self.command.abort()  # what is not taken now must not be carried out later
                 raise RefusedError(f"LinuxCNC does not respond: {what} took more than {SETTLE:g} s")
-            await asyncio.sleep(POLL / 2)
+            await asyncio.sleep(POLL_INTERVAL / 2)
 
     def _calm(self) -> None:
         """After an order that failed, whatever the reason, nothing moves on."""
@@ -533,7 +533,7 @@ class Bridge:
         until = time.monotonic() + limit
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
             while not self._idle() and time.monotonic() < until:
-                await asyncio.sleep(POLL)
+                await asyncio.sleep(POLL_INTERVAL)
                 self._look()
 
     async def _becomes(self, condition: Callable[[], bool]) -> bool:
@@ -543,7 +543,7 @@ class Bridge:
             self._look()
             if condition() or time.monotonic() > until:
                 return condition()
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
 
     async def _require_arrival(self, goal: list[float]) -> None:
         place = self._metres(self.stat.position)
@@ -552,10 +552,10 @@ class Bridge:
             raise RefusedError(f"the machine has stopped at {found} mm before its goal{await self._texts()}")
 
     async def _texts(self) -> str:
-        """Return what LinuxCNC says of an error, to be appended."""
+        """Return what LinuxCNC states of an error, to be appended."""
         until = time.monotonic() + TEXTS
         while not self.alarms and time.monotonic() < until:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
             self._look()
         return f": {'; '.join(self.alarms)}" if self.alarms else ""
 
@@ -589,7 +589,7 @@ def _axis_words(place: list[float]) -> str:
 
 
 async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> None:
-    """Serve until somebody ends this process, or nobody has been there for a while."""
+    """Serve until this process is ended, or no client has been connected for a while."""
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -616,9 +616,9 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
     parser.add_argument("-ini", metavar="FILE", help="LinuxCNC gives it to its display; the running one's is taken")
     parser.add_argument("--port", type=int, default=PORT, help="of 127.0.0.1; 0: any that is free")
-    parser.add_argument("--announce", type=Path, help="file that tells the port and the process")
+    parser.add_argument("--announce", type=Path, help="file that states the port and the process")
     parser.add_argument("--idle", type=float, default=math.inf, help="end after so many seconds without a client")
-    parser.add_argument("--pins", default="", help="what the names of HAL pins begin with that clients may set")
+    parser.add_argument("--pins", default="", help="prefix of the HAL pins that clients may set")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
     options = parser.parse_args(words)
     import hal

@@ -1,8 +1,8 @@
 """Packets of an emScon server: little-endian structures, packed, over TCP port 700.
 
-Every packet begins with its size in bytes (i32, header included) and its type (u32). A command is the header, its
+Every packet starts with its size in bytes (i32, header included) and its type (u32). A command is the header, its
 number, and parameters; the answer repeats the number and adds a status, then values where the status is 0. Between the
-answers come packets that nobody asked for: reflector positions, levels, status changes, errors such as a broken beam.
+answers come packets that nobody requested: reflector positions, levels, status changes, errors such as a broken beam.
 
 The layouts are those of the interface's C definitions, versions 3.6 and 3.8. ``long``, ``int`` and enumerations have
 four bytes; names are 32 characters of UTF-16. Results of measurements have a status behind the header and no number of
@@ -26,7 +26,7 @@ NAME = "64s"
 # ---------------------------------------------------------------------- types of packets
 
 COMMAND, ERROR, SINGLE, MULTI, LEVEL, REFLECTOR, CHANGE, SINGLE2, MULTI2 = 0, 1, 2, 3, 6, 7, 8, 9, 10
-UNUSED_TYPES = frozenset({4, 5, 11})  # of probes with six freedoms: passed over
+UNUSED_TYPES = frozenset({4, 5, 11})  # of probes with six freedoms: ignored
 
 # ---------------------------------------------------------------------- commands
 

@@ -21,7 +21,7 @@ from errormotion.plugins.readings import Environment, Measurement
 
 MILLIBAR = 100.0  # Pa
 METEO = {"manual": codec.METEO_OFF, "read": codec.METEO_READ, "refraction": codec.METEO_REFRACTION}
-AGAIN = 20.0
+MEASURING_TIMEOUT_FACTOR = 20.0
 """Times the measuring time that a result may take beyond the time limit of an answer: the tracker repeats by itself."""
 
 __all__ = ["Event", "LeicaEmScon"]
@@ -30,7 +30,7 @@ __all__ = ["Event", "LeicaEmScon"]
 class LeicaEmScon(Driver):
     """A Leica laser tracker: LT or AT901 with an interferometer, or AT4xx with an absolute distance meter.
 
-    Lengths are in m, angles in rad, places in the tracker's own frame: neither the station orientation nor the
+    Lengths are in m, angles in rad, positions in the tracker's own frame: neither the station orientation nor the
     transformation that the server may hold is applied.
 
     Parameters
@@ -57,7 +57,7 @@ class LeicaEmScon(Driver):
     _set_anew = 0
     _last: tuple[float, float, float] | None = None
 
-    # ------------------------------------------------------------------ what it is and how it stands
+    # ------------------------------------------------------------------ identity and state
 
     @property
     def rate(self) -> float:
@@ -69,28 +69,28 @@ class LeicaEmScon(Driver):
         """Whether distances count from where the beam was last set, and not from the tracker's centre.
 
         Of an interferometer all readings of one `dead_path` share an unknown constant; only their differences are
-        as good as its ``noise``. An AT4xx tells absolute distances. Multilateration takes ``Measurement.distance`` of
+        as good as its ``noise``. An AT4xx reports absolute distances. Multilateration takes ``Measurement.distance`` of
         either, with the dead path of each station unknown.
         """
         return self.settings.tracker != "AT4xx"
 
     @property
     def beam_broken(self) -> bool:
-        """Whether the beam has lost its reflector, as far as the tracker has told by now."""
+        """Whether the beam has lost its reflector, as far as the tracker has reported by now."""
         return self._link.broken
 
     @property
     def dead_path(self) -> int:
-        """How often the distance was lost or set anew since opening; 0 for ever where distances are absolute."""
+        """How often the distance was lost or set again since opening; always 0 where distances are absolute."""
         return self._link.breaks + self._set_anew if self.distance_is_displacement else 0
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """What the tracker has said unasked, oldest first: broken beams, changes of its status."""
+        """Messages of the tracker that were not requested, oldest first: broken beams, changes of its status."""
         return tuple(self._link.events)
 
     def identify(self) -> Identity:
-        """Ask the server which tracker it is, and which weather station it has."""
+        """Request the identity of the tracker and of its weather station."""
         status = self._ask(codec.GET_SYSTEM_STATUS).values
         tracker = self._ask_if_known(codec.GET_TRACKER_INFO)
         station = self._ask_if_known(codec.GET_METEO_STATION)
@@ -112,7 +112,7 @@ class LeicaEmScon(Driver):
         return _environment(self._ask(codec.GET_ENVIRONMENT).values)
 
     def set_environment(self, environment: Environment) -> None:
-        """Tell the tracker what the air is like; takes effect where no weather station overrules it."""
+        """Set the state of the air; takes effect where no weather station overrules it."""
         self._ask(
             codec.SET_ENVIRONMENT,
             temperature=environment.temperature,
@@ -175,7 +175,7 @@ class LeicaEmScon(Driver):
         self._move(codec.GO_BIRD_BATH2, clockwise=int(clockwise))
 
     def go_to(self, target: tuple[float, float, float]) -> None:
-        """Point at a place and take up the reflector near it; the absolute distance meter sets the distance.
+        """Point at a position and take up the reflector near it; the absolute distance meter sets the distance.
 
         Raises
         ------
@@ -216,7 +216,7 @@ class LeicaEmScon(Driver):
 
         A tracker with an interferometer that follows its reflector to the target keeps its count: it goes there only
         where it does not point there already, and `dead_path` then goes up. An AT4xx goes in any case. A broken beam
-        is no error here: the reflector is looked for ``reacquire`` times, and where that fails the measurement says
+        is no error here: the reflector is looked for ``reacquire`` times, and where that fails the measurement states
         why it is not valid.
 
         Parameters
@@ -227,7 +227,7 @@ class LeicaEmScon(Driver):
         Raises
         ------
         InstrumentError
-            The tracker refuses for another reason, stays silent or busy, or the connection is gone.
+            The tracker refuses for another reason, does not answer or stays busy, or the connection is gone.
         """
         self._not_streaming()
         goal = None if target is None else polar(target)
@@ -274,12 +274,12 @@ class LeicaEmScon(Driver):
         BeamBrokenError
             The beam stays broken for longer than ``timeout``.
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         """
         self._not_streaming()
         if self.settings.tracker == "AT4xx":
             raise InstrumentError(
-                "An AT4xx measures point by point, it has no stream of distances; use measure(), or say "
+                "An AT4xx measures point by point, it has no stream of distances; use measure(), or state "
                 'tracker = "AT901" where it is another tracker'
             )
         if self._link.broken:
@@ -316,7 +316,7 @@ class LeicaEmScon(Driver):
             self.find_reflector(0.0)
 
     def _near(self, found: Measurement, goal: tuple[float, float, float]) -> bool:
-        """Whether a measurement points to within the search radius of a place."""
+        """Whether a measurement points to within the search radius of a position."""
         angle = math.hypot(
             found.angles[1] - goal[1],
             math.remainder(found.angles[0] - goal[0], math.tau) * math.sin(goal[1]),
@@ -337,7 +337,7 @@ class LeicaEmScon(Driver):
                 lambda each: (
                     each.kind in (codec.SINGLE, codec.SINGLE2) or (each.kind == codec.ERROR and each.command == number)
                 ),
-                settings.timeout + AGAIN * settings.measuring_time,
+                settings.timeout + MEASURING_TIMEOUT_FACTOR * settings.measuring_time,
                 "a measurement",
             )
         except RefusedError as error:

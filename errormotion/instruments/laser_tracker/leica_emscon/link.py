@@ -1,4 +1,4 @@
-"""Asking an emScon server: commands and their answers, with everything that comes unasked in between."""
+"""Asking an emScon server: commands and their answers, with everything that comes unrequested in between."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RefusedError(InstrumentError):
 
 @dataclass(frozen=True)
 class Event:
-    """What the server said unasked.
+    """Messages of the server that were not requested.
 
     Attributes
     ----------
@@ -68,20 +68,20 @@ class Link:
     ----------
     transport : Transport
     timeout, busy_timeout : float
-        Time limits of an answer, and of a server that says that it is busy, s.
+        Time limits of an answer, and of a server that states that it is busy, s.
 
     Attributes
     ----------
     events : deque of Event
-        The last ones that came unasked.
+        The last messages that were not requested.
     early : deque of Packet
         Points of a continuous measurement that came before the answer to the command that starts it.
     broken : bool
-        Whether the beam has lost its reflector, as far as the server has told.
+        Whether the beam has lost its reflector, as far as the server has reported.
     breaks : int
         How often it has.
     stale_refraction : bool
-        Whether the refraction index may have changed since somebody took note.
+        Whether the refraction index may have changed since it was last read.
     """
 
     def __init__(self, transport: Transport, timeout: float, busy_timeout: float) -> None:
@@ -97,14 +97,14 @@ class Link:
         self.stale_refraction = True
 
     def ask(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
-        """Send a command and return its answer; a busy server is asked again.
+        """Send a command and return its answer; a busy server is queried again.
 
         Raises
         ------
         RefusedError
             The server refuses.
         InstrumentTimeoutError, ProtocolError
-            No answer in time, or none that can be read: the connection has to be opened anew.
+            No answer in time, or none that can be read: the connection has to be opened again.
         """
         return next(self.ask_many(number, limit=limit, **values))
 
@@ -117,7 +117,7 @@ class Link:
         total: Callable[[Packet], int] = lambda _: 1,
         **values: Any,
     ) -> Iterator[Packet]:
-        """Send a command and yield its answers; ``total(first)`` says how many there are, see `ask`."""
+        """Send a command and yield its answers; ``total(first)`` states how many there are, see `ask`."""
         allowed = self._timeout if limit is None else limit
         patience = time.monotonic() + self._busy_timeout
         while True:
@@ -146,7 +146,7 @@ class Link:
         Raises
         ------
         InstrumentTimeoutError
-            It does not come within ``limit`` s. As it may come later, the connection is of no use any more.
+            It does not come within ``limit`` s. As it may come later, the connection can no longer be used.
         """
         end = time.monotonic() + limit
         while True:
@@ -165,7 +165,7 @@ class Link:
         Raises
         ------
         ProtocolError
-            What comes is no packet; the connection is of no use any more.
+            What comes is no packet; the connection can no longer be used.
         """
         self._check()
         end = time.monotonic() + limit

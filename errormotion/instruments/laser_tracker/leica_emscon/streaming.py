@@ -1,4 +1,4 @@
-"""The points of a continuous measurement, put where the tracker's clock says that they belong."""
+"""The points of a continuous measurement, put where the tracker's clock states that they belong."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _WARNINGS = frozenset({0, 1})
 def points(link: Link, settings: EmSconSettings, block: int | None = None) -> Iterator[Samples]:
     """Yield blocks of distances from the packets that come on a link.
 
-    A point's place is its time since the first one over the interval that was set. Places without a point are NaN,
-    ``lost``; or ``beam broken`` where the tracker has told so since the last point.
+    A point's index is its time since the first one over the interval that was set. Indices without a point are NaN,
+    ``lost``; or ``beam broken`` where the tracker has reported so since the last point.
 
     Raises
     ------

@@ -39,7 +39,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
     Parameters
     ----------
     words : ndarray, uint32
-        Begin with a profile or a notify packet.
+        Start with a profile or a notify packet.
     size : int
         Words of a profile.
     trigger : int
@@ -76,7 +76,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def search(words: Array, size: int, trigger: int) -> int:
-    """Return where in words the next profile with a right checksum and a fitting trigger count begins; -1: nowhere."""
+    """Return where in words the next profile with a right checksum and a fitting trigger count starts; -1: nowhere."""
     if words.size < size:
         return -1
     total = _sum(words, 0, size - 1)
@@ -159,7 +159,7 @@ def unpack_intensities(profiles: Array, first: int, reasons: Array, intensities:
     ----------
     profiles : ndarray, uint32, (n, words)
     first : int
-        Word at which they begin.
+        Word at which they start.
     reasons : ndarray, uint8, (n,)
         Not 0 where there is no profile.
     intensities : ndarray, uint16, (n, point)

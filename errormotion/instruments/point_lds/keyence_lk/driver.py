@@ -132,23 +132,23 @@ class KeyenceLK(Driver):
         self.settings = settings
 
     def read(self) -> float:
-        """Return one reading now, m; NaN where the sensor has none, and ``no_value`` then says why.
+        """Return one reading now, m; NaN where the sensor has none, and ``no_value`` then states why.
 
         Raises
         ------
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         InstrumentError
-            The controller refuses, with its error named; or it shows another unit than the settings say.
+            The controller refuses, with its error named; or it shows another unit than the settings state.
         """
         value, reason = self._measure()
         self.no_value = REASONS[reason]
         return value
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of readings, asked for one by one in the rhythm of ``rate``, until the caller stops.
+        """Yield blocks of readings, requested one by one in the rhythm of ``rate``, until the caller stops.
 
-        The clock is this computer's. A simulated sensor is asked as fast as it answers: its clock is a virtual one.
+        The clock is this computer's. A simulated sensor is queried as fast as it answers: its clock is a virtual one.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class KeyenceLK(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         InstrumentError
             The controller refuses; or its answers take longer than ``rate`` allows.
         """
@@ -195,7 +195,7 @@ class KeyenceLK(Driver):
         return SIGNS[settings.positive] * value, reason
 
     def _ask(self, request: str, header: str | None = None) -> str:
-        """Send a request and return what the answer says behind its header."""
+        """Send a request and return what the answer states behind its header."""
         if not self._in_step:
             self._enter(MEASURING)
         self._in_step = False
@@ -209,7 +209,7 @@ class KeyenceLK(Driver):
     def _enter(self, mode: str) -> None:
         """Bring the controller into a mode, if it is not in it.
 
-        Late answers to earlier requests, and what is left of damaged ones, are passed over: afterwards the next answer
+        Late answers to earlier requests, and what is left of damaged ones, are ignored: afterwards the next answer
         belongs to the next request.
         """
         self._in_step = False
@@ -229,7 +229,7 @@ class KeyenceLK(Driver):
         if (found := self._ask(request)) != unit:
             names = {str(display.number): name for name, display in DISPLAYS.items()}
             raise InstrumentError(
-                f"The settings say that the controller at {self.address} shows units of {settings.display}; it answers "
+                f"In the settings the controller at {self.address} shows units of {settings.display}; it answers "
                 f"'{request}' with {names.get(found, found)!r}. Change one of them, or have it set: set_up = \"set\""
             )
         request = f"SR,{OFFSET_SETTING},{output}"
@@ -247,7 +247,7 @@ class KeyenceLK(Driver):
             time.sleep(ahead)
         elif -ahead > self.settings.timeout:
             raise InstrumentError(
-                f"{self.address}: {self.rate:g} readings/s were asked for, but {number} took "
+                f"{self.address}: {self.rate:g} readings/s were requested, but {number} took "
                 f"{number / self.rate - ahead:.1f} s; lower the rate"
             )
 

@@ -1,9 +1,9 @@
-"""What an optoNCDT says: bytes to values and back. Facts marked (m) are from memory; each is one line to correct.
+"""Protocol of the optoNCDT: bytes to values and back. Facts marked (m) are from memory; each is one line to correct.
 
 A value has 18 bits and travels as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``,
 ``H = 10 D17..D12``. With more than one value a sample, those behind the first have ``H = 11 D17..D12`` (m). Distances
 use 16 bits, error codes lie above. Answers to commands are ASCII text between the values and end with ``->``; no
-character of a text has the top bit that every ``H`` has, so the two can always be told apart.
+character of a text has the top bit that every ``H`` has, so the two can always be distinguished.
 
 The bulk of the work is done by the compiled functions of `kernels`; this module holds the facts and the small cases.
 """
@@ -41,7 +41,7 @@ ERROR_CODES: Mapping[int, str] = {
 }
 NO_PEAK, BEFORE_RANGE, AFTER_RANGE = 262076, 262077, 262078
 
-# Why a sample has no value. The place in this list is the code that the compiled functions use; 0 = it has one.
+# Why a sample has no value. The position in this list is the code that the compiled functions use; 0 = it has one.
 REASONS: tuple[str, ...] = (
     "",
     "lost",

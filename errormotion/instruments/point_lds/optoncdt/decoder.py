@@ -12,7 +12,7 @@ from errormotion.instruments.point_lds.optoncdt.codec import COUNTER_BITS, encod
 from errormotion.instruments.streaming import Chunk
 
 LARGEST_GAP = 1 << (COUNTER_BITS - 1)
-"""Samples: half the counter's circle; more cannot be told from a counter that ran backwards."""
+"""Samples: half the counter's circle; more cannot be distinguished from a counter that ran backwards."""
 
 
 class StreamDecoder:

@@ -90,7 +90,7 @@ class LinuxCNCProcess:
     Raises
     ------
     InstrumentError
-        Not installed; another one runs, and does not end in time; it does not start: with the end of what it said.
+        Not installed; another one runs, and does not end in time; it does not start: with the end of what it stated.
     """
 
     def __init__(self, files: dict[str, str], bridge: Path, *, wait: float = 60.0) -> None:
@@ -175,7 +175,7 @@ class LinuxCNCProcess:
             if not self.running or time.monotonic() > until:
                 why = "ended at once" if not self.running else f"did not start within {START:g} s"
                 log = (self.folder / "log.txt").read_text(errors="replace")
-                raise InstrumentError(f"LinuxCNC {why}; the end of what it said:\n{log[-2000:]}")
+                raise InstrumentError(f"LinuxCNC {why}; the end of what it stated:\n{log[-2000:]}")
             time.sleep(0.02)
         told = json.loads(file.read_text())
         return int(told["port"]), int(told["pid"])
@@ -187,7 +187,7 @@ class LinuxCNCProcess:
             user = _user()
             with suppress(
                 OSError, subprocess.TimeoutExpired
-            ):  # its realtime process belongs to root: it has to be asked
+            ):  # its realtime process belongs to root: it is stopped by a request
                 subprocess.run(
                     ["rtapi_app", "exit"],
                     env={"HOME": str(self.folder), "PATH": PATH},
@@ -201,7 +201,7 @@ class LinuxCNCProcess:
 
 
 def _user() -> pwd.struct_passwd | None:
-    """Return who LinuxCNC runs as: it refuses root, so then nobody; else whoever asks (None)."""
+    """Return who LinuxCNC runs as: it refuses root, so then nobody; else whoever queries (None)."""
     return pwd.getpwnam("nobody") if os.geteuid() == 0 else None
 
 

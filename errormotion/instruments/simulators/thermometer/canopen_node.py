@@ -126,7 +126,7 @@ class SimulatedCanopen:
         return (self._inputs.temperatures(self.world.time, self._rng)[channel] - offset) / scale
 
     def _outgoing(self, data: bytes) -> bytes | None:
-        """Return an SDO answer as it goes out, or None for silence."""
+        """Return an SDO answer as it goes out, None without an answer."""
         number, server = self._answers, self._server
         if server is None:
             return data

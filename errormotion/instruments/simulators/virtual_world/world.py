@@ -50,7 +50,7 @@ class VirtualWorld(Motion):
         self._devices: set[Device] = set()
 
     def _compile(self) -> None:
-        """Have the twin's loops compiled now, so that nobody waits in vain for the first samples."""
+        """Have the twin's loops compiled now, so that the first samples are not late."""
         resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
         self.machine.distances(0, 1, 1e3, tool="bar")
         self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
@@ -71,7 +71,7 @@ class VirtualWorld(Motion):
             self.end()
 
     def end(self) -> None:
-        """Forget this world, end its devices and its thread; what it knows can still be asked. Idempotent."""
+        """Forget this world, end its devices and its thread; its truth can still be read. Idempotent."""
         with _lock:
             if _worlds.get(self._key) is self:
                 del _worlds[self._key]
@@ -90,7 +90,7 @@ class VirtualWorld(Motion):
     # ------------------------------------------------------------------ heat and time
 
     def start(self, schedule: Sequence[Event]) -> None:
-        """Begin anew at time 0, cold, with a schedule."""
+        """Start again at time 0, cold, with a schedule."""
         with self._change:
             self._refuse_while_streaming("start a schedule")
             self._refuse_in_alarm()
@@ -182,10 +182,10 @@ class VirtualWorld(Motion):
                 self.motion, self.path = None, here
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Have the trackers beside the machine carried to a place in its coordinates, m."""
+        """Have the trackers beside the machine carried to a position in its coordinates, m."""
         trackers = [device for device in self._devices if isinstance(device, Carried)]
         if not trackers:
-            raise InstrumentError("No tracker stands beside this machine; open it first, at the same machine and seed")
+            raise InstrumentError("No tracker is beside this machine; open it first, at the same machine and seed")
         with self._change:
             self._refuse_while_streaming("carry a tracker")
         for tracker in trackers:

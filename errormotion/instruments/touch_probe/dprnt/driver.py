@@ -89,11 +89,11 @@ class Dprnt(Driver):
         return self._map
 
     def identify(self) -> Identity:
-        """Tell what the settings say: a printer is not asked."""
+        """Return the identity as the settings state it: a printer has no identity."""
         return Identity(
             manufacturer=self.settings.control,
             model="DPRNT",
-            serial_number="not told",
+            serial_number="not reported",
             simulated=self.transport.simulated,
             details={"address": self.address, "tip_radius": self.tip_radius},
         )
@@ -123,16 +123,16 @@ class Dprnt(Driver):
         """Yield what the machine prints of each touch, in order, while its program makes them.
 
         A touch whose line is missing, as those after it show, is ``not made``. Lines that came twice, or cannot be
-        read, are passed over and counted. Where the lines of the next cycle begin, the rest of this one is missing.
+        read, are ignored and counted. Where the lines of the next cycle start, the rest of this one is missing.
 
         Raises
         ------
         InstrumentTimeoutError
-            No line for too long; the message says at which touch.
+            No line for too long; the message states at which touch.
         ProtocolError
             Too many lines that cannot be read.
         InstrumentError
-            A place that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
+            A position that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
         """
         touches = list(touches)
         refuse_unmapped(self._map, touches)
@@ -161,7 +161,7 @@ class Dprnt(Driver):
             due = place + 1
 
     def _next(self, timeout: float, unreadable: int) -> Line:
-        """Return the next line that says a place."""
+        """Return the next line that states a position."""
         if self._ahead is not None:
             line, self._ahead = self._ahead, None
             return line

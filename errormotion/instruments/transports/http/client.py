@@ -25,11 +25,11 @@ from errormotion.instruments.transports.recording import Recorder, ReplayTranspo
 from errormotion.instruments.transports.tcp import TcpTransport
 
 PORT = 80
-MOST = 16 << 20
-"""Bytes: largest body that is taken unless told otherwise."""
+LARGEST_BODY = 16 << 20
+"""Bytes: largest body that is taken by default."""
 _LONGEST_LINE = 4096
-_PATIENCE = 10.0
-"""Time limit of a whole answer, in time limits of silence: a server that drips is not silent."""
+_ANSWER_TIMEOUTS = 10.0
+"""Time limit of a whole answer, in time limits without data: a slow server sends, but must end."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class HttpTransport(Transport):
     recorder : Recorder or path, optional
         Where every frame of the session is written.
     timeout : float
-        Time limit of silence, s.
+        Time limit without data, s.
 
     Attributes
     ----------
     target : Address
-        Who is asked; of a recording the address that was recorded.
+        Address of the server; of a recording the address that was recorded.
 
     Raises
     ------
     InstrumentError
-        Another scheme, nobody there, no simulator, a recording that is there already.
+        Another scheme, no device answers, no simulator, a recording that is there already.
     """
 
     def __init__(
@@ -102,15 +102,15 @@ class HttpTransport(Transport):
 
     # ------------------------------------------------------------------ requests
 
-    def get(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MOST) -> Answer:
-        """Ask for a path.
+    def get(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = LARGEST_BODY) -> Answer:
+        """Request a path.
 
         A connection that the server has ended since the last answer is renewed.
 
         Raises
         ------
         InstrumentTimeoutError
-            Silence, or an answer that takes too long.
+            No answer, or an answer that takes too long.
         ProtocolError
             The answer is none of HTTP, or its body is larger than ``limit``.
         InstrumentError
@@ -135,8 +135,8 @@ class HttpTransport(Transport):
             self._hang_up()
         return Answer(response.status, response.headers.get_content_type(), body)
 
-    def parts(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MOST) -> Iterator[bytes]:
-        """Ask for a stream of many parts, and yield the body of each as it comes.
+    def parts(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = LARGEST_BODY) -> Iterator[bytes]:
+        """Request a stream of many parts, and yield the body of each as it comes.
 
         An answer of one part only is yielded whole. The connection is ended with the iterator; the next request opens
         another one.
@@ -306,7 +306,7 @@ class _Bytes(io.RawIOBase):
 
     def __init__(self, transport: HttpTransport, whole: bool) -> None:
         self._transport = transport
-        self._end = time.monotonic() + _PATIENCE * transport.timeout if whole else float("inf")
+        self._end = time.monotonic() + _ANSWER_TIMEOUTS * transport.timeout if whole else float("inf")
 
     def readable(self) -> bool:
         return True

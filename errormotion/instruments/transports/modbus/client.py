@@ -1,4 +1,4 @@
-"""Modbus: a line on which registers are asked for.
+"""Modbus: a line on which registers are requested.
 
 * ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
 * ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
@@ -6,7 +6,7 @@
 * ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
 
 The frames are our own (`modbus_codec`) and go over the byte transports, so that a session can be recorded and played
-back, and each fault be told from the others. `pymodbus`, whose client owns its socket and waits in silence when a
+back, and each fault be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit when a
 checksum is wrong, is the simulated device, and the other side in tests.
 """
 
@@ -30,8 +30,8 @@ from errormotion.instruments.transports.modbus.codec import (
 from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
-QUIET = 0.05  # s without a byte: what was under way is over
-LONGEST = 512  # bytes of rubbish that are waited for
+QUIET_INTERVAL = 0.05  # s without a byte: what was under way is over
+LONGEST_RUBBISH = 512  # bytes of rubbish that are waited for
 
 
 class ModbusLine(Transport):
@@ -46,14 +46,14 @@ class ModbusLine(Transport):
     unit : int
         Address of the device.
     retries : int
-        How often a damaged answer is asked for once more.
+        How often a damaged answer is requested once more.
 
     Attributes
     ----------
     framing, unit
         As given.
     repeated : int
-        How many answers had to be asked for again.
+        How many answers had to be requested again.
     """
 
     def __init__(self, line: Transport, framing: Framing, unit: int, retries: int = 0) -> None:
@@ -70,9 +70,9 @@ class ModbusLine(Transport):
         ModbusRefusal
             An exception reply.
         ProtocolError
-            A damaged answer: garbage, a wrong checksum, another unit, too short; also when asked again.
+            A damaged answer: garbage, a wrong checksum, another unit, too short; also when queried again.
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         InstrumentError
             The connection is lost; the next call connects again.
         """
@@ -107,7 +107,7 @@ class ModbusLine(Transport):
             raise
 
     def _frame(self, end: float) -> bytes:
-        """Return one answer, as long as its beginning says that it is."""
+        """Return one answer, as long as its start states that it is."""
         data = b""
         while lacking := missing(self.framing, data):
             try:
@@ -117,15 +117,17 @@ class ModbusLine(Transport):
                     raise ProtocolError(
                         f"Expected {lacking} bytes more within {self.timeout:g} s; found {data[:24].hex(' ')}"
                     ) from None
-                raise InstrumentTimeoutError(f"{self.url}: unit {self.unit} is silent for {self.timeout:g} s") from None
+                raise InstrumentTimeoutError(
+                    f"{self.url}: unit {self.unit} did not answer within {self.timeout:g} s"
+                ) from None
         return data
 
     def _settle(self) -> None:
         """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
         came = 0
         with suppress(InstrumentError):
-            while came < LONGEST:
-                came += len(self._line.read(LONGEST, timeout=QUIET))
+            while came < LONGEST_RUBBISH:
+                came += len(self._line.read(LONGEST_RUBBISH, timeout=QUIET_INTERVAL))
 
     def _send(self, data: bytes) -> None:
         self._line.write(data)
@@ -149,7 +151,7 @@ def open_modbus(
     retries: int = 0,
     baudrate: int | None = None,
 ) -> ModbusLine:
-    """Open the Modbus line that an address names; what the address says of ``unit`` and ``baudrate`` wins.
+    """Open the Modbus line that an address names; what the address states of ``unit`` and ``baudrate`` wins.
 
     Parameters
     ----------
@@ -163,7 +165,7 @@ def open_modbus(
     Raises
     ------
     InstrumentError
-        Nobody there, or no address for Modbus.
+        No device answers, or no address for Modbus.
     """
     address = parse_address(url)
     device = original(address)

@@ -21,9 +21,9 @@ CHUNK = 4096
 
 
 class ModbusServer:
-    """A Modbus server that is asked with bytes and answers with bytes, through a connection on loopback.
+    """A Modbus server that takes and returns bytes, through a connection on loopback.
 
-    Between it and whoever asks lies a cable, which is a simulator's to break.
+    Between it and whoever queries lies a cable, which is a simulator's to break.
 
     Parameters
     ----------

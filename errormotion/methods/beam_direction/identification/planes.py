@@ -109,7 +109,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         method=method,
         method_version=version,
         provenance=provenance.make(settings, raw, None, steps=steps)
-        | ({"calibration": sensor.calibration.told()} if sensor is not None else {}),
+        | ({"calibration": sensor.calibration.reference()} if sensor is not None else {}),
         influence=by_source[:, None, :] if settled.sources else None,
         sources=settled.sources or None,
         source_groups=settled.groups or None,

@@ -92,7 +92,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
         method=method.info.id,
         method_version=method.info.version,
         provenance=provenance.make(settings, None, None, steps=["plan"])
-        | ({"calibration": left.calibration.told()} if left is not None else {}),
+        | ({"calibration": left.calibration.reference()} if left is not None else {}),
         influence=influence,
         sources=["scale", "triangulation plane", *(f"inclination calibration {i + 1}" for i in range(number))],
         source_groups=["sensor", "triangulation plane", *["inclination calibration"] * number],

@@ -12,6 +12,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.methods.crossbeam_scan.encoder import folded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,12 +21,9 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.acquisition.programs import Program
     from errormotion.methods.crossbeam_scan.settings import Settings
 
-    Array = Array
 
 BLOCK_LINES = 64
 """Most lines that are asked for at once."""
-OVERFLOW = 2.0**32
-"""Counts after which an encoder begins anew."""
 
 
 class BrokenPassError(InstrumentError):
@@ -136,12 +134,6 @@ def _located(block: Any, middle: float, now: float, settings: Settings) -> Lines
         dropped=int(block.dropped),
         invalid=block.invalid,
     )
-
-
-def folded(counts: Array, middle: float) -> Array:
-    """Return encoder counts with whole overflows taken off, so that they lie nearest to the middle of the axis."""
-    counts = np.asarray(counts, dtype=float)
-    return np.asarray(counts - OVERFLOW * np.rint((counts - middle) / OVERFLOW))
 
 
 def filled(values: Array) -> Array:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = Array
     Heights = NDArray[np.float32]
 
 log = logging.getLogger(__name__)

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
     from errormotion.plugins import Bench
 
-    Array = Array
 
 log = logging.getLogger(__name__)
 

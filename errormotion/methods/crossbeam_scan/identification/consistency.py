@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -135,7 +135,7 @@ def cold_repeats(
         at = tuple(where)
         some = known[at]
         score[at] = _chi_squared(E[at][some], C[at][np.ix_(some, some)])
-    probability = np.where(freedoms > 0, stats.chi2.sf(score, np.maximum(freedoms, 1)), np.nan)
+    probability = np.where(freedoms > 0, special.chdtrc(np.maximum(freedoms, 1), score), np.nan)
     limit = false_alarm / max(int((freedoms > 0).sum()), 1)
     return ColdRepeats(score, freedoms, probability, probability < limit, limit)
 
@@ -315,7 +315,7 @@ def _greatest(
         score = float(step @ pull[i])
         weight = np.abs(step * pull[i])
         degrees = spare[i] * weight.sum() / max(float(weight @ doubtful[i]), 1e-9 * float(weight.sum()))
-        found.append(Moved(k, int(since), step, covariance, score, float(stats.f.sf(score / 6, 6, degrees))))
+        found.append(Moved(k, int(since), step, covariance, score, float(special.fdtrc(6, degrees, score / 6))))
     return max(found, key=lambda step: step.score)
 
 

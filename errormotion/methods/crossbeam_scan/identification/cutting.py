@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.acquisition.listening import OVERFLOW, folded
+from errormotion.methods.crossbeam_scan.encoder import OVERFLOW, folded
 
 Scan = tuple[NDArray[np.float32], Array, Array, float]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,7 +55,10 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     if np.any(np.diff(places) <= 0):
         raise MethodError(f"position: expected places of the artefacts that rise; found {places.tolist()} m")
     cold = cold_cycles(raw, scans.cycles)
-    found = register_all(scans, cold, float(raw["height_noise"]), settings)
+    # The hash of the raw data reads all of it once more: meanwhile scans are registered.
+    with ThreadPoolExecutor(1) as pool:
+        origin = pool.submit(provenance.make, settings, raw, None, steps=_STEPS)
+        found = register_all(scans, cold, float(raw["height_noise"]), settings)
     rig = rig_of(raw)
     axis = carriage(found, places, rig, guide=None)
     warm = [c for c in range(scans.cycles) if c not in cold]
@@ -71,7 +75,9 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     if settings.strain == "guided":
         gone = trust.wrong & (settings.moved == "exclude")
         axis = carriage(found.without(gone), places, rig, guide=settings.guide_uncertainty)
-    return _dataset(raw, settings, method, version, found, axis, rig, trust, cold, rows, time, scans.notes)
+    return _dataset(
+        raw, settings, method, version, found, axis, rig, trust, cold, rows, time, scans.notes, origin.result()
+    )
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
@@ -113,6 +119,7 @@ def _dataset(
     rows: list[int],
     time: Array,
     mended: list[str],
+    origin: Mapping[str, Any],
 ) -> xr.Dataset:
     warm = rows[1:]
     place = np.asarray(raw["position"].values, dtype=float)
@@ -148,7 +155,7 @@ def _dataset(
         reference="cold scans of the artefacts, before the warm-up",
         method=method,
         method_version=version,
-        provenance=provenance.make(settings, raw, None, steps=_STEPS),
+        provenance=origin,
         influence=influence,
         sources=axis.sources,
         source_groups=axis.source_groups,

@@ -24,7 +24,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.spatial.transform import RigidTransform
 
@@ -84,6 +83,8 @@ def slopes(places: ArrayLike) -> tuple[Array, Array]:
     The second uses one neighbour on each side; for two places it says 0. Its difference from the first is a measure of
     what the first misses.
     """
+    from scipy.interpolate import CubicSpline
+
     y = np.asarray(places, dtype=float)
     n = y.size
     if n < 2:

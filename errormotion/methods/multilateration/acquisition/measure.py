@@ -14,24 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from pydantic import Field
 
 from errormotion.arrays import Array
-from errormotion.datasets.units import Length, Time
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.acquisition.scales import Scales
 from errormotion.methods.multilateration.names import station_names, target_names
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.schema import SCHEMA
-from errormotion.plugins import PluginSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.settings import Measuring, Settings
     from errormotion.plugins import Bench
-
-    Array = Array
 
 NO_VALUE = "no value"
 _AIR = ("air_temperature", "air_pressure", "relative_humidity", "refractive_index")
@@ -44,27 +39,6 @@ _FAR = 2.0
 """So many times nearer to another station's place than to its own: the tracker has not been moved."""
 _THIN = 0.05
 """A spread of targets across their longest extent, relative to it, that is enough for that."""
-
-
-class Measuring(PluginSettings):
-    """How the targets are measured."""
-
-    settle: Time = Field(default=0.5, ge=0, description="wait at each target before it is measured")
-    attempts: int = Field(default=2, ge=0, description="times that a reflector is looked for after a broken beam")
-    renewals: int = Field(
-        default=2, ge=0, description="times that a set-up is begun anew because the interferometer lost its count"
-    )
-    returns: int = Field(default=4, ge=0, description="targets visited again at the end of a set-up: they show drift")
-    sequence: tuple[int, ...] = Field(
-        default=(), description="stations by number in the order of set-ups; one that comes again replaces the earlier"
-    )
-    poor: float = Field(default=0.2, ge=0, le=1, description="share of broken beams above which a set-up is repeated")
-    repeats: int = Field(default=1, ge=0, description="times that a poor set-up is repeated")
-    arrival: Length = Field(default=1e-4, gt=0, description="how near the control has to be to a target")
-    timeout: Time = Field(default=120.0, gt=0, description="time limit of a move")
-    scale_sensors: tuple[str, str, str] | None = Field(
-        default=None, description="sensors of the thermometer on the scales of X, Y and Z; without: not recorded"
-    )
 
 
 def measure_stations(

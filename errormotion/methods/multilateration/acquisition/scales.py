@@ -13,8 +13,6 @@ from errormotion.errors import InstrumentError, MethodError
 if TYPE_CHECKING:
     from errormotion.plugins import Bench
 
-    Array = Array
-
 log = logging.getLogger(__name__)
 
 

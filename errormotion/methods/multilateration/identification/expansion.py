@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.multilateration.settings import Air, Expansion
 
-    Array = Array
-
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
 
 

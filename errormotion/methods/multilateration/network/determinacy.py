@@ -261,20 +261,33 @@ def _of_target(target: Array, place: Array) -> str:
     return "it lies nearly in one plane with the stations that see it"
 
 
-def swapped_stations(found: Array, rough: Array | None) -> list[str]:
-    """Return a note where the stations found (n, 3) fit their rough places (n, 3) in another order."""
+def swapped_stations(found: Array, rough: Array | None) -> list[tuple[int, int]]:
+    """Return stations (j, k), from 0, of which j was found where k is stated, where another order fits much better.
+
+    Positions are (n, 3), m: as found, and as stated.
+    """
     if rough is None or not np.isfinite(rough).all():
         return []
     from scipy.optimize import linear_sum_assignment
 
     off = np.linalg.norm(found[:, None] - rough[None], axis=-1)
     rows, columns = linear_sum_assignment(off)
-    own, other = np.diag(off), off[rows, columns]
-    if (rows == columns).all() or not other.sum() < 0.5 * own.sum():
+    if (rows == columns).all() or not off[rows, columns].sum() < 0.5 * np.diag(off).sum():
         return []
-    pairs = [(j + 1, k + 1) for j, k in zip(rows, columns, strict=True) if j != k]
-    changed = [f"the readings of station {j} are those of station {k}" for j, k in pairs]
+    return [(int(j), int(k)) for j, k in zip(rows, columns, strict=True) if j != k]
+
+
+def swap_note(found: Array, rough: Array | None) -> list[str]:
+    """Return a note on swapped stations."""
+    pairs = swapped_stations(found, rough)
+    if not pairs or rough is None:
+        return []
+    order = np.arange(len(found))
+    for j, k in pairs:
+        order[j] = k
+    own, other = (np.linalg.norm(found - each, axis=1).max() * 1e3 for each in (rough, rough[order]))
+    changed = ", ".join(f"the readings of station {j + 1} are those of station {k + 1}" for j, k in pairs)
     return [
-        f"stations look swapped: {', '.join(changed)} (as given they are {own.max() * 1e3:.4g} mm off their rough "
-        f"places, swapped {other.max() * 1e3:.4g} mm); the targets are right, the names of the stations are not"
+        f"stations are probably swapped: {changed} (as stated, they are {own:.4g} mm off their approximate positions, "
+        f"swapped {other:.4g} mm); the targets are right, the names of the stations are not"
     ]

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network import determinacy, outliers
 from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
@@ -159,27 +158,17 @@ class Network:
         shows its whole error.
         """
         s = self.stations
-        return loops(len(self.target)).residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """What a person should know."""
-        return (
-            *outliers.told(self.left_out, self.undecided),
-            *determinacy.without_place(self.weight, self.undecided),
-            *determinacy.without_say(self.carries, self.target),
-            *determinacy.weak_layout(self.target_covariance, self.weight, self.station, self.target),
-            *determinacy.weak_targets(self.target, self.target_covariance, self.station),
-            *determinacy.swapped_stations(self.station, self.rough),
-        )
+        of = loops(len(self.target))
+        return np.asarray(of.residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target))
 
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
-        return loops(len(self.target)).examine(
+        covariance, redundancy = loops(len(self.target)).examine(
             self.weight, self.station, self.extra, self.target, self.carries,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip
+        return covariance, redundancy
 
     @property
     def station(self) -> Array:

@@ -9,7 +9,6 @@ other targets. Where several would do, the target is given up and named.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,7 @@ from scipy.special import ndtri
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.loops import COMPILED_FROM, loops
 from errormotion.methods.multilateration.network.model import directions
-
-if TYPE_CHECKING:
-    from errormotion.methods.multilateration.network.network import Network
-
+from errormotion.methods.multilateration.network.network import Network
 
 FALSE_ALARMS = 0.01
 """Probability of leaving out any good reading of a network."""
@@ -52,21 +48,21 @@ class Found:
         return np.where(self.out, 0.0, weight)
 
 
-def told(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> list[str]:
-    """Return what a person should know of readings left out and targets given up."""
-    notes = []
+def notes(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> list[str]:
+    """Return notes on readings that were excluded and targets that were given up."""
+    found = []
     if left_out:
         shown = ", ".join(f"station {j + 1} of target {i + 1}" for j, i in left_out[:_SHOWN])
         more = f" and {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
-        notes.append(f"wrong readings left out ({len(left_out)}): {shown}{more}")
+        found.append(f"wrong readings left out ({len(left_out)}): {shown}{more}")
     if undecided:
         shown = ", ".join(str(i + 1) for i in undecided[:_SHOWN])
         more = f" and {len(undecided) - _SHOWN} more" if len(undecided) > _SHOWN else ""
-        notes.append(
+        found.append(
             f"targets given up ({len(undecided)}), since a reading of theirs is wrong and nothing tells "
             f"which: {shown}{more}; readings from a further station would tell"
         )
-    return notes
+    return found
 
 
 def normalised(network: Network) -> Array:
@@ -94,7 +90,7 @@ def _clean(network: Network) -> bool:
         network.reading, network.weight, network.station, network.dead_path, np.ascontiguousarray(network.target.T),
         network.factor, _WEAK,
     )  # fmt: skip
-    return worst <= _least_gate(checks)
+    return bool(worst <= _least_gate(checks))
 
 
 def gross(reading: Array, weight: Array, nominal: Array, place: Array, dead_path: Array) -> Found:

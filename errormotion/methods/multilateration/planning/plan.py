@@ -28,11 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.multilateration.network.network import Network
-    from errormotion.methods.multilateration.planning.sight import Planning
-    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.settings import Planning, Settings
     from errormotion.plugins import MethodInfo
-
-    Array = Array
 
 SETUPS = ("as set", "best")
 _COARSE = 4

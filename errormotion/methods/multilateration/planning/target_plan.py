@@ -17,11 +17,8 @@ from errormotion.methods.multilateration.planning.target_sets import POWERS, Exp
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.multilateration.planning.choosing import Choosing
-    from errormotion.methods.multilateration.planning.sight import Planning, Sight
-    from errormotion.methods.multilateration.settings import Settings
-
-    Array = Array
+    from errormotion.methods.multilateration.planning.sight import Sight
+    from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
 
 _ROUNDS = 3
 _ENOUGH = 0.01

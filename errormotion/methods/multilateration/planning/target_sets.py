@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = Array
-
 POWERS = {"mean": 1.0, "largest": 16.0}
 _LOOSE = 0.1
 """What is known of stations and dead paths before, m: nothing that matters, and a matrix that has an inverse."""

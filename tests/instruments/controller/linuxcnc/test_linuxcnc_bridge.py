@@ -230,11 +230,11 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monke
         ("_take", {}, "no such operation"),
         ("state", {"of": 1}, "TypeError"),
         ("move_to", {}, "TypeError"),
-        ("move_to", {"position": "home"}, "expected a place"),
+        ("move_to", {"position": "home"}, "expected a position"),
         ("move_to", {"position": [0, 0, True]}, "expected a coordinate"),
         ("move_to", {"position": [0, 0, 0.11]}, "Z travels from -0.1 to 0.1 m; found 0.11"),
         ("move_to", {"position": [0, 0, 0], "feed": -1}, "feed above 0"),
-        ("probe", {"target": [0, 0, 0], "feed": 0.1}, "stands at the target"),
+        ("probe", {"target": [0, 0, 0], "feed": 0.1}, "is at the target"),
         ("probe", {"target": [0, 0, 0.01], "feed": None}, "expected a feed"),
         ("spindle", {"speed": "fast"}, "expected spindle speed"),
         ("run_program", {"text": 5}, "expected the text"),
@@ -288,7 +288,7 @@ def test_messages_are_no_alarms_but_errors_are(play: Callable[[Test], None]) -> 
 
 
 def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test], None]) -> None:
-    """Another display may have taken the text: it is the place that tells."""
+    """Another display may have taken the text: it is the position that reports."""
 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         assert "stopped at 0.0000, 0.0000, 0.0000 mm before its goal" in await wire.ask("move_to", position=[0, 0, 0.1])

@@ -1,4 +1,4 @@
-"""What is said where LinuxCNC cannot be started: nothing here starts it."""
+"""What is stated where LinuxCNC cannot be started: nothing here starts it."""
 
 import fcntl
 import os

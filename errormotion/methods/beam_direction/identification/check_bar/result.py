@@ -76,7 +76,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         method=method,
         method_version=version,
         provenance=provenance.make(settings, raw, None, steps=["check bar"])
-        | ({"calibration": calibration.told()} if calibration is not None else {}),
+        | ({"calibration": calibration.reference()} if calibration is not None else {}),
         extras=extras,
     )
     return ds.assign_attrs(notes=notes)

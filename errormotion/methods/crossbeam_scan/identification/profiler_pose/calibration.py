@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from errormotion.arrays import Array
@@ -218,6 +217,8 @@ class _Fit:
 
     def solve(self) -> ProfilerPose:
         """Return the fit, its weights from its own residuals."""
+        from scipy.optimize import least_squares  # takes time to import
+
         p = self._start()
         used = self._rim(p)[2] > OBLIQUE
         fitted = used

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.identification.registration import kernels, sums
+from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
 from errormotion.methods.crossbeam_scan.identification.registration.kernels import COLUMNS, POINTS, ROWS
 from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface, repaired
@@ -79,7 +79,10 @@ class BlockMap:
     @cached_property
     def centre(self) -> Array:
         """Middle of the known surface, (3,), m."""
-        return np.asarray(sums.middle(self.height, self.variance, self.x, self.y))
+        known = self.known
+        columns, rows = known.sum(axis=0), known.sum(axis=1)
+        total = np.array([columns @ self.x, rows @ self.y, self.height[known].sum()])
+        return np.asarray(total / rows.sum())
 
     @cached_property
     def surface(self) -> Surface:
@@ -105,9 +108,11 @@ class BlockMap:
     @cached_property
     def moments(self) -> Moments:
         """What the slopes of every fourth block along both directions tell about motions."""
-        q = sums.normals_by_place(
-            self.height, self.slope_x, self.slope_y, self.variance, self.x, self.y, self.centre, THIN
-        )
+        some = slice(THIN // 2, None, THIN)
+        known = self.known[some, some]
+        x, y = np.meshgrid(self.x[some] - self.centre[0], self.y[some] - self.centre[1])
+        p = np.stack([np.ones_like(x), x, y, self.height[some, some] - self.centre[2]])[:, known]
+        q = np.concatenate([-self.slope_x[some, some][known] * p, -self.slope_y[some, some][known] * p, p])
         return Moments(q @ q.T, q[8:] @ q[8:].T, q.shape[1])
 
 
@@ -147,17 +152,15 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
         )
     xc, dx = _centres("x", x, columns, COLUMNS, 0.01)
     yc, dy = _centres("y", y, rows, ROWS, 1.0)
-    scales = kernels.block_scales(z, dx[0], dy, max(1, rows * columns // _SAMPLED))
-    scales = scales[np.isfinite(scales)]
+    scales = _block_scales(z, dx[0], dy, max(1, rows * columns // _SAMPLED))
     if scales.size < FEWEST_BLOCKS:
         raise MethodError(
             f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
             f"{kernels.FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
         )
-    out = np.empty((9, rows, columns))
     # A scan without any noise still has the last bit of its numbers; a few of them tell how large they are.
     least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
-    kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least), out)
+    out = kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least))
     return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y))
 
 
@@ -207,8 +210,7 @@ def _deblurred(
     # A curved block scatters about its plane without any noise.
     share = POINTS / (POINTS - 3)
     bends = share * np.array([np.var(0.5 * dx**2), np.var(0.5 * dy**2), np.var(dx) * np.var(dy)])
-    height, rest = np.empty((2, *mean.shape))
-    kernels.sharpen(out, pitch_x, pitch_y, bends, height, rest)
+    height, rest = _sharpened(out, pitch_x, pitch_y, bends)
     noise = np.sqrt(max(sampled_median(rest), least**2))
     variance = gain * noise**2
     if not known.all():
@@ -238,7 +240,70 @@ def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
 
 def sampled_median(values: Array) -> float:
     """Return the median of the finite out of some thousand evenly chosen values: a robust scale needs no more."""
+    found = upper_median(some_of(values))
+    return found if found == found else float(np.median(values[np.isfinite(values)]))
+
+
+def some_of(values: Array, few: int = _FEW) -> Array:
+    """Return the finite out of about so many values, evenly chosen."""
     flat = values.reshape(-1)
-    step = flat.size // _FEW | 1  # odd: not the same columns of every row
-    found = sums.median_of_some(flat, step)
-    return found if found == found else float(np.median(flat[np.isfinite(flat)]))
+    chosen = flat[:: flat.size // few | 1]  # odd: not the same columns of every row
+    return np.asarray(chosen[np.isfinite(chosen)])
+
+
+def upper_median(values: Array) -> float:
+    """Return the value in the middle, of two the larger; NaN where there is none."""
+    return float(np.partition(values, values.size // 2)[values.size // 2]) if values.size else np.nan
+
+
+def _block_scales(z: NDArray[np.float32], dx: Array, dy: Array, step: int) -> Array:
+    """Return the robust scatter (m) of every ``step``-th block about its plane, without those of too few points.
+
+    The plane is that of `kernels._robust_plane`.
+    """
+    columns = z.shape[1] // COLUMNS
+    chosen = np.arange(0, len(dy) * columns, step)
+    row, column = chosen // columns, chosen % columns
+    lines, points = (ROWS * row)[:, None] + np.arange(ROWS), (COLUMNS * column)[:, None] + np.arange(COLUMNS)
+    block, y = z[lines[:, :, None], points[:, None, :]].astype(float), dy[row]
+    half_r, half_c = ROWS // 2, COLUMNS // 2
+    sx = _medians(block[:, :, half_c:] - block[:, :, :half_c], kernels.FEWEST // 4) / (dx[half_c] - dx[0])
+    run = (y[:, half_r:] - y[:, :half_r])[:, :, None]
+    sy = _medians((block[:, half_r:] - block[:, :half_r]) / run, kernels.FEWEST // 4)
+    rest = block - sx[:, None, None] * dx - sy[:, None, None] * y[:, :, None]
+    height = _medians(rest, kernels.FEWEST)
+    scales = 1.4826 * _medians(np.abs(rest - height[:, None, None]), kernels.FEWEST)
+    return np.asarray(scales[np.isfinite(scales)])
+
+
+def _medians(values: Array, fewest: int) -> Array:
+    """Return the upper median of each block's finite values (block, ...); NaN where there are fewer than this."""
+    ordered = np.sort(values.reshape(len(values), -1), axis=1)  # NaN come last
+    count = np.isfinite(ordered).sum(axis=1)
+    middle = ordered[np.arange(len(ordered)), np.minimum(count // 2, ordered.shape[1] - 1)]
+    return np.where(count < max(fewest, 1), np.nan, middle)
+
+
+def _sharpened(maps: Array, pitch_x: float, pitch_y: float, bends: Array) -> tuple[Array, Array]:
+    """Return heights without what curvature adds to the blocks' means, m, and variances without what it adds, m^2.
+
+    Parameters
+    ----------
+    maps : ndarray (9, block row, block column)
+        Columns of `kernels.reduce_blocks`, holes in means and slopes filled; no points where a block was dropped.
+    pitch_x, pitch_y : float
+        Distance of the blocks, m.
+    bends : ndarray (3,)
+        Variance about its plane of a block with z = dx^2 / 2, dy^2 / 2, dx dy.
+    """
+    zxx, zyy = _second(maps[0].T).T / pitch_x**2, _second(maps[0]) / pitch_y**2
+    zxy = np.gradient(maps[1], pitch_y, axis=0)
+    added = maps[6] * zxx + maps[7] * zyy + maps[8] * zxy
+    height = maps[0] - np.where(maps[4] > 0, added, 0.0)
+    return height, maps[3] - (zxx**2 * bends[0] + zyy**2 * bends[1] + zxy**2 * bends[2])
+
+
+def _second(z: Array) -> Array:
+    """Return second differences along the first axis, extended as straight lines at both ends."""
+    inner = z[:-2] - 2.0 * z[1:-1] + z[2:]
+    return np.concatenate([2.0 * inner[:1] - inner[1:2], inner, 2.0 * inner[-1:] - inner[-2:-1]])

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.identification.registration.kernels import FAST, compiled
 
 
-@compiled(inline="always")
+@compiled()
 def _weights(t: float) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
     """Return the four cubic B-splines at t in [0, 1) between the second and the third."""
     u, sixth = 1.0 - t, 1.0 / 6.0
@@ -131,32 +130,6 @@ def _jacobian_row(
 
 
 @compiled()
-def _accumulate_row(
-    row: int, blocks: Array, x: Array, y: Array, pose: Array, normal: Array, centre: Array, bases: Array,
-    surface: Array, spread_of: Array, grid: Array, gate: float, residual: Array, weight: Array, rows: Array,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Do the work of `accumulate` for one row of blocks."""
-    bx, size = residual.shape[1], 6 + len(bases)
-    J, points, room = np.empty((size, bx)), np.empty((5, bx)), np.empty((4, bx))
-    S, cold, between, r = room[0], room[1], room[2], room[3]
-    variance, w, rest = blocks[3, row], weight[row], residual[row]
-    _moved_row(blocks[0, row], x, y[row], pose, grid, points)
-    _surface_row(points, variance, surface, spread_of, S, cold, between)
-    count, middle, Z = 0.0, 0.0, points[2]
-    for c in range(bx):
-        rest[c] = Z[c] - S[c]
-        kept = abs(rest[c]) < gate
-        r[c] = rest[c] if kept else 0.0
-        w[c] = 1.0 / (variance[c] + cold[c]) if kept else 0.0
-        count += 1.0 if kept else 0.0
-        # How far between two cold lines: there the spline averages their noise.
-        middle += between[c] if kept else 0.0
-    _jacobian_row(points, blocks[1, row], blocks[2, row], normal, centre, bases, J)
-    _row_sums(J, w, r, between, rows[row])
-    rows[row, size * (size + 1) + 1], rows[row, size * (size + 1) + 2] = count, middle
-
-
-@compiled()
 def accumulate(
     blocks: Array,
     x: Array,
@@ -172,6 +145,8 @@ def accumulate(
     residual: Array,
     weight: Array,
     rows: Array,
+    first: int,
+    last: int,
 ) -> None:  # pragma: no cover - compiled
     """Compare warm blocks with the cold surface: residuals, and the sums of every row of blocks.
 
@@ -203,69 +178,28 @@ def accumulate(
         Receives one over the variance of the residual; 0 where the block is not in the sums.
     rows : ndarray (block row, (6 + k) (7 + k) + 3)
         Receives the sums: J^T W J, J^T W r, r^T W r, number of blocks, sum of t (1 - t) along y.
+    first, last : int
+        Rows of blocks to compare: from ``first`` to before ``last``.
     """
-    for row in range(len(residual)):
-        _accumulate_row(
-            row, blocks, x, y, pose, normal, centre, bases, surface, spread_of, grid, gate, residual, weight, rows
-        )
-
-
-@compiled(parallel=True)
-def accumulate_shared(
-    blocks: Array, x: Array, y: Array, pose: Array, normal: Array, centre: Array, bases: Array, surface: Array,
-    spread_of: Array, grid: Array, gate: float, residual: Array, weight: Array, rows: Array,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Do what `accumulate` does, on several threads: worth it for ten thousand blocks."""
-    for row in numba.prange(len(residual)):
-        _accumulate_row(
-            row, blocks, x, y, pose, normal, centre, bases, surface, spread_of, grid, gate, residual, weight, rows
-        )
-
-
-@compiled(parallel=True)
-def advance(
-    blocks: Array, x: Array, y: Array, pose: Array, normal: Array, centre: Array, bases: Array, grid: Array,
-    step: Array, residual: Array,
-) -> None:  # fmt: skip  # pragma: no cover - compiled
-    """Add J step to the residuals of `accumulate` at a pose: what they are after a short step (6 + k,)."""
-    for row in numba.prange(len(residual)):
-        bx, rest = residual.shape[1], residual[row]
-        J, points = np.empty((6 + len(bases), bx)), np.empty((5, bx))
+    bx, size = residual.shape[1], 6 + len(bases)
+    J, points, room = np.empty((size, bx)), np.empty((5, bx)), np.empty((4, bx))
+    S, cold, between, r = room[0], room[1], room[2], room[3]
+    for row in range(first, last):
+        variance, w, rest = blocks[3, row], weight[row], residual[row]
         _moved_row(blocks[0, row], x, y[row], pose, grid, points)
+        _surface_row(points, variance, surface, spread_of, S, cold, between)
+        count, middle, Z = 0.0, 0.0, points[2]
+        for c in range(bx):
+            rest[c] = Z[c] - S[c]
+            kept = abs(rest[c]) < gate
+            r[c] = rest[c] if kept else 0.0
+            w[c] = 1.0 / (variance[c] + cold[c]) if kept else 0.0
+            count += 1.0 if kept else 0.0
+            # How far between two cold lines: there the spline averages their noise.
+            middle += between[c] if kept else 0.0
         _jacobian_row(points, blocks[1, row], blocks[2, row], normal, centre, bases, J)
-        for k in range(len(J)):
-            for c in range(bx):
-                rest[c] += step[k] * J[k, c]
-
-
-@compiled(inline="always")
-def _gain(a: float, b: float, d: float, k: float, s: float, t: float) -> tuple[float, float, float]:  # pragma: no cover
-    """Return the entries of K = T (k + T C T)^-1 T with C = (a b; b d) and T = diag(s, t)."""
-    first, last, mixed = k + s * s * a, k + t * t * d, s * t * b
-    determinant = first * last - mixed * mixed
-    return s * s * last / determinant, -s * t * mixed / determinant, t * t * first / determinant
-
-
-@compiled()
-def line_gains(C: Array, k: float, s: float, t: float) -> Array:  # pragma: no cover - compiled
-    """Return what takes the sums of every line to its effects, (line, 2, 2); ``s``, ``t``: their deviations."""
-    K = np.empty(C.shape)
-    for row in range(len(C)):
-        K[row, 0, 0], K[row, 0, 1], K[row, 1, 1] = _gain(C[row, 0, 0], C[row, 0, 1], C[row, 1, 1], k, s, t)
-        K[row, 1, 0] = K[row, 0, 1]
-    return K
-
-
-@compiled()
-def line_moments(C: Array, u: Array, k: float, s: float, t: float) -> Array:  # pragma: no cover - compiled
-    """Return the sum over lines of the squared effects that their sums u (line, 2) let expect, (2,)."""
-    total = np.zeros(2)
-    for row in range(len(C)):
-        K00, K01, K11 = _gain(C[row, 0, 0], C[row, 0, 1], C[row, 1, 1], k, s, t)
-        first, last = K00 * u[row, 0] + K01 * u[row, 1], K01 * u[row, 0] + K11 * u[row, 1]
-        total[0] += first * first + k * K00
-        total[1] += last * last + k * K11
-    return total
+        _row_sums(J, w, r, between, rows[row])
+        rows[row, size * (size + 1) + 1], rows[row, size * (size + 1) + 2] = count, middle
 
 
 @compiled(fastmath=FAST)

@@ -1,21 +1,21 @@
-"""Compiled loops over the points, which reduce them to blocks, and over the blocks, which fill and sharpen them.
+"""Compiled loops over the points of a scan, which reduce them to blocks.
 
-Threads share them by rows of blocks, and every block is computed within one thread: the result has the same bits on any
-number of threads.
+Threads share the rows of blocks, and every block is computed within one thread: the result has the same bits on any
+number of threads. The threads are Python's and not numba's: code for these takes twice as long to compile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from itertools import pairwise
+from threading import Thread
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-
-Function = TypeVar("Function", bound=Callable[..., Any])
+from errormotion.compiling import Compiler
 
 COLUMNS = 16
 """Points of a block along x, the profile."""
@@ -24,6 +24,8 @@ ROWS = 4
 POINTS = ROWS * COLUMNS
 FEWEST = 20
 """A block with fewer valid points says nothing."""
+MANY = 10000
+"""More blocks than these are shared by several threads."""
 
 # Sums may be taken in any order (so that they vectorise), but NaN stays NaN.
 FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -36,15 +38,41 @@ _FEW_OF_ROW, _OF_ROW = 6, 16
 _OFF = 1.3
 
 
-def compiled(**options: Any) -> Callable[[Function], Function]:
-    """Compile with numba: cached on disk, without the interpreter's lock."""
-    return cast(Callable[[Function], Function], numba.njit(cache=True, nogil=True, error_model="numpy", **options))
+compiled = Compiler("the registration of scans", seconds=5, error_model="numpy")
+
+
+def in_threads(work: Callable[..., Any], rows: int, blocks: int, *given: Any) -> None:
+    """Call ``work(*given, first, last)`` for parts of so many rows of blocks, each in a thread of its own if worth it.
+
+    Parameters
+    ----------
+    work : callable
+        Computes the rows from ``first`` to before ``last``, each by itself.
+    rows, blocks : int
+        How many there are; few blocks take one thread.
+    given : tuple
+        Further arguments.
+    """
+    limits = np.linspace(0, rows, min(threads() if blocks > MANY else 1, rows) + 1).astype(int).tolist()
+    others = [Thread(target=work, args=(*given, *part)) for part in pairwise(limits[1:])]
+    for thread in others:
+        thread.start()
+    work(*given, *limits[:2])
+    for thread in others:
+        thread.join()
+
+
+def threads() -> int:
+    """Return how many threads share the rows: as many as numba uses (``NUMBA_NUM_THREADS``)."""
+    import numba
+
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined, unused-ignore]
 
 
 @compiled()
-def _median(values: Array, n: int) -> float:  # pragma: no cover - compiled
-    """Return the upper median of the first n values, which are put in another order (Hoare's selection)."""
-    k, low, high = n // 2, 0, n - 1
+def _median(values: Array) -> float:  # pragma: no cover - compiled
+    """Return the upper median of the values (n,), which are put in another order (Hoare's selection)."""
+    k, low, high = len(values) // 2, 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
         i, j = low, high
@@ -82,7 +110,7 @@ def _robust_plane(
                 n += 1
     if n < FEWEST // 4:
         return 0, np.nan, np.nan, np.nan, np.nan
-    sx = _median(room[0], n) / (dx[half_c] - dx[0])
+    sx = _median(room[0, :n]) / (dx[half_c] - dx[0])
     n = 0
     for i in range(half_r):
         for j in range(COLUMNS):
@@ -92,7 +120,7 @@ def _robust_plane(
                 n += 1
     if n < FEWEST // 4:
         return 0, np.nan, np.nan, np.nan, np.nan
-    sy = _median(room[0], n)
+    sy = _median(room[0, :n])
     n = 0
     for i in range(ROWS):
         for j in range(COLUMNS):
@@ -103,25 +131,13 @@ def _robust_plane(
                 n += 1
     if n < FEWEST:
         return n, np.nan, np.nan, np.nan, np.nan
-    height = _median(room[0], n)
+    height = _median(room[0, :n])
     n = 0
     for k in range(POINTS):
         if room[1, k] == room[1, k]:
             room[0, n] = abs(room[1, k] - height)
             n += 1
-    return n, height, sx, sy, 1.4826 * _median(room[0], n)
-
-
-@compiled()
-def block_scales(z: NDArray[np.float32], dx: Array, dy: Array, step: int) -> Array:  # pragma: no cover - compiled
-    """Return the robust scale (m) of every ``step``-th block, NaN where it has too few points."""
-    by, bx = z.shape[0] // ROWS, z.shape[1] // COLUMNS
-    room = np.empty((2, POINTS))
-    scales = np.full((by * bx + step - 1) // step, np.nan)
-    for k in range(scales.size):
-        row, column = (k * step) // bx, (k * step) % bx
-        scales[k] = _robust_plane(z, row * ROWS, column * COLUMNS, dx, dy[row], room)[4]
-    return scales
+    return n, height, sx, sy, 1.4826 * _median(room[0, :n])
 
 
 @compiled(fastmath=FAST)
@@ -289,193 +305,84 @@ def _row_scale(
             if mad == mad:
                 scales[found] = mad
                 found += 1
-        own = _median(scales, found) if found > 0 else scale
+        own = _median(scales[:found]) if found > 0 else scale
         if not own > _OFF * scale:
             return scale
     return own
 
 
-@compiled(fastmath=FAST)
-def _reduce_row(
-    z: NDArray[np.float32], row: int, dx: Array, y: Array, scale: float, out: Array
-) -> None:  # pragma: no cover - compiled
-    """Do the work of `reduce_blocks` for one row of blocks, whose profiles are at ``y`` (4,) about its centre."""
-    bx = out.shape[2]
-    Sxx = ROWS * np.sum(dx * dx)
-    qx = 0.5 * np.sum(dx * dx) / COLUMNS
-    limit = _LIMIT * scale * scale * (POINTS - 3)
-    dx4, pitch = dx.astype(np.float32), dx[1] - dx[0]
-    room = np.empty((2, POINTS))
-    fitted, plane = np.empty(9), np.empty(3)
-    mean_y = np.sum(y) / ROWS
-    Syy = COLUMNS * np.sum((y - mean_y) ** 2)
-    # Response of the height at the nominal centre to dy^2/2, for the profiles where they are.
-    qy = 0.0
-    for i in range(ROWS):
-        qy += (1.0 / ROWS - mean_y * COLUMNS * (y[i] - mean_y) / Syy) * 0.5 * y[i] * y[i]
-    gain = 1.0 / POINTS + mean_y * mean_y / Syy
-    y4, dy4 = (y - mean_y).astype(np.float32), y.astype(np.float32)
-    r0 = row * ROWS
-    sums = np.empty((4, bx), np.float32)
-    _block_sums(z, r0, dx4, y4, sums)
-    scale = _row_scale(z, r0, dx, y, sums, Sxx, Syy, scale, room)
-    limit = _LIMIT * scale * scale * (POINTS - 3)
-    for column in range(bx):
-        c0 = column * COLUMNS
-        base = z[r0 + 1, c0 + 7]
-        S0, S1, S2, SS = sums[0, column], sums[1, column], sums[2, column], sums[3, column]
-        mean, sx, sy = np.float64(S0) / POINTS, np.float64(S1) / Sxx, np.float64(S2) / Syy
-        rest = np.float64(SS) - mean * S0 - sx * S1 - sy * S2
-        if rest < limit:
-            out[0, row, column] = np.float64(base) + mean - sy * mean_y
-            out[1, row, column] = sx
-            out[2, row, column] = sy
-            out[3, row, column] = max(rest, 0.0) / (POINTS - 3)
-            out[4, row, column] = POINTS
-            out[5, row, column] = gain
-            out[6, row, column] = qx
-            out[7, row, column] = qy
-            out[8, row, column] = 0.0
-        else:
-            # Where the blocks on the left lead to: NaN leads nowhere, and medians start.
-            left, bend = max(column - 1, 0), 0.0
-            if column > 1:
-                bend = out[1, row, left] - out[1, row, left - 1]
-                bend = bend if bend == bend else 0.0
-            plane[1] = out[1, row, left] + bend if column else np.nan
-            plane[0] = out[0, row, left] + COLUMNS * pitch * (plane[1] - 0.5 * bend) if column else np.nan
-            plane[2] = out[2, row, left] if column else np.nan
-            _refit(z, r0, c0, dx, y, dx4, dy4, scale, plane, room, fitted)
-            for k in range(9):
-                out[k, row, column] = fitted[k]
-
-
-@compiled(parallel=True, fastmath=FAST)
-def reduce_blocks(
-    z: NDArray[np.float32], dx: Array, dy: Array, scale: float, out: Array
-) -> None:  # pragma: no cover - compiled
-    """Reduce a height map to blocks in one pass; blocks that a plane does not explain are fitted again, robustly.
+def reduce_blocks(z: NDArray[np.float32], dx: Array, dy: Array, usual: float) -> Array:
+    """Return a height map reduced to blocks; blocks that a plane does not explain are fitted robustly.
 
     Parameters
     ----------
     z : ndarray (row, column), float32
         Heights, m; NaN where there is none.
     dx : ndarray (16,)
-        Places of a block's points about its centre, m.
+        Positions of a block's points about its centre, m.
     dy : ndarray (block row, 4)
-        Places of its profiles about its centre, m.
-    scale : float
+        Positions of its profiles about its centre, m.
+    usual : float
         Scatter of the points about the plane of a good block, m.
-    out : ndarray (9, block row, block column)
-        Receives height at the centre, both slopes, variance about the plane, points used, variance of the height in
-        units of a point's variance, response of the height to dx^2/2, dy^2/2, dx dy. NaN where a block says nothing.
-    """
-    for row in numba.prange(out.shape[1]):
-        _reduce_row(z, row, dx, dy[row], scale, out)
-
-
-@compiled(fastmath=FAST)
-def sharpen(
-    maps: Array, pitch_x: float, pitch_y: float, bends: Array, height: Array, scatter: Array
-) -> None:  # pragma: no cover - compiled
-    """Take out what curvature adds to the blocks' means and to the scatter of their points.
-
-    Second differences go on as straight lines at both ends.
-
-    Parameters
-    ----------
-    maps : ndarray (9, block row, block column)
-        Columns of `reduce_blocks`, holes in means and slopes filled; no points where a block says nothing.
-    pitch_x, pitch_y : float
-        Distance of the blocks, m.
-    bends : ndarray (3,)
-        Variance about its plane of a block with z = dx^2 / 2, dy^2 / 2, dx dy.
-    height, scatter : ndarray (block row, block column)
-        Receive heights of the surface, m, and variances, m^2, that are noise.
-    """
-    by, bx = height.shape
-    for row in range(by):
-        # Coefficients of the second difference along y over four rows.
-        if row == 0:
-            k0, k1, k2, k3, a, b, c, d = 0, 1, 2, 3, 2.0, -5.0, 4.0, -1.0
-        elif row == by - 1:
-            k0, k1, k2, k3, a, b, c, d = by - 1, by - 2, by - 3, by - 4, 2.0, -5.0, 4.0, -1.0
-        else:
-            k0, k1, k2, k3, a, b, c, d = row - 1, row, row + 1, row, 1.0, -2.0, 1.0, 0.0
-        m0, m1, m2, m3, z = maps[0, k0], maps[0, k1], maps[0, k2], maps[0, k3], maps[0, row]
-        low, high = max(row - 1, 0), min(row + 1, by - 1)
-        s0, s1, step = maps[1, low], maps[1, high], 1.0 / ((high - low) * pitch_y)
-        qx, qy, qxy, points, found = maps[6, row], maps[7, row], maps[8, row], maps[4, row], maps[3, row]
-        along = np.empty(bx)
-        for j in range(1, bx - 1):
-            along[j] = z[j - 1] - 2.0 * z[j] + z[j + 1]
-        along[0], along[bx - 1] = 2.0 * along[1] - along[2], 2.0 * along[bx - 2] - along[bx - 3]
-        fx, fy = 1.0 / pitch_x**2, 1.0 / pitch_y**2
-        out, rest = height[row], scatter[row]
-        for j in range(bx):
-            zxx, zyy = fx * along[j], fy * (a * m0[j] + b * m1[j] + c * m2[j] + d * m3[j])
-            zxy = step * (s1[j] - s0[j])
-            out[j] = z[j] - (qx[j] * zxx + qy[j] * zyy + qxy[j] * zxy if points[j] > 0 else 0.0)
-            rest[j] = found[j] - (zxx * zxx * bends[0] + zyy * zyy * bends[1] + zxy * zxy * bends[2])
-
-
-@compiled()
-def spread(height: Array, sx: Array, sy: Array, pitch_x: float, pitch_y: float) -> int:  # pragma: no cover - compiled
-    """Fill blocks without height (NaN) from their neighbours' planes, outwards from the known, then smooth the filled.
 
     Returns
     -------
-    int
-        How many were filled.
+    ndarray (9, block row, block column)
+        Height at the centre, both slopes, variance about the plane, points used, variance of the height in units of a
+        point's variance, response of the height to dx^2/2, dy^2/2, dx dy. NaN where a block is dropped.
     """
-    by, bx = height.shape
-    lost = np.argwhere(np.isnan(height))
-    if len(lost) == 0 or len(lost) == by * bx:
-        return len(lost)
-    known = ~np.isnan(height)
-    waiting, left = lost, len(lost)
-    while left > 0:
-        order = np.empty((left, 2), np.int64)
-        filled = np.empty((left, 3))
-        n, rest = 0, 0
-        for k in range(left):
-            i, j = waiting[k, 0], waiting[k, 1]
-            count, h, gx, gy = 0, 0.0, 0.0, 0.0
-            for p in range(max(i - 1, 0), min(i + 2, by)):
-                for q in range(max(j - 1, 0), min(j + 2, bx)):
-                    if known[p, q]:
-                        h += height[p, q] + sx[p, q] * (j - q) * pitch_x + sy[p, q] * (i - p) * pitch_y
-                        gx += sx[p, q]
-                        gy += sy[p, q]
-                        count += 1
-            if count:
-                order[n, 0], order[n, 1] = i, j
-                filled[n, 0], filled[n, 1], filled[n, 2] = h / count, gx / count, gy / count
-                n += 1
+    mean = dy.mean(axis=1, keepdims=True)
+    centred, Sxx = dy - mean, ROWS * float(dx @ dx)
+    Syy = COLUMNS * np.sum(centred**2, axis=1, keepdims=True)
+    # Response of the height at the nominal centre to dy^2/2, for the profiles where they are.
+    qy = np.sum((1.0 / ROWS - mean * COLUMNS * centred / Syy) * 0.5 * dy**2, axis=1, keepdims=True)
+    of_row = np.hstack([mean, Syy, 1.0 / POINTS + mean**2 / Syy, qy])
+    out = np.empty((9, len(dy), z.shape[1] // COLUMNS))
+    single = (each.astype(np.float32) for each in (dx, dy, centred))
+    in_threads(_reduce_rows, len(dy), z.size, z, dx, dy, *single, of_row, Sxx, usual, out)
+    return out
+
+
+@compiled(fastmath=FAST)
+def _reduce_rows(
+    z: NDArray[np.float32], dx: Array, dy: Array, dx4: NDArray[np.float32], dy4: NDArray[np.float32],
+    centred4: NDArray[np.float32], of_row: Array, Sxx: float, usual: float, out: Array, first: int, last: int,
+) -> None:  # fmt: skip  # pragma: no cover - compiled
+    """Do the work of `reduce_blocks` for the rows of blocks from ``first`` to before ``last``."""
+    bx, pitch, qx = out.shape[2], dx[1] - dx[0], 0.5 * Sxx / POINTS
+    room, fitted, plane = np.empty((2, POINTS)), np.empty(9), np.empty(3)
+    sums = np.empty((4, bx), np.float32)
+    for row in range(first, last):
+        mean_y, Syy, gain, qy = of_row[row, 0], of_row[row, 1], of_row[row, 2], of_row[row, 3]
+        r0 = row * ROWS
+        _block_sums(z, r0, dx4, centred4[row], sums)
+        scale = _row_scale(z, r0, dx, dy[row], sums, Sxx, Syy, usual, room)
+        limit = _LIMIT * scale * scale * (POINTS - 3)
+        for column in range(bx):
+            c0 = column * COLUMNS
+            base = z[r0 + 1, c0 + 7]
+            S0, S1, S2, SS = sums[0, column], sums[1, column], sums[2, column], sums[3, column]
+            mean, sx, sy = np.float64(S0) / POINTS, np.float64(S1) / Sxx, np.float64(S2) / Syy
+            rest = np.float64(SS) - mean * S0 - sx * S1 - sy * S2
+            if rest < limit:
+                out[0, row, column] = np.float64(base) + mean - sy * mean_y
+                out[1, row, column] = sx
+                out[2, row, column] = sy
+                out[3, row, column] = max(rest, 0.0) / (POINTS - 3)
+                out[4, row, column] = POINTS
+                out[5, row, column] = gain
+                out[6, row, column] = qx
+                out[7, row, column] = qy
+                out[8, row, column] = 0.0
             else:
-                waiting[rest, 0], waiting[rest, 1] = i, j
-                rest += 1
-        for k in range(n):
-            i, j = order[k, 0], order[k, 1]
-            height[i, j], sx[i, j], sy[i, j] = filled[k, 0], filled[k, 1], filled[k, 2]
-            known[i, j] = True
-        left = rest
-    return len(lost)
-
-
-@compiled()
-def relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:  # pragma: no cover - compiled
-    """Bend the filled blocks so that fourth differences vanish along rows and columns (Gauss-Seidel)."""
-    by, bx = height.shape
-    for _ in range(sweeps):
-        for k in range(len(filled)):
-            i, j = filled[k, 0], filled[k, 1]
-            total, count = 0.0, 0
-            if 2 <= i < by - 2:
-                total += 4.0 * (height[i - 1, j] + height[i + 1, j]) - height[i - 2, j] - height[i + 2, j]
-                count += 6
-            if 2 <= j < bx - 2:
-                total += 4.0 * (height[i, j - 1] + height[i, j + 1]) - height[i, j - 2] - height[i, j + 2]
-                count += 6
-            if count:
-                height[i, j] = total / count
+                # Where the blocks on the left lead to: NaN leads nowhere, and medians start.
+                left, bend = max(column - 1, 0), 0.0
+                if column > 1:
+                    bend = out[1, row, left] - out[1, row, left - 1]
+                    bend = bend if bend == bend else 0.0
+                plane[1] = out[1, row, left] + bend if column else np.nan
+                plane[0] = out[0, row, left] + COLUMNS * pitch * (plane[1] - 0.5 * bend) if column else np.nan
+                plane[2] = out[2, row, left] if column else np.nan
+                _refit(z, r0, c0, dx, dy[row], dx4, dy4[row], scale, plane, room, fitted)
+                for k in range(9):
+                    out[k, row, column] = fitted[k]

@@ -28,7 +28,6 @@ from errormotion.methods.crossbeam_scan.identification.registration.solver impor
     solve,
 )
 from errormotion.methods.crossbeam_scan.identification.registration.start import Start, descend, search
-from errormotion.methods.crossbeam_scan.identification.registration.sums import within
 
 Backend = Literal["height_map", "open3d_plane", "paper"]
 
@@ -120,13 +119,13 @@ def register(
     C = _covariance(problem, found, found.noise, free)
     share = _cold_share(problem, warm, found, free, C)
     C = terms.moved(_unknown(C + np.outer(missed, missed), free), at - problem.centre)
-    square, used, points = within(sums.residual, warm.points, found.gate)
+    used = np.abs(sums.residual) < found.gate
     if rms is None:
-        rms = float(np.sqrt(square / used))
+        rms = float(np.sqrt(np.mean(sums.residual[used] ** 2)))
     return Registration(
         backend=registration, pose=terms.pose_about(state.pose, state.values, at - problem.centre), point=at,
         covariance=C[:6, :6], residual=sums.residual, x=warm.x, y=warm.y,
-        rms=rms, points=int(points), noise=(cold.noise, warm.noise),
+        rms=rms, points=int(warm.points[used].sum()), noise=(cold.noise, warm.noise),
         line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
         condition=free.condition, loose=free.loose, iterations=found.steps,
         extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,

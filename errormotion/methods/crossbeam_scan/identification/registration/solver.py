@@ -25,24 +25,18 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap
+from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap, some_of, upper_median
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import (
     accumulate,
-    accumulate_shared,
-    advance,
     lag_sums,
-    line_gains,
-    line_moments,
 )
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import scales
-from errormotion.methods.crossbeam_scan.identification.registration.sums import median_size_of_some
+from errormotion.methods.crossbeam_scan.identification.registration.kernels import in_threads
 
 NONE = Extra.of(None)
 LINE = [2, 1]
 """Columns of J that are the line effects: 1 and, but for its sign, Sy."""
-MANY = 10000
-"""More blocks than these are shared out to several threads."""
 LAGS = 2
 _NEIGHBOURS = (2 * LAGS + 1) ** 2
 _EM_STEPS = 25
@@ -82,8 +76,8 @@ class Problem:
         residual, weight = np.empty((2, *self.stack.shape[1:]))
         rows = np.empty((len(self.y), n * n + n + 3))
         surface = self.cold.surface
-        work = accumulate_shared if residual.size > MANY else accumulate
-        work(
+        in_threads(
+            accumulate, len(self.y), residual.size,
             self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, surface.coefficients,
             self.cold.variance, surface.grid, gate, residual, weight, rows,
         )  # fmt: skip
@@ -93,10 +87,14 @@ class Problem:
     def after(self, state: State, sums: Sums, step: Array) -> Sums:
         """Return the sums at a state after a step (6 + k,) so short that residuals change in proportion."""
         matrix, normal = self.map(state)
-        advance(
-            self.stack, self.x, self.y, matrix, normal, self.centre, self.extra.bases, self.cold.surface.grid,
-            step, sums.residual,
-        )  # fmt: skip
+        height, slope_x, slope_y = self.stack[:3].reshape(3, -1)
+        x, y = (each.ravel() for each in np.meshgrid(self.x, self.y))
+        points = matrix[:, :3] @ np.stack([x, y, height]) + (matrix[:, 3] - self.centre)[:, None]
+        turned = normal @ np.stack([-slope_x, -slope_y, np.ones_like(x)])
+        moved = np.tensordot(step, self.extra.motions[: len(step)], 1)
+        shift = moved[:, 1:] @ points + moved[:, :1]
+        change = np.sum(turned * shift, axis=0) / turned[2]
+        sums.residual[:] += change.reshape(sums.residual.shape)
         along = sums.A @ step
         return replace(sums, g=sums.g + along, square=sums.square + (2 * sums.g + along) @ step)
 
@@ -180,7 +178,7 @@ class Sums:
 
     def scale(self) -> float:
         """Return the robust standard deviation of the residuals about zero, m; infinite where there are none."""
-        found = 1.4826 * median_size_of_some(self.residual.reshape(-1), self.residual.size // _FEW | 1)
+        found = 1.4826 * upper_median(np.abs(some_of(self.residual, _FEW)))
         return found if found == found else np.inf
 
 
@@ -193,7 +191,15 @@ class Noise:
 
     def gains(self, A: Array) -> Array:
         """Return K of every row, (row, 2, 2)."""
-        return line_gains(np.ascontiguousarray(A[:, LINE][:, :, LINE]), self.k, *self.tau)
+        first, mixed, last = line_gain(A[:, LINE][:, :, LINE], self.k, *self.tau)
+        return np.stack([np.stack([first, mixed], axis=-1), np.stack([mixed, last], axis=-1)], axis=-1)
+
+
+def line_gain(C: Array, k: float, s: float, t: float) -> tuple[Array, Array, Array]:
+    """Return K00, K01 and K11 of every line (line,), with T = diag(s, t): what takes its sums to its effects."""
+    first, last, mixed = k + s * s * C[:, 0, 0], k + t * t * C[:, 1, 1], s * t * C[:, 0, 1]
+    determinant = first * last - mixed * mixed
+    return s * s * last / determinant, -s * t * mixed / determinant, t * t * first / determinant
 
 
 def normal_equations(sums: Sums, noise: Noise) -> tuple[Array, Array]:
@@ -262,7 +268,9 @@ def estimate_noise(problem: Problem, state: State, sums: Sums, line_effects: boo
 def _maximised(C: Array, u: Array, k: float, tau: Array) -> Array:
     """Return the standard deviations of the line effects after some steps of expectation and maximisation."""
     for _ in range(_EM_STEPS):
-        tau = np.sqrt(line_moments(C, u, k, *tau) / len(u))
+        K00, K01, K11 = line_gain(C, k, *tau)
+        effects = np.stack([K00 * u[:, 0] + K01 * u[:, 1], K01 * u[:, 0] + K11 * u[:, 1]])
+        tau = np.sqrt(np.mean(effects**2 + k * np.stack([K00, K11]), axis=1))
     return tau
 
 

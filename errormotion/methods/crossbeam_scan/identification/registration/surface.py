@@ -84,6 +84,68 @@ def repaired(height: Array, slope_x: Array, slope_y: Array, pitch_x: float, pitc
     if len(lost) == 0:
         return height, slope_x, slope_y
     height, slope_x, slope_y = height.copy(), slope_x.copy(), slope_y.copy()
-    kernels.spread(height, slope_x, slope_y, pitch_x, pitch_y)
-    kernels.relax(height, lost, SWEEPS)
+    _spread(height, slope_x, slope_y, pitch_x, pitch_y)
+    _relax(height, lost, SWEEPS)
     return height, slope_x, slope_y
+
+
+@kernels.compiled()
+def _spread(height: Array, sx: Array, sy: Array, pitch_x: float, pitch_y: float) -> int:  # pragma: no cover - compiled
+    """Fill blocks without height (NaN) from their neighbours' planes, outwards from the known, then smooth the filled.
+
+    Returns
+    -------
+    int
+        How many were filled.
+    """
+    by, bx = height.shape
+    lost = np.argwhere(np.isnan(height))
+    if len(lost) == 0 or len(lost) == by * bx:
+        return len(lost)
+    known = ~np.isnan(height)
+    waiting, left = lost, len(lost)
+    while left > 0:
+        order = np.empty((left, 2), np.int64)
+        filled = np.empty((left, 3))
+        n, rest = 0, 0
+        for k in range(left):
+            i, j = waiting[k, 0], waiting[k, 1]
+            count, h, gx, gy = 0, 0.0, 0.0, 0.0
+            for p in range(max(i - 1, 0), min(i + 2, by)):
+                for q in range(max(j - 1, 0), min(j + 2, bx)):
+                    if known[p, q]:
+                        h += height[p, q] + sx[p, q] * (j - q) * pitch_x + sy[p, q] * (i - p) * pitch_y
+                        gx += sx[p, q]
+                        gy += sy[p, q]
+                        count += 1
+            if count:
+                order[n, 0], order[n, 1] = i, j
+                filled[n, 0], filled[n, 1], filled[n, 2] = h / count, gx / count, gy / count
+                n += 1
+            else:
+                waiting[rest, 0], waiting[rest, 1] = i, j
+                rest += 1
+        for k in range(n):
+            i, j = order[k, 0], order[k, 1]
+            height[i, j], sx[i, j], sy[i, j] = filled[k, 0], filled[k, 1], filled[k, 2]
+            known[i, j] = True
+        left = rest
+    return len(lost)
+
+
+@kernels.compiled()
+def _relax(height: Array, filled: NDArray[np.int64], sweeps: int) -> None:  # pragma: no cover - compiled
+    """Bend the filled blocks so that fourth differences vanish along rows and columns (Gauss-Seidel)."""
+    by, bx = height.shape
+    for _ in range(sweeps):
+        for k in range(len(filled)):
+            i, j = filled[k, 0], filled[k, 1]
+            total, count = 0.0, 0
+            if 2 <= i < by - 2:
+                total += 4.0 * (height[i - 1, j] + height[i + 1, j]) - height[i - 2, j] - height[i + 2, j]
+                count += 6
+            if 2 <= j < bx - 2:
+                total += 4.0 * (height[i, j - 1] + height[i, j + 1]) - height[i, j - 2] - height[i, j + 2]
+                count += 6
+            if count:
+                height[i, j] = total / count

@@ -19,8 +19,6 @@ _SOME = 1000
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
-
 WEAK = 10.0
 """So many times as uncertain as the middle one, the stations known. Of m targets one of sqrt(m) times is harmless to
 the datum, so that the limit is half of this where it is larger."""
