@@ -131,7 +131,7 @@ class Crossbeam:
             Z of the tool frame relative to the cut, m.
         """
         poses = np.tile(self.pose, (np.size(along), 1, 1))
-        poses[:, 1, 3] += along
+        poses[:, 1, 3] += np.asarray(along, dtype=float)
         poses[:, 2, 3] += lift
         return poses
 

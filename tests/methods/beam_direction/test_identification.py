@@ -370,7 +370,11 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
     calibrate(holed).save(tmp_path / "holed.nc")
     raw = simulation.raw(machine, FOUR, seed=0)
     file = str(tmp_path / "holed.nc")
-    refused(raw, r"Plane 2: Calibration 'holed': .* in a hole between the calibrated settings; nearest calibrated", compensation=file)
+    refused(
+        raw,
+        r"Plane 2: Calibration 'holed': .* in a hole between the calibrated settings; nearest calibrated",
+        compensation=file,
+    )
     errors = identify(raw, compensation=file, extrapolate=True)
     assert "Plane 2: extrapolated. Calibration 'holed' does not speak for" in notes(errors)
     assert "Plane 1: extrapolated" not in notes(errors)
