@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
 from errormotion.errors import BenchError
+from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
 
 log = logging.getLogger(__name__)
@@ -95,6 +96,7 @@ class OpenBench:
 
     def try_open(self) -> None:
         """Open what can be opened; ``answers`` says what could not."""
+        describe(self.description)
         for instrument in self.plan.instruments:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)

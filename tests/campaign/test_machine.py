@@ -9,7 +9,8 @@ from errormotion import datasets, plugins
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.campaign.runner import run
-from errormotion.errors import BenchError
+from errormotion.errors import BenchError, InstrumentError
+from errormotion.instruments import simulators
 from errormotion.kinematics.description import MachineDescription
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Lab"\n'
@@ -165,3 +166,36 @@ def test_settings_that_contradict_the_machine_are_refused_when_the_campaign_is_r
     )
     bench(tmp_path, 'machine = "Mill"\n')  # nothing is known of the machine: nothing contradicts it
     assert load_campaign(path).tests[0].settings.level == 0.025
+
+
+CONTROL = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://machine/controller?seed=5"\n'
+
+
+def test_the_simulated_control_moves_the_machine_of_the_bench(tmp_path: Path) -> None:
+    plan = load_bench(bench(tmp_path, MACHINE + CONTROL))
+    with OpenBench(plan) as opened:
+        here = simulators.world("machine", seed=5).machine
+        assert here.description == plan.description
+        assert here.geometry.machine.chain == "workpiece-C-X-Y-bed-Z-spindle-tool"
+        control = opened.of_kind("controller")
+        control.move_to([0.29, 0.0, 0.45])
+        with pytest.raises(InstrumentError, match="X"):
+            control.move_to([0.31, 0.0, 0.45])
+    wider = load_bench(bench(tmp_path, MACHINE.replace('"300 mm"', '"400 mm"') + CONTROL))
+    with OpenBench(wider) as opened:  # another machine, though the address is the same
+        opened.of_kind("controller").move_to([0.31, 0.0, 0.45])
+
+
+@pytest.mark.parametrize(
+    ("machine", "text"),
+    [
+        ('machine = "Mill"\n', r"expected a table \[machine\] in the bench file; found none"),
+        (
+            MACHINE.replace(', fixed = "90 deg"', "").replace("travel = {", 'travel = { C = ["0 deg", "90 deg"],'),
+            "X, Y, Z, C",
+        ),
+    ],
+)
+def test_a_machine_that_cannot_be_simulated_over_the_wire_is_refused(tmp_path: Path, machine: str, text: str) -> None:
+    with pytest.raises(BenchError, match=text), OpenBench(load_bench(bench(tmp_path, machine + CONTROL))):
+        pass
