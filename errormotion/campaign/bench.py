@@ -12,6 +12,7 @@ from typing import Any, Self
 from errormotion.campaign.files import BenchInstrument, BenchPlan
 from errormotion.campaign.journal import cause_of
 from errormotion.errors import BenchError
+from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
 
 log = logging.getLogger(__name__)
@@ -95,7 +96,12 @@ class OpenBench:
             raise BenchError("\n".join([head, *tree([answer.line() for answer in self.answers])]))
 
     def try_open(self) -> None:
+<<<<<<< HEAD
         """Open all instruments; ``answers`` contains the failures."""
+=======
+        """Open what can be opened; ``answers`` says what could not."""
+        describe(self.description)
+>>>>>>> machine
         for instrument in self.plan.instruments:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
-from errormotion.campaign.machine import limits_within, read_machine
+from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.datasets import tomlfile
 from errormotion.datasets.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
@@ -251,17 +251,12 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         raise BenchError(tomlfile.report(source, mistakes))
     if bench is None:
         raise BenchError("")
-    tests = tuple(
-        TestPlan(
-            test.name,
-            plugins.get("methods", test.method),
-            _settings("methods", test.method, test.settings, ())[0],
-            test.inputs,
-            test.instruments,
-        )
-        for test in table.test
-    )
-    return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text, source.parent.resolve())
+    tests = []
+    for test in table.test:
+        method = plugins.get("methods", test.method)
+        settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
+    return CampaignPlan(table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve())
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:
@@ -309,11 +304,16 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
                     f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs one {kind}; the bench "
                     f'{bench.source} offers {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
                 )
-        mistakes += _machine_mistakes(entry["method"], found, bench, place)
+        method = plugins.get("methods", entry["method"])
+        found = completed(method, found, bench.description)
+        for key, text in contradictions(method, found, bench.description).items():
+            where = tomlfile.dotted((*place, "settings", *([key] if key else [])))
+            mistakes.append(f"{where}: {text} ([machine] of {bench.source})")
         mistakes += _limit_mistakes(entry["method"], found, bench, place)
     return mistakes
 
 
+<<<<<<< HEAD
 def _machine_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> Iterator[str]:
     """Yield the settings that contradict the machine of the bench."""
     check = getattr(plugins.get("methods", method)(), "check_machine", None)
@@ -322,6 +322,8 @@ def _machine_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple
             yield f"{tomlfile.dotted((*place, 'settings', key))}: {text} ([machine] of {bench.source})"
 
 
+=======
+>>>>>>> machine
 def _choice_mistakes(choice: Any, place: tuple[str | int, ...], bench: BenchPlan) -> list[str] | None:
     """Return the selected instruments that are not on the bench; None if the selection is not a table of names."""
     if not isinstance(choice, dict) or not all(isinstance(name, str) for name in choice.values()):

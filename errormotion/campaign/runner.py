@@ -272,6 +272,8 @@ class _Session:
         log.info("acquire", extra={"data": {"test": test.name, "method": method.info.id, "samples": before}})
         self.progress.stage("measuring", expected)
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
+        if bench.description is not None:
+            attrs["chain"] = bench.description.moving_chain
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
