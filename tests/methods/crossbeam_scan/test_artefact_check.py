@@ -149,7 +149,7 @@ def test_a_cold_scan_that_does_not_repeat_is_named(machine, raw):
 
 def test_three_artefacts_cannot_tell_and_say_so(raw):
     ds = identify(raw.isel(artefact=[0, 3, 6]))
-    assert named(ds, "Too few artefacts to tell by the others whether one has moved: four are needed.")
+    assert named(ds, "Too few artefacts to detect one that moved: at least four are needed.")
     assert not ds["moved"].any()
 
 
