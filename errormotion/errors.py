@@ -1,6 +1,6 @@
 """Every exception that a user may meet, from one root.
 
-A message says what was expected, what came, and what to do. A traceback is for the log.
+A message states what was expected, what was found, and what to do. A traceback belongs in the log.
 """
 
 
@@ -9,7 +9,7 @@ class ErrormotionError(Exception):
 
 
 class InstrumentError(ErrormotionError):
-    """An instrument did not do what it was asked to."""
+    """An instrument failed, or refused a request."""
 
 
 class InstrumentTimeoutError(InstrumentError):
@@ -41,7 +41,7 @@ class DatasetError(ErrormotionError):
 
 
 class FitError(ErrormotionError):
-    """Geometry that does not determine what was asked for."""
+    """Geometry that does not determine the result."""
 
 
 class MethodError(ErrormotionError):
@@ -57,4 +57,4 @@ class RunError(ErrormotionError):
 
 
 class PluginError(ErrormotionError):
-    """A plugin is unknown, broken, or not what it says."""
+    """A plugin is unknown or broken."""

@@ -76,8 +76,8 @@ def draw_change(figure: Figure, ax: Axes, machine: VirtualMachine) -> None:
 def pocket_scan(machine: VirtualMachine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return x, heights (line, point) and the feed of a real scan of the pocket."""
     feed = (np.arange(400) - 199.5) * 70e-6 - machine.crossbeam.pose[1, 3]
-    scans, _, _ = machine.crossbeam.pocket_scans(circular_pocket(), Profiler(), feed, np.array([0.174]), (3,))
-    return Profiler().x, scans[0], feed
+    poses = machine.crossbeam.pocket_lines(feed, 0.174)
+    return Profiler().x, Profiler().scan(circular_pocket(), poses, key=(3, 0)), feed
 
 
 def draw_pocket(figure: Figure, ax: Axes, machine: VirtualMachine) -> None:
@@ -94,8 +94,7 @@ def draw_rim(ax: Axes, machine: VirtualMachine) -> None:
     feed = np.array([0.0, 70e-6])
     for disturbances, colour, size, label in ((PERFECT, GREY, 5, "perfect"), (Disturbances(), BLUE, 3, "real")):
         profiler = Profiler(disturbances=disturbances)
-        scans, _, _ = machine.crossbeam.pocket_scans(circular_pocket(), profiler, feed, np.array([0.174]), (8,))
-        z = scans[0, 0]
+        z = profiler.scan(circular_pocket(), machine.crossbeam.pocket_lines(feed, 0.174), key=(8, 0))[0]
         if colour == GREY:
             left, step = profiler.x[:1600], np.argmin(np.diff(z[:1600]))
             top = z[step - 8]

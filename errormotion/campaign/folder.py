@@ -15,7 +15,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
-from errormotion.campaign.store import replace_text
 from errormotion.datasets.provenance import plain
 from errormotion.errors import RunError
 
@@ -169,3 +168,13 @@ def list_runs(runs: Path) -> list[RunFolder]:
 def now() -> str:
     """Return the present time in UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
+    part = path.with_name(f"{path.name}.part")
+    with part.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)

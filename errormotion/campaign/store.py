@@ -23,6 +23,7 @@ import zarr
 from xarray.conventions import encode_cf_variable
 from zarr.codecs import BloscCodec
 
+from errormotion.campaign.folder import replace_text
 from errormotion.errors import RunError
 
 BLOCK_BYTES = 24 * 2**20
@@ -102,10 +103,15 @@ class RawStore:
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
-        for name, stored in skeleton.variables.items():
-            if stored.dtype.kind == "U":
-                skeleton[name] = stored.astype(np.dtypes.StringDType())
-            skeleton[name].encoding = {}
+        # Objects become texts of free length with every version of xarray; an empty array of objects has no type.
+        texts = {
+            name: variable.astype(object if variable.size else np.dtypes.StringDType())
+            for name, variable in skeleton.variables.items()
+            if variable.dtype.kind == "U"
+        }
+        coordinates = [name for name in texts if name in skeleton.coords]
+        skeleton = skeleton.drop_indexes([name for name in coordinates if name in skeleton.xindexes])
+        skeleton = skeleton.assign(texts).set_coords(coordinates).drop_encoding()
         for name, variable in growing.items():
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]
@@ -286,16 +292,6 @@ def committed_length(path: Path, dim: str) -> int:
 
 def _dims(metadata: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(metadata.get("dimension_names") or ())  # a scalar has none
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file under a temporary name, synchronise it to disk, and rename it."""
-    part = path.with_name(f"{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
 
 
 def _sync(path: Path) -> None:

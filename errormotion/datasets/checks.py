@@ -51,7 +51,7 @@ def _range(row: Row) -> str:
 
 def _guess(value: float, row: Row) -> str:
     mistakes = _MISTAKES.get(row.unit, ())
-    # Where a whole turn is plausible nobody writes seconds of arc.
+    # Where a whole turn is plausible, the value is not in seconds of arc.
     for factor, offset, unit in mistakes[::-1] if row.unit == "rad" and row.high > 1 else mistakes:
         if row.low <= value * factor + offset <= row.high:
             return f"; is it in {unit}?"

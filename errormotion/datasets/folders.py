@@ -1,4 +1,4 @@
-"""Where files are looked for that settings name: beside the file that holds the settings."""
+"""Folders in which files are searched that settings name: first the folder of the file with the settings."""
 
 from __future__ import annotations
 

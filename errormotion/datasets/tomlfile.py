@@ -1,4 +1,4 @@
-"""Files that a person writes: TOML checked by a pydantic model, and every mistake told at once.
+"""Files that a person writes: TOML checked by a pydantic model, and all mistakes reported together.
 
 Each mistake names the file, the dotted key, what was expected, what was found, and for an unknown key the nearest
 known one.
@@ -108,7 +108,7 @@ def check(
     model : type of BaseModel
         What it must hold.
     prefix : sequence of str or int
-        Where ``data`` stands in its file, for the dotted keys of the messages.
+        Position of ``data`` in its file, for the dotted keys of the messages.
     edge : bool
         A person wrote it: bare numbers are refused where a unit belongs.
     """
@@ -153,9 +153,9 @@ def _mistake(details: ErrorDetails, model: type[BaseModel], prefix: Sequence[Key
     if kind == "quantity":
         return f"{place}: {message}"
     if kind in ("value_error", "assertion_error"):
-        told = message.partition(", ")[2]
-        complete = isinstance(found, Mapping) or "; found" in told  # of a whole table, or in its own words
-        return f"{place}: {told}" if complete else f"{place}: {told}; found {_short(found)}"
+        text = message.partition(", ")[2]
+        complete = isinstance(found, Mapping) or "; found" in text  # of a whole table, or in its own words
+        return f"{place}: {text}" if complete else f"{place}: {text}; found {_short(found)}"
     expected = _EXPECTED.get(kind) or message.removeprefix("Input should be ")
     if expected.startswith(("greater", "less")):
         expected = f"a value {expected}"
@@ -223,13 +223,13 @@ def _step(annotations: Sequence[Any], key: Key) -> list[Any]:
 
 
 def _has_tag(model: type[BaseModel], key: Key) -> bool:
-    """Whether pydantic calls this member of a union by ``key``: by its name, or by what its discriminator says."""
+    """Whether pydantic calls this member of a union by ``key``: by its name or its discriminator."""
     tags = [tag for field in model.model_fields.values() for tag in get_args(field.annotation)]
     return key == model.__name__ or key in tags
 
 
 def _walk(model: type[BaseModel], path: Sequence[Key]) -> tuple[list[Any], list[Key]]:
-    """Return what may stand at a path, and the path without pydantic's tags for members of unions."""
+    """Return what is allowed at a path, and the path without pydantic's tags for members of unions."""
     here: list[Any] = [model]
     kept: list[Key] = []
     for key in path:

@@ -60,7 +60,7 @@ class Quantity:
     example: str
 
     def parse(self, text: str) -> float:
-        """Return the value of a text such as ``"5 mm"``; ValueError says what was expected."""
+        """Return the value of a text such as ``"5 mm"``; ValueError states what was expected."""
         match = _QUANTITY.fullmatch(text)
         expected = f"expected {self.kind} with its unit, such as '{self.example}'; found '{text}'"
         if match is None:

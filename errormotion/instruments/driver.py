@@ -15,7 +15,7 @@ from errormotion.plugins import InstrumentInfo, PluginSettings
 class Driver:
     """Base of drivers with one transport.
 
-    A subclass has ``info`` and ``Settings``, says hello in ``_begin`` and goodbye in ``_end``, and talks through
+    A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and uses
     ``self.transport``.
 
     Parameters
@@ -47,18 +47,18 @@ class Driver:
         return self._transport
 
     def open(self) -> None:
-        """Open the connection and greet the device; idempotent.
+        """Open the connection and check the device; idempotent.
 
         Raises
         ------
         InstrumentError
-            Nobody there, or not the expected device.
+            No device answers, or not the expected device.
         """
         if self._transport is not None:
             return
         self._transport = self._connect()
         try:
-            self._begin()
+            self._start_session()
         except BaseException:
             self._drop()
             raise
@@ -68,7 +68,7 @@ class Driver:
         if self._transport is None:
             return
         try:
-            self._end()
+            self._end_session()
         finally:
             transport, self._transport = self._transport, None
             transport.close()
@@ -83,17 +83,17 @@ class Driver:
         if kind is None:
             self.close()
             return
-        with suppress(InstrumentError):  # what happened inside says more than that closing fails as well
+        with suppress(InstrumentError):  # the first error states the cause
             self.close()
 
     def _connect(self) -> Transport:
         return open_transport(self.address, simulator=self.info.simulator, recorder=self._record)
 
-    def _begin(self) -> None:
-        """Greet the device right after connecting."""
+    def _start_session(self) -> None:
+        """Check the device right after connecting."""
 
-    def _end(self) -> None:
-        """Leave the device in order right before closing."""
+    def _end_session(self) -> None:
+        """Stop the device right before closing."""
 
     def _drop(self) -> None:
         transport, self._transport = self._transport, None

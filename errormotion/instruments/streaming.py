@@ -2,7 +2,7 @@
 
 The thread takes bytes off the transport, has them decoded, and queues the samples. When the queue is full the thread
 waits, if the transport holds the device back; if it does not (a serial line) the samples are thrown away, counted,
-and appear as lost. Nothing vanishes in silence.
+and appear as lost. No sample is lost without being counted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import Transport
 
-POLL = 0.1
+POLL_INTERVAL = 0.1
 """Seconds after which the thread looks whether it shall end."""
 
 Array = np.ndarray[Any, Any]
@@ -73,7 +73,7 @@ class Reader:
     name : str
         Of the instrument, for messages.
     limit : int
-        Samples in the queue at which the thread begins to wait.
+        Samples in the queue at which the thread starts to wait.
     overrun : int
         Reason code of samples that were thrown away.
     prompt : bytes
@@ -91,7 +91,7 @@ class Reader:
         self._prompt = prompt
         self._queue: deque[_Entry] = deque()
         self._queued = 0
-        self._handed_over = 0
+        self._delivered = 0
         self._text = b""
         self._reply: bytes | None = None
         self._listening = False
@@ -112,7 +112,7 @@ class Reader:
         Raises
         ------
         InstrumentTimeoutError
-            The device was silent for ``timeout`` s while samples were missing.
+            The device sent no data for ``timeout`` s while samples were missing.
         InstrumentError
             Whatever ended the thread.
         """
@@ -136,8 +136,8 @@ class Reader:
             else:
                 values[into], reasons[into] = entry.chunk.values[part], entry.chunk.reasons[part]
             done += n
-        self._handed_over += size
-        self._transport.handed_over(self._handed_over)
+        self._delivered += size
+        self._transport.report_delivered(self._delivered)
 
     def _await_samples(self, timeout: float) -> None:
         start = time.monotonic()
@@ -157,7 +157,7 @@ class Reader:
             self._queued = 0
             self._change.notify_all()
 
-    def ask(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
+    def query(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
         """Write a request and return the answer's text, prompt included, which comes between the data.
 
         With ``final`` nothing is read after the answer.
@@ -186,7 +186,7 @@ class Reader:
         """Write the request that ends the stream, wait for its answer, end the thread; return the answer."""
         self.drain()
         try:
-            return self.ask(request, timeout, final=True)
+            return self.query(request, timeout, final=True)
         finally:
             self.abandon()
 
@@ -210,7 +210,7 @@ class Reader:
                         break
                     if now - start >= timeout:
                         raise InstrumentTimeoutError(f"{self._name}: still sending {timeout:g} s after it was stopped")
-                    self._change.wait(POLL)
+                    self._change.wait(POLL_INTERVAL)
         finally:
             self.abandon()
         return self._error
@@ -226,7 +226,7 @@ class Reader:
         try:
             while not self._ended:
                 try:
-                    data = self._transport.read(timeout=POLL)
+                    data = self._transport.read(timeout=POLL_INTERVAL)
                 except InstrumentTimeoutError:
                     continue
                 now = time.monotonic()
@@ -236,7 +236,7 @@ class Reader:
                     raise chunk.end
         except InstrumentError as error:
             self._fail(type(error)(f"{self._name}: {error}"))
-        except Exception as error:  # noqa: BLE001 - whatever it is, the caller must hear of it and not wait
+        except Exception as error:  # noqa: BLE001 - the caller must receive every error
             self._fail(InstrumentError(f"{self._name}: the reader broke: {type(error).__name__}: {error}"))
 
     def _fail(self, error: InstrumentError) -> None:
@@ -254,7 +254,7 @@ class Reader:
             if self._draining or not size:
                 return
             if self._queued >= self._limit:
-                if self._transport.holds_back:
+                if self._transport.flow_control:
                     self._change.wait_for(self._may_go_on)
                     if self._draining:
                         return

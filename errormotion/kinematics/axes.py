@@ -1,7 +1,7 @@
-"""One axis of a machine: how it moves, and the error motions that come with it.
+"""One axis of a machine: its motion and its error motions.
 
-An axis joins two bodies, one nearer to the workpiece and one nearer to the tool. Whichever of them moves, a positive
-command takes the tool side in the positive direction relative to the workpiece side, and the axis's error is the actual
+An axis joins two bodies, one nearer to the workpiece and one nearer to the tool. Whichever body moves, a positive
+command moves the tool side in the positive direction relative to the workpiece side, and the axis's error is the actual
 pose of the tool side relative to the workpiece side minus the commanded one.
 """
 
@@ -31,7 +31,7 @@ class ErrorMotion:
     twists : ndarray, (n, 6)
         EX EY EZ in m and EA EB EC in rad; NaN where a freedom is not known.
     period : float, optional
-        2 pi for a rotary axis that turns without end: the table is continued with this period. Without it the errors
+        2 pi for a rotary axis without end stops: the table is continued with this period. Without it the errors
         outside of the table are unknown: NaN.
 
     Raises
@@ -78,12 +78,12 @@ class Axis:
     Attributes
     ----------
     name : str
-        ``X Y Z U V W`` move along, ``A B C`` turn about the coordinate that ISO 841 gives them.
+        ``X Y Z U V W`` move along, ``A B C`` rotate about the coordinate that ISO 841 assigns to them.
     carries_tool : bool
         Whether the moving body is on the tool's side of the bed.
     reference : ndarray, (3,)
-        Where the error motion is stated, m, in machine coordinates with all axes at zero. It rides on the moving body
-        of a linear axis; for a rotary axis it is a point of the axis's line.
+        Point at which the error motion is stated, m, in machine coordinates with all axes at zero. It moves with the
+        body of a linear axis; for a rotary axis it is a point of the axis's line.
     """
 
     name: str
@@ -101,12 +101,12 @@ class Axis:
 
     @property
     def rotary(self) -> bool:
-        """Whether the axis turns."""
+        """Whether the axis rotates."""
         return self.name in ROTARY_AXES
 
     @property
     def direction(self) -> Array:
-        """Unit vector, (3,), that the axis moves along or turns about."""
+        """Unit vector, (3,), that the axis moves along or rotates about."""
         direction = np.zeros(3)
         direction[direction_of(self.name)] = 1.0
         return direction
@@ -115,8 +115,8 @@ class Axis:
     def error_follows_motion(self) -> bool:
         """Whether the error acts in the tool-side body's frame, behind the motion, or in the workpiece-side body's.
 
-        A linear axis's reference rides on the moving body; a rotary axis's error motions are stated in the body that
-        does not turn (ISO 230-7).
+        The reference of a linear axis moves with the body; a rotary axis's error motions are stated in the body that
+        does not rotate (ISO 230-7).
         """
         return self.carries_tool != self.rotary
 
@@ -147,8 +147,8 @@ class Axis:
         error : array_like, (n, 6)
             Error motion at the reference.
         location : array_like, (n, 6)
-            Error of place of the axis's line (squareness among them), at the reference. It moves the line and leaves
-            the bodies where they are at command zero.
+            Error of position and orientation of the axis's line (squareness included), at the reference. It displaces
+            the line and leaves the bodies unchanged at command zero.
         """
         M, D, L = self.motion(commanded), displaced(error, self.reference), displaced(location, self.reference)
         return L * (M * D if self.error_follows_motion else D * M) * L.inv()

@@ -1,14 +1,14 @@
-"""Directions of beams: how far one is off its nominal, and how a surface lies to it.
+"""Directions of beams: their deviation from nominal, and the inclination of a surface to them.
 
-A beam starts at its zero point, where the reading is 0, and goes along a unit vector u towards the target. A surface
+A beam starts at its zero point, where the reading is 0; its direction is the unit vector u to the target. A surface
 with unit normal N (towards the sensor, N.u < 0) is inclined to it by alpha, the angle between -u and N. The azimuth of
 that tilt about the beam, counted from the plane of triangulation (emitted and received beam), is the rotation beta.
-Both together are the tilt vector
+Both together form the tilt vector
 
     q = tan(alpha) (cos beta, sin beta) = (N.e1, N.e2) / (-N.u),    e1 = t x u / |t x u|,   e2 = u x e1,
 
-t the normal of the plane of triangulation. q has no pole where the beam meets the surface at right angles. What is
-published as a sensor's deflection is no third freedom: whatever way the sensor was turned, u, t and N say alpha, beta.
+t the normal of the plane of triangulation. q has no pole where the beam is perpendicular to the surface. The
+published deflection of a sensor is not a third freedom: u, t and N determine alpha and beta in any orientation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 
 _ALONG = np.cos(np.radians(1e-4))
-"""Cosine from which a direction counts as lying along an axis."""
+"""Cosine above which a direction is taken to be along an axis."""
 _IN_LINE = 1e-6
 """Sine of the angle below which a triangulation normal lies along the beam."""
 
@@ -46,15 +46,15 @@ def across(direction: Array) -> Array:
 
 
 def turned(direction: Array, angles: Array) -> Array:
-    """Return the unit vector (3,) that lies off ``direction`` by two small angles (2,), rad, along ``across`` of it."""
+    """Return the unit vector (3,) at two small angles (2,), rad, to ``direction`` along the vectors of ``across``."""
     there = direction + angles @ across(direction)
     return np.asarray(there / np.linalg.norm(there))
 
 
 def rotation_between(nominal: ArrayLike, actual: ArrayLike) -> Array:
-    """Return the smallest rotation (..., 3), rad, as a vector, that takes one unit vector (..., 3) to the other.
+    """Return the smallest rotation (..., 3), rad, as a vector, that rotates one unit vector (..., 3) into the other.
 
-    Where they oppose one another every axis across them would do, and the result is NaN.
+    For opposite vectors the axis is not unique, and the result is NaN.
     """
     u0, u = np.asarray(nominal, float), np.asarray(actual, float)
     sine = np.cross(u0, u)
@@ -73,9 +73,9 @@ def beam_errors(
 ) -> tuple[Array, Array]:
     """Return the errors of beams against their nominal ones, and the covariance of these errors.
 
-    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation that takes the nominal direction to the
-    actual one, about that beam's zero point. The rotation of a beam about itself is not seen: NaN where the nominal
-    beam lies along an axis; elsewhere the smallest rotation stands for it.
+    EX EY EZ is the shift of the zero point, EA EB EC the smallest rotation from the nominal direction to the
+    actual one, about that beam's zero point. The rotation of a beam about itself is unknown: NaN where the nominal
+    beam is along an axis; elsewhere the smallest rotation is stated.
 
     Parameters
     ----------
@@ -133,21 +133,21 @@ def _turning_by_direction(u0: Array, u: Array) -> Array:
 
 
 def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) -> Array:
-    """Return how surfaces lie to a beam, as tilt vectors.
+    """Return the inclination of surfaces to a beam, as tilt vectors.
 
     Parameters
     ----------
     beam : array_like (3,)
         Unit vector from the sensor to the target.
     triangulation_normal : array_like (3,)
-        Unit normal of the plane that holds emitted and received beam; what of it lies along the beam does not matter.
+        Unit normal of the plane that holds emitted and received beam; its component along the beam has no effect.
     normal : array_like (..., 3)
         Unit normals of the surfaces, towards the sensor.
 
     Returns
     -------
     ndarray (..., 2)
-        q = tan(alpha) (cos beta, sin beta); NaN where the beam does not meet the surface's outside.
+        q = tan(alpha) (cos beta, sin beta); NaN where the beam does not hit the outside of the surface.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
     if not size > _IN_LINE:
         raise MethodError(
             "The triangulation normal lies along the beam; expected the normal of the plane that holds the emitted and "
-            "the received beam, so across the beam."
+            "the received beam, which is perpendicular to the beam."
         )
     e1 = first / size
     e2 = np.cross(u, e1)
@@ -173,7 +173,7 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
 def inclination_rotation(q: ArrayLike) -> tuple[Array, Array]:
     """Return inclination in [0, pi/2) and rotation in [0, 2 pi), rad, of tilt vectors (..., 2).
 
-    Where the beam meets the surface at right angles the rotation is 0.
+    The rotation is 0 where the beam is perpendicular to the surface.
     """
     q = np.asarray(q, float)
     alpha = np.arctan(np.hypot(q[..., 0], q[..., 1]))
@@ -184,7 +184,7 @@ def inclination_rotation(q: ArrayLike) -> tuple[Array, Array]:
 def tilt_vector(inclination: ArrayLike, rotation: ArrayLike) -> Array:
     """Return tilt vectors (..., 2) of inclinations and rotations, rad.
 
-    A negative inclination is the same tilt turned by half a turn: data given over -45..45 deg need no other handling.
+    A negative inclination is the same tilt at a rotation that is 180 deg larger.
     """
     alpha, beta = np.asarray(inclination, float), np.asarray(rotation, float)
     return np.asarray(np.tan(alpha)[..., None] * np.stack(np.broadcast_arrays(np.cos(beta), np.sin(beta)), axis=-1))

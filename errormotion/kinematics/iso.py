@@ -1,7 +1,8 @@
-"""The six freedoms and what ISO 230-1 calls the errors of an axis in them.
+"""The six freedoms, and the names of the errors of an axis in ISO 230-1.
 
 A name is E, the direction, the axis that moves: ``EYX`` is the straightness of X in Y, ``ECX`` its rotation about Z.
-A zero in it marks an error of place, not of motion: ``EC0Y`` is the squareness of Y to X.
+A zero in it marks an error of position or orientation of the axis, not of its motion: ``EC0Y`` is the squareness of Y
+to X.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ LINEAR_AXES = ("X", "Y", "Z", "U", "V", "W")
 ROTARY_AXES = ("A", "B", "C")
 
 _PARALLEL_TO = {"X": 0, "Y": 1, "Z": 2, "U": 0, "V": 1, "W": 2, "A": 0, "B": 1, "C": 2}
-# Components of error datasets that are no single axis: the standard has no name beyond the freedom's own.
+# Components of error datasets that are not a single axis: the standard has no name for their errors.
 _NO_AXIS = ("tool", "beam")
 
 
@@ -25,12 +26,12 @@ def iso_names(component: str, *, spindle_axis: str = "C") -> dict[str, str]:
     component : str
         An axis (``X Y Z U V W A B C``), ``spindle``, ``tool`` (the volume) or ``beam``.
     spindle_axis : str
-        Letter of the axis that the spindle turns about; the usual vertical or gantry spindle is C.
+        Letter of the spindle's axis of rotation; the usual vertical or gantry spindle is C.
 
     Returns
     -------
     dict
-        Freedom to name, such as ``{"EX": "EXX", "EY": "EYX", ...}``. The volume's and a beam's errors keep the
+        Freedom to name, such as ``{"EX": "EXX", "EY": "EYX", ...}``. The volume's and a beam's errors have the
         freedom's own name.
 
     Raises
@@ -46,7 +47,7 @@ def iso_names(component: str, *, spindle_axis: str = "C") -> dict[str, str]:
 
 
 def direction_of(axis: str) -> int:
-    """Return the index (0 X, 1 Y, 2 Z) of the coordinate that an axis moves along or turns about.
+    """Return the index (0 X, 1 Y, 2 Z) of the coordinate that an axis moves along or rotates about.
 
     Raises
     ------
@@ -60,10 +61,10 @@ def direction_of(axis: str) -> int:
 
 
 def location_names(axis: str, others: tuple[str, ...] = LINEAR_AXES) -> dict[str, str]:
-    """Return the errors of place of an axis on a machine that also has the axes ``others``.
+    """Return the errors of position and orientation of an axis on a machine that also has the axes ``others``.
 
     X is the datum's first axis and Y the second, so a three-axis machine has three: ``EC0Y``, ``EA0Z``, ``EB0Z``. A
-    rotary axis has four: two places and two tilts of its line.
+    rotary axis has four: two offsets and two tilts of its line.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A machine as a chain of axes from workpiece to tool, and what its axes' errors do at the tool.
+"""A machine as a chain of axes from workpiece to tool, and the effect of its axes' errors at the tool.
 
 A description such as ``workpiece-X-Y-bed-Z-spindle-tool`` names the bodies and axes on the way from the workpiece over
 the bed to the tool. Volumetric errors are twists of the tool relative to the workpiece, actual minus commanded, at the
@@ -44,7 +44,8 @@ class Machine:
     axis_names : tuple of str
         Order of the commanded coordinates: X Y Z U V W A B C, as far as there are.
     error_names : tuple of str
-        Order of the error parameters: six error motions of every axis, then the errors of place. A machine with X, Y
+        Order of the error parameters: six error motions of every axis, then the errors of position and orientation
+        (squareness among them). A machine with X, Y
         and Z has 21: EXX ... ECZ, EC0Y, EA0Z, EB0Z.
 
     Raises
@@ -81,8 +82,8 @@ class Machine:
     def error_names(self) -> tuple[str, ...]:
         """Names of the error parameters, in order."""
         motions = [name for axis in self.axis_names for name in iso_names(axis).values()]
-        places = [name for axis in self.axis_names for name in location_names(axis, self.axis_names).values()]
-        return (*motions, *places)
+        positions = [name for axis in self.axis_names for name in location_names(axis, self.axis_names).values()]
+        return (*motions, *positions)
 
     def nominal_pose(self, commanded: ArrayLike) -> RigidTransform:
         """Return the commanded poses, (n,), of the tool body in the workpiece frame, for commands (n, axis)."""
@@ -95,7 +96,7 @@ class Machine:
         motions: Mapping[str, Callable[[Array], ArrayLike]],
         locations: Mapping[str, float] | None = None,
     ) -> Array:
-        """Return the error parameters at commanded places, in the order of `error_names`.
+        """Return the error parameters at commanded positions, in the order of `error_names`.
 
         Parameters
         ----------
@@ -105,7 +106,7 @@ class Machine:
             Axis to a function from its commanded position (...) to its error twist (..., 6), such as
             `errormotion.kinematics.axes.ErrorMotion`. An axis that is not named has unknown errors: NaN.
         locations : mapping of str to float, optional
-            Name of an error of place (``EC0Y``) to its value, rad or m. NaN where not named.
+            Name of an error of position (``EC0Y``) to its value, rad or m. NaN where not named.
 
         Returns
         -------
@@ -203,7 +204,7 @@ class Machine:
         return displacement(reduce(mul, poses) * nominal.inv(), nominal.apply(tool))
 
     def _locations(self, joint: Axis) -> list[tuple[int, int]]:
-        """Return (column among the error parameters, freedom) of the errors of place of one axis."""
+        """Return (column among the error parameters, freedom) of the errors of position of one axis."""
         names = location_names(joint.name, self.axis_names)
         return [(self.error_names.index(name), DOF.index(dof)) for dof, name in names.items()]
 

@@ -37,7 +37,7 @@ def log(pose: RigidTransform) -> Array:
 def displaced(twist: ArrayLike, point: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTransform:
     """Return the pose of a body that is turned about a point by the rotation vector R and shifted by E, exactly.
 
-    It is what a finite error means: the functional point goes by (EX, EY, EZ), whatever the rotation.
+    A finite error is defined so: the functional point is displaced by (EX, EY, EZ), independent of the rotation.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Small errors of a rigid body as twists, and what becomes of them at another point or in another frame.
 
 A twist ``(EX, EY, EZ, EA, EB, EC)`` holds the displacement (m) of one point of the body, the functional point, and the
-body's small rotation (rad) about X, Y, Z. A freedom that nobody knows is NaN. It spoils only what depends on it: where
+body's small rotation (rad) about X, Y, Z. An unknown freedom is NaN. It affects only what depends on it: where
 a coefficient is exactly zero, the unknown freedom does not matter.
 """
 

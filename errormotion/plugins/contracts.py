@@ -28,7 +28,7 @@ class PluginSettings(BaseModel):
 
 @dataclass(frozen=True)
 class InstrumentInfo:
-    """What an instrument says of itself.
+    """Description of an instrument.
 
     ``status`` is honest about what it has met: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
     ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
@@ -44,7 +44,7 @@ class InstrumentInfo:
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """What a method says of itself; ``cannot_see`` lists in words what it is blind to."""
+    """Description of a method; ``cannot_see`` lists what it does not determine."""
 
     id: str
     summary: str
@@ -75,7 +75,7 @@ class FigureOfMerit:
     Attributes
     ----------
     name : str
-        In the words of the standard that defines it, with its place or time where it has one.
+        In the words of the standard that defines it, with its position or time where it has one.
     value, expanded_uncertainty : float
         SI; k = 2. NaN where unknown.
     unit : str
@@ -168,7 +168,7 @@ class Touch:
     Attributes
     ----------
     start, target : (3,) tuple of float
-        Commanded places of the tip, X Y Z, m: before the touch, and where the probe stops if nothing trips it.
+        Commanded positions of the tip, X Y Z, m: before the touch, and where the probe stops if it does not trip.
     item : int
         What is touched (the number of a ball), for messages and for the dataset.
     """
@@ -185,7 +185,7 @@ class Contact:
     Attributes
     ----------
     position : (3,) tuple of float
-        Where the machine says that the tip was when the probe tripped, m; NaN where the touch gave none.
+        Position of the tip by the machine when the probe tripped, m; NaN where it did not trip.
     time : float
         When it tripped, s on the clock of the machine (its ``state()["time"]``).
     flag : str
@@ -244,7 +244,7 @@ class Instrument(Protocol):
     ) -> None: ...
 
     def identify(self) -> Identity:
-        """Ask the device who it is."""
+        """Ask the device for its identity."""
 
     def read(self) -> Any:
         """Return one reading now."""
@@ -271,7 +271,7 @@ class Bench(Protocol):
         """Whether the bench offers an instrument of this kind."""
 
     def ask(self, message: str) -> None:
-        """Ask the operator to do something and wait for it; passes at once on a virtual machine."""
+        """Request an action of the operator and wait for it; returns immediately on a virtual machine."""
 
 
 @runtime_checkable
@@ -299,9 +299,12 @@ class Method(Protocol):
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
+    ``machine_defaults(machine)`` : mapping of str to value
+        Settings that follow from the machine of the bench (a `MachineDescription`), for a campaign that does not state
+        them.
     ``check_machine(settings, machine)`` : mapping of str to str
-        Which settings contradict the machine of the bench (a `MachineDescription`), by setting, with what was expected
-        and what was found; used when a campaign is read.
+        What contradicts the machine, by setting (an empty text for the whole), with what was expected and what was
+        found; used when a campaign is read.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
 
@@ -330,7 +333,7 @@ class Method(Protocol):
         """Measure; yield raw datasets to be joined along ``append_dim(settings)``.
 
         ``inputs`` are results of earlier tests by the name the campaign gives them. ``done`` is what an interrupted
-        run already holds: go on behind it.
+        run has already: continue after it.
         """
 
     def append_dim(self, settings: Any) -> str:

@@ -40,7 +40,7 @@ class Plugin:
         return _name_and_version(self.entry_point.dist)
 
 
-#: What the registry asks of a class before it hands it out; the conformance kit asks for the rest.
+#: What the registry requires of a class; the conformance kit checks the rest.
 _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo], tuple[str, ...]]] = {
     "instruments": (InstrumentInfo, ("Settings", "open", "close", "identify", "read")),
     "methods": (MethodInfo, ("Settings", "needs", "acquire", "append_dim", "progress", "identify", "plan")),
@@ -59,7 +59,7 @@ def _name_and_version(dist: Distribution | None) -> str:
 def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
     """Read the entry points of every distribution.
 
-    Where a distribution's list cannot be read, an entry point without a value stands for it.
+    Where a distribution's list cannot be read, an entry point without a value replaces it.
     """
     found: dict[Group, list[EntryPoint]] = {group: [] for group in GROUPS}
     seen: set[str] = set()
@@ -71,7 +71,7 @@ def _found() -> Mapping[Group, tuple[EntryPoint, ...]]:
             seen.add(name)
         try:
             points = tuple(dist.entry_points)
-        except Exception:  # noqa: BLE001 - a list of whatever form harms nobody else
+        except Exception:  # noqa: BLE001 - a faulty list affects no other distribution
             text = dist.read_text("entry_points.txt") or ""
             points = tuple(EntryPoint(name, "", f"errormotion.{group}") for group in GROUPS if group in text)
         for group in GROUPS:
@@ -93,7 +93,7 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
             raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
         if info.id != point.name:
             raise PluginError(f"the entry point is called '{point.name}' but the class calls itself '{info.id}'")
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin of whatever kind harms nobody else
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
         return Plugin(
             point.name,
             group,

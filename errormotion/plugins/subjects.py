@@ -46,7 +46,7 @@ class InstrumentSubject:
     settings : mapping
         What the driver's ``Settings`` are made from.
     name : str
-        Tells several subjects of one plugin apart.
+        Distinguishes several subjects of one plugin.
     make : callable, optional
         ``make(address, record)`` returns a driver, where ``plugin(address, Settings(**settings), record=record)``
         would not do (a driver of several addresses). ``record`` is a path or None.
@@ -55,7 +55,7 @@ class InstrumentSubject:
     harmless : tuple of str
         Faults that a driver must get over without loss.
     drop_fault, split_fault : str
-        Fault that leaves samples out (asked for with ``fault_at=10``, from the tenth on), and fault that cuts the
+        Fault that leaves samples out (requested with ``fault_at=10``, from the tenth on), and fault that cuts the
         frames into pieces.
     plausible : (float, float), optional
         Lowest and highest plausible reading in SI units; default: those of its kind. None: no bounds.
@@ -138,7 +138,7 @@ class MethodSubject:
     setting_vectors : mapping of str to str
         Which of these settings are points and directions in the frame of the raw data.
     name : str
-        Tells several subjects of one plugin apart.
+        Distinguishes several subjects of one plugin.
     optional : tuple of str
         Variables of the raw dataset that the method can do without.
     measured : tuple of str
@@ -183,7 +183,7 @@ class MethodSubject:
         _WARM.add(self.plugin)
 
         def work() -> None:
-            with suppress(Exception):  # the checks tell what is wrong
+            with suppress(Exception):  # the checks report what is wrong
                 self.identify(self.make(0)[0])
 
         worker = threading.Thread(target=work, name="warm-up", daemon=True)

@@ -60,7 +60,7 @@ def _no_dropping(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def info_complete(subject: InstrumentSubject) -> str:
-    """Class attribute ``info`` tells id, kind, summary, status and version, and its simulator loads."""
+    """Class attribute ``info`` states id, kind, summary, status and version, and its simulator loads."""
     info = subject.plugin.info
     require(isinstance(info, InstrumentInfo), f"expected an InstrumentInfo, found {type(info).__name__}")
     for name in ("id", "kind"):
@@ -88,7 +88,7 @@ def kind_contract(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def settings_strict(subject: InstrumentSubject) -> str:
-    """Settings are a PluginSettings, refuse unknown keys, and come back from their JSON unchanged."""
+    """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
     return check_settings(subject.plugin.Settings, subject.build().settings)
 
 
@@ -108,7 +108,7 @@ def check_settings(cls: Any, settings: Any) -> str:
 
 @INSTRUMENT_CHECKS.add()
 def identify(subject: InstrumentSubject) -> str:
-    """The instrument tells maker, model and serial number, the same each time, and admits to be a simulator."""
+    """The instrument states maker, model and serial number, the same each time, and whether it is simulated."""
     with subject.build() as instrument:
         first, second = instrument.identify(), instrument.identify()
     require(isinstance(first, Identity), f"expected an Identity, found {type(first).__name__}")
@@ -165,8 +165,8 @@ def _require_refusal(instrument: Any, when: str, streams: bool) -> None:
 
 
 @INSTRUMENT_CHECKS.add()
-def nobody_there(subject: InstrumentSubject) -> str:
-    """With nobody at the address, making the driver is free, and opening it raises a typed error within the limit."""
+def no_device(subject: InstrumentSubject) -> str:
+    """Without a device, making the driver succeeds, and opening it raises a typed error within the limit."""
     instrument = subject.build(address=subject.dead_address)
     start = time.perf_counter()
     try:
@@ -178,7 +178,7 @@ def nobody_there(subject: InstrumentSubject) -> str:
         return f"{type(error).__name__} after {seconds:.2f} s"
     finally:
         instrument.close()
-    require(False, f"somebody answered at {subject.dead_address}")
+    require(False, f"a device answered at {subject.dead_address}")
     return ""
 
 
@@ -230,7 +230,7 @@ def stream_blocks(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_stream)
 def monotonic_time(subject: InstrumentSubject) -> str:
-    """Device counters go on without a gap from block to block, host times never go back nor lie ahead."""
+    """Device counters continue without a gap from block to block; host times never decrease nor lie ahead."""
     before = time.monotonic()
     with subject.build() as instrument:
         blocks = first_blocks(instrument, subject.blocks)
@@ -256,8 +256,8 @@ def split_reads(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(why_not=_no_dropping)
 def counted_drops(subject: InstrumentSubject) -> str:
-    """Samples that the device left out are NaN at their places, and counted; the others stay where they belong."""
-    later = f"{subject.drop_fault}&fault_at=10"  # a sample lost before the first one is nobody's to count
+    """Samples that the device left out are NaN at their positions, and counted; the others keep their positions."""
+    later = f"{subject.drop_fault}&fault_at=10"  # a sample lost before the first one cannot be counted
     whole, holes = (run_session(subject, fault=fault) for fault in ("", later))
     if isinstance(holes.error, InstrumentError):
         return f"the driver stops: {type(holes.error).__name__}"
@@ -274,7 +274,7 @@ def counted_drops(subject: InstrumentSubject) -> str:
 
 @INSTRUMENT_CHECKS.add(limit=90.0, why_not=_no_faults)
 def faults(subject: InstrumentSubject) -> str:
-    """Each fault of the menu becomes a typed error within the time limit, or a counted loss where data go on."""
+    """Each fault becomes a typed error within the time limit, or a counted loss where data continue."""
     seen: list[str] = []
     wrong: list[str] = []
     sound = run_session(subject)

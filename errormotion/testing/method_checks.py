@@ -53,7 +53,7 @@ def info_complete(subject: MethodSubject) -> str:
 
 @METHOD_CHECKS.add()
 def settings_strict(subject: MethodSubject) -> str:
-    """Settings are a PluginSettings, refuse unknown keys, and come back from their JSON unchanged."""
+    """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
     return check_settings(subject.plugin.Settings, subject.effective_settings())
 
 

@@ -1,7 +1,7 @@
-"""The virtual machine: kinematic errors, heat, artefacts and sensors, and the truth for everything.
+"""The virtual machine: kinematic errors, heat, artefacts and sensors, and the true errors.
 
-``VirtualMachine`` is one seeded individual. ``Event`` says what it is told to do while it warms up, ``StepProgram`` how
-it steps a sphere through the beams.
+``VirtualMachine`` is one seeded individual. ``Event`` is a command during the warm-up, ``StepProgram`` the motion of a
+sphere in steps through the beams.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Event", "StepProgram", "VirtualMachine"]
 
 
 def __getattr__(name: str) -> Any:
-    """Load the machine, and numba with it, when it is asked for."""
+    """Load the machine, and numba with it, when it is first used."""
     if name == "VirtualMachine":
         from errormotion.twin.machine import VirtualMachine
 

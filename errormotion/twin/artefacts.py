@@ -1,4 +1,4 @@
-"""Artefacts for a line profiler: pieces of known shape on the table of the virtual machine."""
+"""Artefacts for a line profiler: pieces of a known shape on the table of the virtual machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from errormotion.twin import surfaces
 
 Surface = Callable[[Array, Array], ArrayLike]
 
-#: knots of a free form, m, and how many lie beyond the outline: the spline's memory of its end is 0.27 per knot
+#: distance of the knots of a free form, m, and their number beyond the outline: effects of the end fall by 0.27 a knot
 KNOTS = 0.1e-3
 BEYOND = 20
 
@@ -29,7 +29,7 @@ class Artefact:
     Attributes
     ----------
     name : str
-        For people.
+        For reports.
     shape : int
         Which of the shapes in `errormotion.twin.surfaces`.
     parameters : ndarray, (5,)
@@ -49,7 +49,7 @@ class Artefact:
         return float(self.parameters[0]), float(self.parameters[1])
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return z at x, y (which broadcast), m; NaN outside the artefact."""
+        """Return z at x, y (which broadcast), m; NaN off the artefact."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
         out = np.empty(x.size)
         surfaces.heights(self.shape, self.parameters, self.table, x.ravel(), y.ravel(), out)
@@ -65,11 +65,11 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     Parameters
     ----------
     z : callable
-        Takes x and y, arrays of one shape in m, and returns heights in m; also a little (2 mm) beyond the outline.
+        Takes x and y, arrays of one shape in m, and returns heights in m; also up to 2 mm beyond the outline.
     half_size : (float, float)
         Half of the size in x and y, m.
     name : str
-        For people.
+        For reports.
 
     Raises
     ------
@@ -81,8 +81,8 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     values = np.asarray(z(*grid), dtype=float)
     if values.shape != grid[0].shape or not np.isfinite(values).all():
         raise BenchError(
-            f"The surface of an artefact gives one finite height (m) for each position; it gave shape {values.shape} "
-            f"with {int(np.sum(~np.isfinite(values)))} values that are not finite, for shape {grid[0].shape}."
+            f"expected one finite height, m, for each position of the surface; found shape {values.shape} with "
+            f"{int(np.sum(~np.isfinite(values)))} values that are not finite, for positions of shape {grid[0].shape}."
         )
     table = np.ascontiguousarray(spline_filter(values, order=3, mode="mirror"))
     return Artefact(name, surfaces.FREEFORM, np.array([*half_size, x[0], y[0], 1 / KNOTS]), table)
@@ -91,7 +91,7 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
 def swept(half_size: tuple[float, float] = (22e-3, 30e-3)) -> Artefact:
     """Return a section curve in X-Z, swept along a guide curve in Y-Z: z = f(x) + g(y), slopes up to 0.5.
 
-    The kind of surface of Zhao et al., section 3.1, who print no equation of theirs.
+    The type of surface of Zhao et al., section 3.1, who state no equation.
     """
 
     def section(x: Array) -> Array:
@@ -127,7 +127,7 @@ def circular_pocket(
     radius, depth : float
         m. The radius is the one of Zhao et al., section 4.2.
     spot : float
-        Standard deviation of the laser's spot, m: where it straddles the rim, the reading is a mean of both levels.
+        Standard deviation of the laser's spot, m: across the rim, the reading is a mean of both levels.
     half_size : (float, float)
         Half of the size of the plate in x and y, m.
     """
@@ -137,5 +137,5 @@ def circular_pocket(
 
 def _positive(what: str, value: float) -> float:
     if not value > 0:
-        raise BenchError(f"The {what} of an artefact is a positive length in m; found {value!r}.")
+        raise BenchError(f"expected the {what} of an artefact as a positive length in m; found {value!r}.")
     return float(value)

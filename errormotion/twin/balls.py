@@ -1,4 +1,4 @@
-"""Balls on the table of the virtual machine, and the touch probe that finds them."""
+"""Balls on the table of the virtual machine, and the touch probe that measures them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
 
-#: of a ball, m: nominal radius; how far the true one may be off; roundness from peak to valley
+#: of a ball, m: nominal radius; largest deviation of the true one; roundness from peak to valley
 RADIUS, RADIUS_ERROR, FORM = 12.5e-3, 3e-6, 0.5e-6
-#: how well a ball is set up by hand, m (one sigma, each coordinate; at most three times that)
+#: deviation of a ball's position from its nominal one, m (one sigma, each coordinate; at most three times that)
 PLACING = 0.1e-3
-#: where the balls stand, as a share of the travel: across from the middle, and up from below
+#: positions of the balls as a share of the travel: X and Y from the middle, Z from the lowest position
 PLACES = (
     *((-0.8, -0.8, 0.12), (0.8, -0.75, 0.50), (0.75, 0.8, 0.20), (-0.8, 0.75, 0.62)),
     *((0.0, 0.0, 0.35), (0.1, -0.8, 0.15), (-0.1, 0.8, 0.45), (0.4, 0.1, 0.55)),
 )
 
-#: of the probe, m: nominal radius of its tip; how far the true one may be off; scatter of a trigger
+#: of the probe, m: nominal radius of its tip; largest deviation of the true one; scatter of a trigger
 TIP_RADIUS, TIP_ERROR, NOISE = 3e-3, 1e-6, 0.25e-6
 #: pre-travel, m: its mean, and the amplitude of its three lobes
 PRETRAVEL, LOBING = 8e-6, 1.5e-6
@@ -34,15 +34,15 @@ class Balls:
     Attributes
     ----------
     nominal : ndarray, (ball, 3)
-        Where they are said to stand, m, in commanded places of the tip.
+        Nominal centres, m, in commanded positions of the tip.
     centre : ndarray, (ball, 3)
-        Where they stand, m.
+        True centres, m.
     nominal_radius : float
         m.
     radius : ndarray, (ball,)
         Mean radius of each, m.
     form : ndarray, (ball, 3, 3)
-        The surface stands ``n @ form @ n`` above the mean radius in the direction n, m.
+        The surface is ``n @ form @ n`` above the mean radius in the direction n, m.
     """
 
     nominal: Array
@@ -62,7 +62,7 @@ class Balls:
     def first(self, count: int) -> Balls:
         """Return the first ones."""
         if not 1 <= count <= len(self):
-            raise BenchError(f"The table has room for 1 to {len(self)} balls; found {count}.")
+            raise BenchError(f"expected 1 to {len(self)} balls; found {count}")
         part = slice(count)
         return replace(
             self,
@@ -73,15 +73,15 @@ class Balls:
         )
 
     def moved(self, ball: int, shift: ArrayLike) -> Balls:
-        """Return the same balls, one of them (counted from 0) pushed by ``shift`` (3,), m."""
+        """Return the same balls, one of them (counted from 0) displaced by ``shift`` (3,), m."""
         if not 0 <= ball < len(self):
-            raise BenchError(f"The balls are counted from 0 to {len(self) - 1}; found {ball}.")
+            raise BenchError(f"expected the number of a ball, 0 to {len(self) - 1}; found {ball}")
         centre = self.centre.copy()
         centre[ball] += np.asarray(shift, dtype=float)
         return replace(self, centre=centre)
 
     def height(self, ball: NDArray[np.intp], direction: Array) -> Array:
-        """Return how far the surfaces of balls (n,) are from their centres in unit directions (n, 3), m."""
+        """Return the distance of the surfaces of balls (n,) from their centres in unit directions (n, 3), m."""
         form = np.einsum("ni,nij,nj->n", direction, self.form[ball], direction)
         return np.asarray(self.radius[ball] + form)
 
@@ -90,14 +90,14 @@ class Balls:
 class Probe:
     """A touch-trigger probe.
 
-    After the tip has touched, the machine goes on by the pre-travel before the probe trips; it is a little longer where
-    the three contacts of the probe's seat are stiffer. It is positive, and the spheres that are measured come out
+    After the contact the machine moves on by the pre-travel before the probe trips; it is a little longer where
+    the three contacts of the probe's seat are stiffer. It is positive, so measured spheres appear
     smaller by its mean.
 
     Attributes
     ----------
     nominal_tip_radius, tip_radius : float
-        As stated, and as it is, m.
+        Nominal and true, m.
     noise : float
         Scatter of one trigger along the normal (one sigma), m.
     mean, lobing : float
@@ -125,7 +125,7 @@ class Probe:
 
 
 def seeded_balls(rng: np.random.Generator, travel: Mapping[str, tuple[float, float]]) -> Balls:
-    """Return all the balls that the table has room for, spread in the travel at different heights."""
+    """Return all balls, spread over the travel at different heights."""
     low, high = np.array([travel.get(axis, (0.0, 0.0)) for axis in "XYZ"]).T
     share = np.array(PLACES)
     share[:, :2] = (1 + share[:, :2]) / 2

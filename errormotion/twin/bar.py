@@ -1,4 +1,4 @@
-"""The bar in the spindle: where its axis lies, how it runs out, and what its surface looks like to a laser."""
+"""The bar in the spindle: position of its axis, runout, and texture of its surface."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from errormotion.arrays import Array
 from errormotion.twin import intersections
 
 RADIUS = 5e-3
-#: angles in the table of what repeats every turn, and the highest harmonic in it
+#: angles in the table of what repeats in every turn, and the highest harmonic in it
 ANGLES = 1024
 HARMONICS = 36
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A check bar on a spindle that turns about its own axis.
+    """A check bar in a spindle that rotates about its own axis.
 
     Attributes
     ----------
     radius : float
         True radius, m.
     point, axis : ndarray, (3,)
-        Cold axis of rotation: where it meets the end of the bar, m, and its unit direction.
+        Cold axis of rotation: its intersection with the end of the bar, m, and its unit direction.
     eccentricity : float
         Distance of the bar's axis from the axis of rotation at the end of the bar, m: its runout is twice that.
     eccentricity_angle : float
@@ -50,14 +50,14 @@ class Bar:
     texture: Array
 
     def still_readings(self, origin: Array, direction: Array, point: Array, axis: Array) -> Array:
-        """Return the distances to a perfect bar that turns without runout, m, shape (channel, n).
+        """Return the distances to a perfect bar that rotates without runout, m, shape (channel, n).
 
         Parameters
         ----------
         origin : (channel, n, 3)
             m.
         direction : (channel, 3)
-            Unit directions; the last channel looks at the end face.
+            Unit directions; the last channel measures the end face.
         point, axis : (n, 3)
             Axis of rotation, m, unit.
         """
@@ -67,7 +67,7 @@ class Bar:
         return np.concatenate([side, end])
 
     def pattern(self, origin: Array, direction: Array, point: Array, axis: Array) -> Array:
-        """Return what runout and texture add to the readings over one turn, m, shape (channel, ANGLES + 1).
+        """Return the effect of runout and texture on the readings over one turn, m, shape (channel, ANGLES + 1).
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ def seeded_texture(rng: np.random.Generator, channels: int, sigma: float) -> Arr
 
 
 def seeded_bar(rng: np.random.Generator, channels: int) -> Bar:
-    """Return a bar of 5 mm radius with the flaws of a good one."""
+    """Return a bar of 5 mm radius with the deviations of a good one."""
     tilt = rng.normal(0, 50e-6, 2).clip(-120e-6, 120e-6)
     axis = np.array([tilt[1], -tilt[0], 1.0])
     return Bar(

@@ -1,8 +1,8 @@
 """The crossbeam of the gantry as it warms up, and scans of artefacts by the line profiler in its spindle.
 
-The carriage O20 rides on the crossbeam along Y. The tool frame O30 is shifted by the ``lever`` (x_y, 0, z_y), the
-profiler frame O40 is in O30 at the ``pose`` H. With the carriage at y and its error E (a displacement of its origin
-and a rotation), a point (x, 0, z) of a profile lies in the machine at
+The carriage O20 moves along the crossbeam, Y. The tool frame O30 is offset from it by the ``lever`` (x_y, 0, z_y), the
+profiler frame O40 has the ``pose`` H in O30. With the carriage at y and its error E (a displacement of its origin
+and a rotation), a point (x, 0, z) of a profile is in the machine at
 
     (0, y, 0) + E (lever + H (x, 0, z)).
 """
@@ -29,9 +29,9 @@ _STEADY = {
 }
 #: from the carriage to the tool frame, m (Zhao et al., section 4.3)
 LEVER = (-0.9, 0.0, -2.051)
-#: pose of the profiler in the tool frame before the seed turns it: lift, m
+#: nominal height of the profiler in the tool frame, m
 LIFT = -0.174
-#: misalignment of an artefact: shift, m, and rotation, rad (one sigma)
+#: deviation of an artefact from its nominal position, m, and orientation, rad (one sigma)
 PLACE, TURN = 0.2e-3, 3e-3
 
 _ARTEFACT = 3
@@ -41,8 +41,8 @@ _ARTEFACT = 3
 class Crossbeam:
     """One crossbeam with a profiler in its spindle.
 
-    The carriage follows its guide: where the guide bends, the carriage turns, so EA = dEZ/dy and EC = -dEX/dy. ``own``
-    adds what the carriage does by itself.
+    The carriage follows its guide: it rotates with the slope of the guide, so EA = dEZ/dy and EC = -dEX/dy. ``own``
+    adds a motion of the carriage relative to its guide.
 
     Attributes
     ----------
@@ -65,9 +65,9 @@ class Crossbeam:
     own: Array = field(default_factory=lambda: np.zeros(6))
 
     def twist(self, t: ArrayLike, y: ArrayLike) -> Array:
-        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t (s), positions y (m).
+        """Return the thermal error of the carriage at its origin, (..., 6), m and rad, at times t, s, and y, m.
 
-        Times and positions broadcast. Before time 0 all is cold.
+        Times and positions broadcast. Before time 0 the machine is cold.
         """
         t, y = np.broadcast_arrays(np.asarray(t, dtype=float), np.asarray(y, dtype=float))
         half = (self.travel[1] - self.travel[0]) / 2
@@ -81,7 +81,7 @@ class Crossbeam:
         return np.asarray(twist + grown[..., :1] * self.own)
 
     def carriage(self, t: float, y: Array, middle: float, motion: str) -> Array:
-        """Return the poses of the carriage at commanded positions y (n,), poses (n, 4, 4) in the machine, m."""
+        """Return the poses (n, 4, 4) of the carriage in the machine at commanded positions y (n,), m."""
         going = np.tile(np.eye(4), (y.size, 1, 1))
         going[:, 1, 3] = y
         if motion == "axis":
@@ -92,19 +92,19 @@ class Crossbeam:
         return there @ displaced(self.twist(t, middle)).as_matrix() @ going
 
     def carriage_at(self, t: Array, positions: Array) -> Array:
-        """Return the poses of the carriage at times t (n,) of the warm-up, s, and commanded positions (n, 3), m.
+        """Return the poses of the carriage at times t (n,) since the start of the warm-up, s, and positions (n, 3), m.
 
         Returns
         -------
         ndarray, (n, 4, 4)
-            Poses in the machine, m. Z moves the spindle in the carriage and not the carriage.
+            In the machine, m. Z moves the spindle in the carriage and not the carriage.
         """
         going = np.tile(np.eye(4), (len(positions), 1, 1))
         going[:, :2, 3] = positions[:, :2]
         return np.asarray(going @ displaced(self.twist(t, positions[:, 1])).as_matrix())
 
     def artefact_pose(self, seed: int, position: float) -> Array:
-        """Return the pose of the artefact at a position, (4, 4) in the machine, m: below the profiler, misaligned."""
+        """Return the pose of the artefact of a position, (4, 4) in the machine, m: under the profiler, misaligned."""
         bits = int(np.float64(position).view(np.int64))
         rng = np.random.default_rng([abs(seed), int(seed < 0), _ARTEFACT, bits & 0x7FFFFFFFFFFFFFFF, int(bits < 0)])
         off = rng.normal(0, [PLACE] * 3 + [TURN] * 3)
@@ -112,13 +112,28 @@ class Crossbeam:
         return np.asarray(displaced(off).as_matrix())
 
     def pocket_pose(self, position: float) -> Array:
-        """Return the pose of a pocket cut by the cold machine at a position of the axis, (4, 4) in the machine, m.
+        """Return the pose of a pocket that the cold machine has cut at a position of the axis, (4, 4), m.
 
-        Its centre is the origin of the tool frame at that time.
+        Its middle is the origin of the tool frame during the cut.
         """
         pose = np.eye(4)
         pose[:3, 3] = self.lever + np.array([0.0, position, 0.0])
         return pose
+
+    def pocket_lines(self, along: ArrayLike, lift: float) -> Array:
+        """Return the poses (n, 4, 4) of the profiler relative to a pocket that the cold machine has cut itself.
+
+        Parameters
+        ----------
+        along : (n,)
+            Y of the tool frame relative to the cut, m.
+        lift : float
+            Z of the tool frame relative to the cut, m.
+        """
+        poses = np.tile(self.pose, (np.size(along), 1, 1))
+        poses[:, 1, 3] += np.asarray(along, dtype=float)
+        poses[:, 2, 3] += lift
+        return poses
 
     def lines(self, carriage: Array, artefact: Array, *, lift: ArrayLike = 0.0) -> Array:
         """Return the poses (n, 4, 4) of the profiler relative to an artefact, from those of the carriage.
@@ -132,7 +147,7 @@ class Crossbeam:
 
 
 def seeded_crossbeam(rng: np.random.Generator, travel: tuple[float, float]) -> Crossbeam:
-    """Return the crossbeam of one machine: the tables, off by up to 15 percent, and a misaligned profiler."""
+    """Return the crossbeam of one machine: the tables within 15 percent, and a profiler with a seeded misalignment."""
     steady = np.zeros((len(LAGS), len(_STEADY), 4))
     for k, terms in enumerate(_STEADY.values()):
         for lag, coefficients in enumerate(terms):

@@ -1,4 +1,4 @@
-"""The measuring frame: five laser triangulation sensors around a bar, as drawn and as they really stand."""
+"""The measuring frame: five laser triangulation sensors around a bar, nominal and true."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ RANGE = 2e-3
 LEVELS = (0.010, 0.050)
 #: expansion of the frame per kelvin at the sensors looking along X, Y, Z, m/K
 EXPANSION = (2.1e-6, 2.4e-6, 1.3e-6)
-#: how far the true expansion of a frame is off that of the drawing, relative (one sigma)
+#: deviation of the true expansion of a frame from the drawing, relative (one sigma)
 EXPANSION_SPREAD = 0.1
-#: how much a sensor's reading rises after it is switched on, m, and its time constant, s: settled after two hours
+#: rise of a sensor's reading after it is switched on, m, and its time constant, s: settled after two hours
 WARM_UP = 10.5e-6
 WARM_UP_TIME = 1440.0
 #: white noise of one sample, m
@@ -31,11 +31,11 @@ class FrameGeometry:
     Attributes
     ----------
     channels : tuple of str
-        X1, Y1 look at level L1 of the bar, X2, Y2 at level L2, Z at its end face.
+        X1, Y1 measure at level L1 of the bar, X2, Y2 at level L2, Z at its end face.
     nominal_origin, nominal_direction : ndarray, (channel, 3)
-        The beams as drawn, m; the origin is the start of the measuring range.
+        The beams of the drawing, m; the origin is the start of the measuring range.
     true_origin, true_direction : ndarray, (channel, 3)
-        The beams as they are in the cold state.
+        The beams in the cold state.
     levels : ndarray, (2,)
         z of L1 and L2, m.
     range : float
@@ -47,7 +47,7 @@ class FrameGeometry:
     warm_up_time : float
         Its time constant, s.
     expansion, true_expansion : ndarray, (channel, 3)
-        Where the origins go per kelvin of the frame, m/K: by the drawing, and as it is (a tenth of it off, one sigma).
+        Displacement of the origins per kelvin of the frame, m/K: of the drawing, and true (10 % off, one sigma).
     """
 
     channels: tuple[str, ...]
@@ -64,18 +64,18 @@ class FrameGeometry:
     true_expansion: Array
 
     def origins(self, warming: ArrayLike) -> Array:
-        """Return the true origins after the frame has warmed by this many kelvins (n,), m, shape (channel, n, 3)."""
+        """Return the true origins after a temperature rise of the frame (n,), K; m, shape (channel, n, 3)."""
         rise = np.asarray(warming, dtype=float)
         return np.asarray(self.true_origin[:, None, :] + self.true_expansion[:, None, :] * rise[:, None])
 
     def warm_up_offset(self, since_on: ArrayLike) -> Array:
-        """Return what the readings lack of their settled value, m (not positive), shape (channel, n)."""
+        """Return the readings less their settled values, m (not positive), shape (channel, n)."""
         age = np.asarray(since_on, dtype=float) / self.warm_up_time
         return np.asarray(-self.warm_up[:, None] * np.exp(-age))
 
 
 def nominal_beams(bar_radius: float) -> tuple[Array, Array]:
-    """Return origins and directions as drawn, m: mid-range on a bar along z that ends at z = 0, shape (channel, 3)."""
+    """Return nominal origins, m, and directions, (channel, 3): mid-range on a bar along z that ends at z = 0."""
     standoff = bar_radius + RANGE / 2
     low, high = LEVELS
     origin = [(standoff, 0, low), (standoff, 0, high), (0, standoff, low), (0, standoff, high), (0, 0, -RANGE / 2)]

@@ -105,7 +105,7 @@ class GeometricErrors:
         twist = self.machine.volumetric_error(q, errors, head.inv().apply(np.zeros(3)))
         if not self.description.fixed:
             return twist
-        parts = twist.reshape(-1, 3)  # displacement and rotation by turns
+        parts = twist.reshape(-1, 3)  # rows alternate: displacement, rotation
         return np.asarray(table.rotation.inv().apply(parts)).reshape(twist.shape)
 
     @cached_property
@@ -137,7 +137,7 @@ class GeometricErrors:
 
     @cached_property
     def _places(self) -> Mapping[str, Array]:
-        """Rotational errors of place of each axis, (3,), rad."""
+        """Rotational errors of orientation of each axis, (3,), rad."""
         axes = self.machine.axis_names
         named = {axis: location_names(axis, axes) for axis in axes}
         return {

@@ -1,4 +1,4 @@
-"""Where a beam meets a cylinder, a plane, a sphere: distances along the beam, exact, broadcasting over leading axes."""
+"""Intersections of a beam with cylinder, plane and sphere: exact distances along the beam, over leading axes."""
 
 from __future__ import annotations
 

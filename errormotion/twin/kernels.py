@@ -1,7 +1,7 @@
 """The compiled inner loops: counter-based noise, and the samples of the sensors.
 
-Every random number is a pure function of (key, index), so a sample has the same noise in whatever block it is asked
-for. Nothing here knows of the machine: the loops take nodes, tables and coefficients.
+Every random number is a pure function of (key, index), so a sample has the same noise in any block of a
+stream. The loops are independent of the machine: they take nodes, tables and coefficients.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def compiled(function: Function) -> Function:
 
 @compiled
 def mixed(x: np.uint64) -> np.uint64:
-    """Return x with its 64 bits well mixed (the finaliser of SplitMix64, Steele, Lea and Flood 2014)."""
+    """Return x with its 64 bits mixed (the finaliser of SplitMix64, Steele, Lea and Flood 2014)."""
     x = (x ^ (x >> _S30)) * _MIX_1
     x = (x ^ (x >> _S27)) * _MIX_2
     return x ^ (x >> _S31)
@@ -129,7 +129,7 @@ def rotating_bar(
     turns : ndarray, (node, 3)
         Angle of the spindle behind node k: turns[k] @ (1, dt, dt^2), in turns.
     table : ndarray, (channel, angle + 1)
-        What repeats every turn, m, over one turn; the last column repeats the first.
+        The part that repeats in every turn, m, over one turn; the last column repeats the first.
     noise : ndarray, (channel,)
         White noise of one sample, m.
     keys : ndarray of uint64, (channel,)
@@ -177,20 +177,20 @@ def stepped_sphere(
     keys: NDArray[np.uint64],
     limit: float,
 ) -> None:
-    """Fill ``out`` with readings of a sphere that rests and travels.
+    """Fill ``out`` with readings of a sphere that is moved in steps.
 
     Parameters
     ----------
     out : ndarray, (channel, n)
         Readings of samples first .. first + n - 1, m; NaN out of range, or where the beam misses the sphere.
     begins, ends : ndarray, (rest,)
-        When each rest begins and ends, s; between two rests the sphere travels in a straight line.
+        Start and end of each rest, s; between two rests the sphere moves in a straight line.
     places : ndarray, (rest, 3)
         Centre of the sphere at each rest, m.
     origin, direction : ndarray, (channel, 3)
         Beams, m.
     offset : ndarray, (channel, rest)
-        What the reading has too much at each rest (speckle), m.
+        Deviation of the reading at each rest (speckle), m.
     """
     rests = begins.size
     for c in range(out.shape[0]):

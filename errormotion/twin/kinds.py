@@ -1,4 +1,4 @@
-"""The two virtual machines, as tables: bodies and heat flows, what grows where, and how far the axes travel."""
+"""The two named virtual machines as tables: bodies, heat flows, thermal growth, chain and travel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Table = Mapping[str, float]
 
 @dataclass(frozen=True)
 class MachineKind:
-    """One virtual machine before a seed makes it an individual.
+    """One virtual machine without the individual deviations that a seed adds.
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class MachineKind:
     growth : mapping
         Error of the spindle to (body to um/K or urad/K), at the end of the bar.
     behind : tuple of str
-        Bodies behind the last axis. They displace and tilt the spindle; the others also turn the frame of the axes.
+        Bodies behind the last axis. They displace and tilt the spindle; the others also rotate the frame of the axes.
     compensation : mapping
         Axis to (steady correction at top speed in m, time constant of the control's model in s).
     top_speed : float
         1/min.
     rapid : float
-        Feed of moves as fast as the machine can, m/s.
+        Feed of rapid moves, m/s.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The virtual machine: one seeded individual, its truth, and what the sensors read on it."""
+"""The virtual machine: one seeded individual, its true errors, and the readings of its sensors."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from errormotion.twin.sensing import Sensing
 from errormotion.twin.stage_sensor import StageSensor
 from errormotion.twin.state import ThermalState, seeded_state
 
-#: the spindle reaches full speed in this time, s
+#: time to full spindle speed, s
 SPIN_UP_TIME = 0.75
-#: sensors count as warm when they have been on for this time, s
+#: time since switching on after which sensors are warm, s
 WARM_AFTER = 4 * 3600.0
 
 _PARTS = ("heat", "frame", "bar", "geometry", "crossbeam", "point_sensor", "probing")
@@ -38,8 +38,8 @@ _PART = {name: number for number, name in enumerate(_PARTS)}
 class VirtualMachine(StageSensor, ProbeMeasurements):
     """A machine tool whose true errors are known.
 
-    The seed makes an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
-    schedule give the same numbers, whatever is asked for in which order.
+    The seed selects an individual: thermal amplitudes, beams, bar, geometric errors, noise. The same seed and the same
+    schedule give the same numbers, independent of the order of the calls.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     frame : FrameGeometry
         The five sensors.
     bar : Bar
-        The bar as it truly is; ``bar_radius`` is what its certificate says, m.
+        The true bar; ``bar_radius`` is the radius in its certificate, m.
     sphere_radius : float
         m.
     state : ThermalState
@@ -78,7 +78,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     crossbeam : Crossbeam
         Thermal errors of the Y axis of the gantry, and the line profiler in its spindle.
     point_sensor, sine_gauge, check_bar
-        A point sensor on the stage and what it looks at.
+        A point sensor on the stage, and its targets.
     """
 
     def __init__(self, machine: str | MachineDescription = "cframe", seed: int = 0, *, warm: bool = True) -> None:
@@ -115,10 +115,10 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
     def _sense(self) -> Sensing:
         return Sensing(self.seed, self.frame, self.bar, self.sphere_radius, self.state, self.sensors_on_for)
 
-    # ------------------------------------------------------------------ what it does
+    # ------------------------------------------------------------------ commands
 
     def start(self, schedule: Sequence[Event] = ()) -> None:
-        """Begin anew at time 0, cold and at rest, with what is commanded from then on.
+        """Restart at time 0, cold and at rest, with a schedule of commands.
 
         Raises
         ------
@@ -129,26 +129,26 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         self._sensing = self._sense()
 
     def command(self, event: Event) -> None:
-        """Add to the schedule what is commanded at a time; all before that time stays as it was.
+        """Add a command to the schedule; the state before its time stays unchanged.
 
-        What the schedule holds for later times stays as well, and what it holds for the same time comes first.
+        Later commands of the schedule stay, and those of the same time are executed before it.
 
         Raises
         ------
         BenchError
-            As `start`; the schedule stays as it was.
+            As `start`; the schedule stays unchanged.
         """
         events = sorted([*self._events, event], key=lambda each: each.time)
         self.start(events)
 
     def stop_spindle(self, time: float) -> None:
-        """Stop the spindle at a time, s, and take what was commanded for it later out of the schedule."""
+        """Stop the spindle at a time, s, and remove its later commands from the schedule."""
         events = [event if event.time < time else replace(event, spindle_speed=None) for event in self._events]
         self.start(events)
         self.command(Event(time, spindle_speed=0.0))
 
     def forget(self, events: Sequence[Event], time: float) -> None:
-        """Take events from a time on, s, out of the schedule, wherever they are in it."""
+        """Remove these events from the schedule, as far as they are at or after a time, s."""
         self.start([each for each in self._events if each.time < time or each not in events])
 
     @property
@@ -167,12 +167,12 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
 
     @property
     def temperature_sensors(self) -> tuple[str, ...]:
-        """Names of the places whose temperature is known."""
+        """Names of the temperature sensors."""
         return self.state.sensors
 
     @property
     def spindle_functional_point(self) -> Array:
-        """Where the cold axis of rotation meets the end of the bar, m, shape (3,)."""
+        """Intersection of the cold axis of rotation with the end of the bar, m, shape (3,)."""
         return self.bar.point.copy()
 
     def temperatures(self, t: ArrayLike) -> Array:
@@ -221,7 +221,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         gives.
         """
         if axis not in self.geometry.motions:
-            raise BenchError(f"The axes are {', '.join(self.geometry.motions)}; found {axis!r}.")
+            raise BenchError(f"expected one of the axes {', '.join(self.geometry.motions)}; found {axis!r}")
         q = _times(positions)
         (joint,) = (each for each in self.geometry.machine.joints if each.name == axis)
         coords = {axis.lower(): ("position", q, {"units": "rad" if joint.rotary else "m"})}
@@ -271,7 +271,7 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         tool: str = "bar",
         motion: StepProgram | None = None,
     ) -> Array:
-        """Return what the sensors read: samples first .. first + n - 1 of their streams.
+        """Return the readings of the sensors: samples first .. first + n - 1 of their streams.
 
         Parameters
         ----------
@@ -282,17 +282,17 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         channels : sequence of str, optional
             Which sensors; all where not given.
         tool : {"bar", "sphere"}
-            What is in the spindle.
+            Mounted in the spindle.
         motion : StepProgram, optional
-            How the sphere moves; needed for the sphere.
+            Motion of the sphere; required for the sphere.
 
         Returns
         -------
         ndarray, (channel, n)
-            m; NaN out of the measuring range and where a beam misses.
+            m; NaN outside of the measuring range and where a beam misses the target.
         """
         if first < 0 or n < 0 or not rate > 0:
-            raise BenchError(f"Samples need first >= 0, n >= 0, rate > 0; found {first}, {n}, {rate} Hz.")
+            raise BenchError(f"expected first >= 0, n >= 0 and a rate above 0 Hz; found {first}, {n}, {rate} Hz")
         chosen = self._chosen(channels)
         out = np.full((chosen.size, n), np.nan)
         if tool == "bar":
@@ -300,16 +300,14 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         elif tool == "sphere" and motion is not None:
             self._sensing.read_sphere(out, first, float(rate), chosen, motion)
         else:
-            raise BenchError(
-                f"The spindle holds a 'bar', or a 'sphere' with a StepProgram; found {tool!r}, {motion!r}."
-            )
+            raise BenchError(f"expected the tool 'bar', or 'sphere' with a StepProgram; found {tool!r}, {motion!r}")
         return out
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)
         unknown = [name for name in names if name not in self.frame.channels]
         if unknown:
-            raise BenchError(f"The channels are {', '.join(self.frame.channels)}; found {', '.join(unknown)}.")
+            raise BenchError(f"expected channels of {', '.join(self.frame.channels)}; found {', '.join(unknown)}")
         return np.array([self.frame.channels.index(name) for name in names], dtype=np.int64)
 
 

@@ -1,4 +1,4 @@
-"""Where the axes of the machine are at what time: straight pieces, each at a constant feed, without acceleration."""
+"""Positions of the axes over time: straight pieces, each at a constant feed, without acceleration."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 
-#: a move along Y that warms the crossbeam up: at this feed at least, m/s, and longer than this, m
+#: least feed, m/s, and length, m, of a move along Y that warms up the crossbeam
 WARM_UP_FEED, WARM_UP_WAY = 2.0 / 60, 0.2
 _ROUNDING = 1e-6  # counts
 
 
 @dataclass(frozen=True)
 class Path:
-    """The way of the axes X, Y, Z.
+    """The path of the axes X, Y, Z.
 
     Attributes
     ----------
     times : ndarray, (n,)
         Increasing, s. Before the first and after the last of them the machine stands still.
     places : ndarray, (n, 3)
-        Commanded, m. Where two that follow one another are the same, the machine dwells.
+        Commanded, m. Two equal positions in succession are a dwell.
     rapid : ndarray of bool, (n - 1,)
-        Which of the pieces are moves between two works, as fast as the machine can.
+        Which of the pieces are rapid moves.
     """
 
     times: Array
@@ -39,12 +39,12 @@ class Path:
 
     @property
     def begin(self) -> float:
-        """When the first piece begins, s."""
+        """Start of the first piece, s."""
         return float(self.times[0])
 
     @property
     def end(self) -> float:
-        """When the last piece has ended, s."""
+        """End of the last piece, s."""
         return float(self.times[-1])
 
     @property
@@ -53,11 +53,11 @@ class Path:
         return self.end - self.begin
 
     def beginning(self, time: float) -> Path:
-        """Return the same path, begun at another time, s."""
+        """Return the same path with another start time, s."""
         return replace(self, times=self.times - self.begin + time)
 
     def place(self, t: ArrayLike) -> Array:
-        """Return where the machine is at times t (...), m, shape (..., 3)."""
+        """Return the positions at times t (...), s; m, shape (..., 3)."""
         t = np.asarray(t, dtype=float)
         return np.stack([np.interp(t, self.times, axis) for axis in self.places.T], axis=-1)
 
@@ -71,7 +71,7 @@ class Path:
         return Path(times, places, self.rapid[:last])
 
     def feed(self, time: float) -> float:
-        """Return how fast the machine moves at a time, m/s."""
+        """Return the feed at a time, m/s."""
         piece = int(np.searchsorted(self.times, time, side="right")) - 1
         if not 0 <= piece < len(self.times) - 1:
             return 0.0
@@ -79,10 +79,10 @@ class Path:
         return float(way / (self.times[piece + 1] - self.times[piece]))
 
     def warm_up(self) -> float | None:
-        """Return when the first move begins that warms the crossbeam up, s; None where there is none.
+        """Return the start of the first move that warms up the crossbeam, s; None without one.
 
-        That is a move along Y at `WARM_UP_FEED` or faster over more than `WARM_UP_WAY`, but no rapid one: a measuring
-        pass that returns in rapid is no warm-up.
+        It is a move along Y at `WARM_UP_FEED` or faster over more than `WARM_UP_WAY` that is not rapid: a measuring
+        pass with a rapid return is not a warm-up.
         """
         way, seconds = np.abs(np.diff(self.places[:, 1])), np.diff(self.times)
         warming = (way > WARM_UP_WAY) & (way >= WARM_UP_FEED * seconds * (1 - 1e-9)) & ~self.rapid
@@ -94,17 +94,17 @@ class Path:
         return [int(piece) for piece in np.flatnonzero(forwards)]
 
     def crossings(self, piece: int, count: float, start: int, step: int) -> tuple[NDArray[np.int64], Array]:
-        """Return at which counts an encoder on Y triggers during a piece in +Y, and when.
+        """Return the counts and times at which an encoder on Y triggers during a piece in +Y.
 
-        It triggers wherever its count is a multiple of ``step``, at the end of the piece but not at its begin, so that
-        two pieces that follow one another trigger once where they meet.
+        It triggers where its count is a multiple of ``step``, at the end of the piece but not at its start, so that
+        successive pieces trigger once at their common position.
 
         Parameters
         ----------
         piece : int
             Number of the piece.
         count : float
-            Way of one count, m.
+            Distance per count, m.
         start : int
             Count at Y = 0.
         step : int

@@ -1,4 +1,4 @@
-"""What a point sensor looks at: a plane of a sine gauge on a turntable, and a check bar."""
+"""Targets of a point sensor: a plane of a sine gauge on a turntable, and a check bar."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from errormotion.errors import BenchError
 from errormotion.kinematics.beams import turned
 from errormotion.twin import kernels
 
-#: radius and length of the check bar by its certificate, m, and how far the true radius is off (one sigma), m
+#: radius and length of the check bar by its certificate, m, and deviation of the true radius (one sigma), m
 BAR_RADIUS, BAR_LENGTH, BAR_RADIUS_ERROR = 25e-3, 0.2, 0.3e-6
-#: how far the bar lies off the machine's axis, rad (one sigma, each direction)
+#: deviation of the bar from the machine's axis, rad (one sigma, each direction)
 BAR_MISALIGNMENT = 0.2e-3
 
 
@@ -28,7 +28,7 @@ class Plane:
     point : ndarray, (3,)
         m.
     reach : float
-        How far from the point the face goes, m.
+        Radius of the face about the point, m.
     """
 
     normal: Array
@@ -36,7 +36,7 @@ class Plane:
     reach: float = np.inf
 
     def meet(self, origins: Array, direction: Array) -> tuple[Array, Array]:
-        """Return how far beams from origins (n, 3) go, m, shape (n,), NaN for a miss, and the normals there (n, 3)."""
+        """Return the lengths of beams from origins (n, 3), m, (n,), NaN for a miss, and the normals there (n, 3)."""
         facing = float(self.normal @ direction)
         if facing >= 0:
             return np.full(len(origins), np.nan), np.broadcast_to(self.normal, origins.shape)
@@ -47,7 +47,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class CheckBar:
-    """A cylinder that lies on the table.
+    """A cylinder on the table.
 
     Attributes
     ----------
@@ -56,9 +56,9 @@ class CheckBar:
     axis : ndarray, (3,)
         Unit vector.
     nominal_axis : ndarray, (3,)
-        Along which it was laid.
+        Nominal direction.
     radius, certified_radius : float
-        As it is, and by the certificate, m.
+        True, and in the certificate, m.
     length : float
         m.
     """
@@ -71,7 +71,7 @@ class CheckBar:
     length: float = BAR_LENGTH
 
     def meet(self, origins: Array, direction: Array) -> tuple[Array, Array]:
-        """Return how far beams from origins (n, 3) go, m, shape (n,), NaN for a miss, and the normals there (n, 3)."""
+        """Return the lengths of beams from origins (n, 3), m, (n,), NaN for a miss, and the normals there (n, 3)."""
         start = origins - self.point
         w = start - (start @ self.axis)[:, None] * self.axis
         v = direction - (direction @ self.axis) * self.axis
@@ -88,20 +88,20 @@ Target = Plane | CheckBar
 
 @dataclass(frozen=True)
 class SineGauge:
-    """A sine gauge on a turntable about Z: its face at any inclination and rotation goes through one place, nearly.
+    """A sine gauge on a turntable about Z: its face at any inclination and rotation goes nearly through one point.
 
     Attributes
     ----------
     seed : int
-        Of what goes wrong in setting it.
+        Of the deviations of each setting.
     pivot : ndarray, (3,)
-        That place, m.
+        That point, m.
     point_uncertainty : float
-        How far the face is off it along its normal, new at every setting, m (one sigma).
+        Deviation of the face along its normal, independent at every setting, m (one sigma).
     angle_uncertainty : float
-        How far its normal is off, each direction across, new at every setting, rad (one sigma).
+        Deviation of its normal in each direction, independent at every setting, rad (one sigma).
     reach : float
-        How far the face goes from the pivot, m.
+        Radius of the face about the pivot, m.
     steepest : float
         Greatest inclination, rad.
     """
@@ -114,37 +114,37 @@ class SineGauge:
     steepest: float = np.radians(60.0)
 
     def nominal_normal(self, inclination: float, rotation: float) -> Array:
-        """Return the normal, (3,), that a setting is meant to have.
+        """Return the nominal normal, (3,), of a setting.
 
         Parameters
         ----------
         inclination : float
             Of the face to the table, rad.
         rotation : float
-            Of the turntable, rad; at 0 the face inclines towards +X, its normal leans to +X.
+            Of the turntable, rad; at 0 the face inclines towards +X, and its normal towards +X.
 
         Raises
         ------
         BenchError
-            The gauge does not go so steep.
+            The inclination is larger than that of the gauge.
         """
         if not 0 <= inclination <= self.steepest:
             raise BenchError(
-                f"The sine gauge takes inclinations from 0 to {np.degrees(self.steepest):g} deg; found "
-                f"{np.degrees(inclination):g} deg."
+                f"expected an inclination from 0 to {np.degrees(self.steepest):g} deg; found "
+                f"{np.degrees(inclination):g} deg"
             )
         flat = np.sin(inclination)
         return np.array([flat * np.cos(rotation), flat * np.sin(rotation), np.cos(inclination)])
 
     def plane(self, inclination: float, rotation: float, setting: int = 0) -> tuple[Array, Array]:
-        """Return the true normal (3,) and a true point (3,), m, of the face as it was set.
+        """Return the true normal (3,) and a true point (3,), m, of the face of a setting.
 
         Parameters
         ----------
         inclination, rotation : float
             Commanded, rad, see `nominal_normal`.
         setting : int
-            Which time it is set: another one, another small error.
+            Number of the setting, which selects its deviations.
         """
         normal = self.nominal_normal(inclination, rotation)
         bits = np.array([inclination, rotation], dtype=np.float64).view(np.int64)
@@ -153,12 +153,12 @@ class SineGauge:
         return true, self.pivot + self.point_uncertainty * errors[2] * true
 
     def face(self, inclination: float, rotation: float, setting: int = 0) -> Plane:
-        """Return the face as it was set, see `plane`, as something to look at."""
+        """Return the face of a setting, see `plane`, as a target."""
         return Plane(*self.plane(inclination, rotation, setting), self.reach)
 
 
 def seeded_check_bar(rng: np.random.Generator, point: Array) -> CheckBar:
-    """Return a bar that lies along Y, nearly."""
+    """Return a bar approximately along Y."""
     nominal = np.array([0.0, 1.0, 0.0])
     axis = turned(nominal, BAR_MISALIGNMENT * rng.normal(size=2))
     return CheckBar(point, axis, nominal, BAR_RADIUS + BAR_RADIUS_ERROR * float(rng.normal()))

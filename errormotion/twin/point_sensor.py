@@ -1,4 +1,4 @@
-"""A point laser sensor on the machine's stage: where its beam is meant to be, where it is, and what it reads."""
+"""A point laser sensor on the machine's stage: its nominal and true beam, and its readings."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from errormotion.kinematics.beams import tilt, turned
 from errormotion.twin.planes import Target
 from errormotion.twin.triangulation import Optics, key_of, speckle
 
-#: place of the zero point while the stage stands at 0, by the drawing, m
+#: nominal position of the zero point with the stage at 0, m
 NOMINAL_ORIGIN = (0.05, 0.0, -0.08)
-#: how the beam leans away from -Z, by the drawing, rad
+#: nominal angle of the beam to -Z, rad
 NOMINAL_LEAN = np.radians(20.0)
-#: how far the beam is off the drawing: zero point in each direction, m; direction, rad; about itself, rad (one sigma)
+#: deviation of the beam: zero point in each direction, m; direction, rad; about itself, rad (one sigma)
 OFF_ORIGIN, OFF_DIRECTION, OFF_ROLL = 0.1e-3, np.radians(0.3), np.radians(0.5)
 
 
@@ -24,23 +24,23 @@ OFF_ORIGIN, OFF_DIRECTION, OFF_ROLL = 0.1e-3, np.radians(0.3), np.radians(0.5)
 class PointSensor:
     """A beam from a zero point along a direction; a reading d puts a surface point at origin + stage + d direction.
 
-    Depth counts from the zero point as a reading does, but is true.
+    Depth is the true distance from the zero point.
 
     Attributes
     ----------
     nominal_origin, nominal_direction, nominal_triangulation_normal : ndarray, (3,)
-        By the drawing: where the reading is 0 while the stage stands at 0, m; from the sensor to the target, unit;
-        normal of the plane of emitted and received beam, unit.
+        Nominal: point where the reading is 0 with the stage at 0, m; unit vector from the sensor to the target;
+        unit normal of the plane of emitted and received beam.
     true_origin, true_direction, triangulation_normal : ndarray, (3,)
-        As they are.
+        The same, true.
     range : (low, high)
-        Depths that the sensor sees, m.
+        Measuring range in depth, m.
     optics : Optics
-        What the tilt of the surface does.
+        Effect of the tilt of the surface.
     noise : float
         White noise of one reading, m (one sigma).
     speckle, speckle_length : float
-        What the surface's texture does to a reading, m (one sigma), and the way of the sensor over it on which that
+        Effect of the surface's texture on a reading, m (one sigma), and the path over it on which the effect
         loses its correlation, m.
     warm_up, warm_up_time : float
         Rise of the reading after switching on, m, and its time constant, s.
@@ -62,11 +62,11 @@ class PointSensor:
 
     @property
     def mid_range(self) -> float:
-        """Depth at which the tilt of the surface does nothing, m."""
+        """Depth at which the tilt of the surface has no effect, m."""
         return (self.range[0] + self.range[1]) / 2
 
     def from_start(self, measuring_range: float) -> PointSensor:
-        """Return the same beam as a sensor with another range sees it, which counts from the start of its range, m."""
+        """Return the same beam of a sensor with another range, whose readings count from the start of the range, m."""
         shift = self.mid_range - measuring_range / 2
         return replace(
             self,
@@ -76,27 +76,27 @@ class PointSensor:
         )
 
     def slope(self, q: ArrayLike) -> Array:
-        """Return the error of the reading per depth from mid-range at tilt vectors (..., 2), 1; NaN where unseen."""
+        """Return the error of the reading per depth from mid-range at tilt vectors (..., 2), 1; NaN without light."""
         return self.optics.slope(q)
 
     def still(self, target: Target, stage: Array, *, inclination_error: bool = True, beyond: bool = False) -> Array:
-        """Return what the warm sensor reads without noise and speckle.
+        """Return the readings of the warm sensor without noise and speckle.
 
         Parameters
         ----------
         target : Plane or CheckBar
-            What it looks at.
+            The surface.
         stage : ndarray, (n, 3)
-            Places of the stage, m.
+            Positions of the stage, m.
         inclination_error : bool
-            Whether the tilt of the surface matters.
+            Whether the tilt of the surface has its effect.
         beyond : bool
             Whether a surface before or behind the range reads as minus or plus infinity, and not as NaN.
 
         Returns
         -------
         ndarray, (n,)
-            m; NaN out of range, where the beam misses, and where no light comes back.
+            m; NaN outside of the range, where the beam misses the target, and without received light.
         """
         depth, normals = target.meet(self.true_origin + stage, self.true_direction)
         slope = self.slope(tilt(self.true_direction, self.triangulation_normal, normals))
@@ -108,33 +108,33 @@ class PointSensor:
         return reading if beyond else np.where(np.isinf(reading), np.nan, reading)
 
     def speckles(self, key: tuple[int, ...], stage: Array) -> Array:
-        """Return what the texture of a target adds to the readings at stage places (n, 3), m, shape (n,).
+        """Return the effect of a target's texture on the readings at stage positions (n, 3), m, shape (n,).
 
         Parameters
         ----------
         key : tuple of int
-            Another target, another texture.
+            Of the texture; each target has its own.
         stage : ndarray, (n, 3)
-            The sensor's way over the target, m, whether across it or towards it.
+            Positions of the sensor relative to the target, m, across it and towards it.
         """
         return self.speckle * speckle(key_of(*key), stage, self.speckle_length)
 
     def warm_up_offset(self, since_on: ArrayLike) -> Array:
-        """Return what the readings lack of their settled value, m (not positive)."""
+        """Return the readings less their settled values, m (not positive)."""
         return np.asarray(-self.warm_up * np.exp(-np.asarray(since_on, dtype=float) / self.warm_up_time))
 
 
 def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, azimuth: float = 0.0) -> PointSensor:
-    """Return a sensor whose beam is off its drawing by about 0.1 mm and 0.3 deg.
+    """Return a sensor whose beam deviates from nominal by about 0.1 mm and 0.3 deg.
 
     Parameters
     ----------
     rng : Generator
-        Which individual.
+        Of the individual.
     lean : float
         Angle of the nominal beam to -Z, rad.
     azimuth : float
-        In which direction it leans, rad; 0 = towards +X.
+        Direction of this angle, rad; 0 = towards +X.
     """
     towards = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     nominal = np.sin(lean) * towards - np.cos(lean) * np.array([0.0, 0.0, 1.0])
@@ -163,5 +163,5 @@ def seeded_point_sensor(rng: np.random.Generator, lean: float = NOMINAL_LEAN, az
 
 
 def _limited(rng: np.random.Generator, n: int) -> Array:
-    """Return normal numbers that keep within 2."""
+    """Return normal numbers within 2."""
     return np.clip(rng.normal(size=n), -2.0, 2.0)

@@ -1,11 +1,11 @@
-"""Balls on the table, touched by the machine itself: where the probe trips, and the truth behind it.
+"""Balls on the table, probed by the machine: positions at which the probe trips, and the true errors.
 
-The tip of the probe stands where the bar ended. Where the machine believes it to be at p, it is at p + e(p, t):
+The tip of the probe has the position of the end of the bar. Where the control displays p, the tip is at p + e(p, t):
 
     e(p, t) = E(t) + R(t) x M (p - f) + g(p)
 
-E is the thermal displacement of the spindle with the tip at f, R the part of its rotation that turns the frame of the
-axes, M keeps the axes that carry the tool (the others carry the table, which does not turn), and g is the geometric
+E is the thermal displacement of the spindle with the tip at f, R the part of its rotation that rotates the frame of the
+axes, M selects the axes that carry the tool (the others carry the table, which does not rotate), and g is the geometric
 error.
 """
 
@@ -25,11 +25,11 @@ from errormotion.twin.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
 
-#: balls on the table unless more are asked for
+#: default number of balls on the table
 BALLS = 4
-#: of a temperature sensor, K (one sigma)
+#: noise of a temperature sensor, K (one sigma)
 TEMPERATURE_NOISE = 0.02
-#: the probe has come free when the tip is this far off a ball, m
+#: distance of the tip from a ball at which the probe is released, m
 RELEASE = 3e-6
 
 _TRIGGER, _THERMOMETER = 60, 61
@@ -38,7 +38,7 @@ _NO_SHIFT = np.zeros(3)
 
 
 class ProbeMeasurements:
-    """What a machine with a touch probe in its spindle and balls on its table can measure.
+    """A touch probe in the spindle, and balls on the table.
 
     Attributes
     ----------
@@ -60,12 +60,12 @@ class ProbeMeasurements:
 
     @property
     def spindle_functional_point(self) -> Array:
-        """Where the cold axis of rotation meets the end of the bar, m, shape (3,)."""
+        """Intersection of the cold axis of rotation with the end of the bar, m, shape (3,)."""
         raise NotImplementedError
 
     @property
     def temperature_sensors(self) -> tuple[str, ...]:
-        """Names of the places whose temperature is known."""
+        """Names of the temperature sensors."""
         raise NotImplementedError
 
     def temperatures(self, t: ArrayLike) -> Array:
@@ -94,20 +94,20 @@ class ProbeMeasurements:
 
     @property
     def probing_functional_point(self) -> Array:
-        """Commanded place of the tip at which it is where the bar ended, m, shape (3,)."""
+        """Commanded position of the tip at which it is at the end of the bar, m, shape (3,)."""
         return self.spindle_functional_point
 
     def balls_on_table(self, count: int = BALLS) -> Balls:
-        """Return the balls when there are 1 to 8 of them; the first ones are always the same."""
+        """Return 1 to 8 balls; the first ones are always the same."""
         return self._all_balls.first(count)
 
     def probe_error(self, p: ArrayLike, t: ArrayLike) -> Array:
-        """Return where the tip is minus where the machine believes it to be, m, shape (n, 3).
+        """Return the true position of the tip minus the displayed one, m, shape (n, 3).
 
         Parameters
         ----------
         p : (n, 3) or (3,)
-            Commanded places of the tip, m.
+            Commanded positions of the tip, m.
         t : (n,) or scalar
             s.
         """
@@ -116,19 +116,19 @@ class ProbeMeasurements:
         return self._error_at(times)(places)
 
     def truth_probing(self, t: ArrayLike, functional_point: ArrayLike | None = None) -> xr.Dataset:
-        """Return what probing can see of the thermal error, as an error dataset over ``time``, without uncertainty.
+        """Return the thermal error that probing can determine, as an error dataset over ``time``, without uncertainty.
 
-        EX, EY, EZ are the displacement of the tip at ``functional_point``; EA, EB, EC the turn of the frame of the
-        axes. A tilt of the spindle behind the last axis displaces all balls alike and is in the displacement alone.
-        On a machine whose table moves, ask for each functional point anew: the error there is not the rigid motion of
-        the one here.
+        EX, EY, EZ are the displacement of the tip at ``functional_point``; EA, EB, EC the rotation of the frame of the
+        axes. A tilt of the spindle behind the last axis displaces all balls equally and is in the displacement only.
+        On a machine whose table moves, call this for each functional point: the error there is not the rigid motion of
+        the one at another point.
 
         Parameters
         ----------
         t : (n,)
             Times, s, increasing.
         functional_point : (3,), optional
-            Commanded place of the tip, m; ``probing_functional_point`` where not given.
+            Commanded position of the tip, m; ``probing_functional_point`` where not given.
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
         point = self.probing_functional_point if functional_point is None else np.asarray(functional_point, dtype=float)
@@ -144,12 +144,12 @@ class ProbeMeasurements:
         return truth.dataset(np.hstack([displacement, turn]), *where)
 
     def _carried(self, place: Array) -> Array:
-        """Return M (p - f): the lever that turns with the frame of the axes, m."""
+        """Return M (p - f): the lever that rotates with the frame of the axes, m."""
         carried = np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)
         return np.asarray(carried * (place - self.probing_functional_point))
 
     def _error_at(self, times: Array) -> ErrorAt:
-        """Return the error of the tip at given times as a function of its commanded places (n, 3)."""
+        """Return the error of the tip at given times as a function of its commanded positions (n, 3)."""
         twist, turn = self.state.twist_and_turn(times)
 
         def error(places: Array) -> Array:
@@ -160,14 +160,14 @@ class ProbeMeasurements:
     # ------------------------------------------------------------------ contacts
 
     def probe_gap(self, p: ArrayLike, t: ArrayLike, *, balls: Balls | None = None) -> Array:
-        """Return how far the tip is from tripping on the nearest ball, m, shape (n,); 0 or less: it is tripped.
+        """Return the distance of the tip from tripping on the nearest ball, m, shape (n,); 0 or less: tripped.
 
         Without the scatter of the trigger.
 
         Parameters
         ----------
         p : (n, 3) or (3,)
-            Commanded places of the tip, m.
+            Commanded positions of the tip, m.
         t : (n,) or scalar
             s.
         balls : Balls, optional
@@ -184,7 +184,7 @@ class ProbeMeasurements:
         return np.asarray(np.min(gaps, axis=0))
 
     def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
-        """Whether a probe that has tripped is free again with the tip at a commanded place p (3,), m."""
+        """Whether a probe that has tripped is released with the tip at a commanded position p (3,), m."""
         return bool(self.probe_gap(p, t, balls=balls)[0] > RELEASE)
 
     def contact(
@@ -198,30 +198,30 @@ class ProbeMeasurements:
         noise: bool = True,
         leaving: bool = False,
     ) -> tuple[Array | None, float]:
-        """Return where the probe trips on the straight way from ``start`` to ``target``.
+        """Return the position at which the probe trips on the straight path from ``start`` to ``target``.
 
         Parameters
         ----------
         start, target : (3,)
-            Commanded places of the tip, m.
+            Commanded positions of the tip, m.
         t : float
-            When it is at the start, s.
+            Time at the start, s.
         feed : float, optional
-            m/s; where not given, the way takes no time.
+            m/s; where not given, the path takes no time.
         balls : Balls, optional
             `balls` where not given.
         noise : bool
-            Whether the trigger scatters: by a number that belongs to this way at this time.
+            Whether the trigger scatters, by a number that depends on the path and the time.
         leaving : bool
-            Whether the probe may be tripped at the start by a ball that it then moves off.
+            Whether the probe may have tripped at the start on a ball from which it moves away.
 
         Returns
         -------
         position : ndarray (3,) or None
-            Commanded place of the tip when the probe trips, m; None where nothing is in the way. The start, where the
-            probe is tripped there.
+            Commanded position of the tip when the probe trips, m; None without contact. The start, where the
+            probe has tripped there.
         distance : float
-            Way from the start to there, or to the target, m.
+            Path length from the start to there, or to the target, m.
         """
         balls = self.balls if balls is None else balls
         begin, end = np.asarray(start, dtype=float), np.asarray(target, dtype=float)
@@ -235,7 +235,7 @@ class ProbeMeasurements:
         scatter = self.probe.noise * self._trigger(begin, end, t) if noise else 0.0
         times = np.full(count, float(t))
         way = np.full(count, np.nan)
-        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact follows from its place
+        for _ in range(1 if feed is None else 3):  # with a feed, the time of the contact follows from its position
             way = self._way(begin, direction, np.arange(count), balls, self._error_at(times), np.full(count, scatter))
             times = t + np.where(np.isfinite(way), way, 0.0) / feed if feed else times
         way = way[way <= length]
@@ -253,7 +253,7 @@ class ProbeMeasurements:
         scatter: Array,
         shift: Array,
     ) -> Array:
-        """Return where the probe trips on given balls, each approached on a straight path that takes no time.
+        """Return the positions at which the probe trips on given balls, each on a straight path that takes no time.
 
         Parameters
         ----------
@@ -278,7 +278,7 @@ class ProbeMeasurements:
         return np.asarray(start + distance[:, None] * direction)
 
     def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
-        """Return how far the tip's centre is from that of a ball when the probe trips, m."""
+        """Return the distance of the tip's centre from that of a ball when the probe trips, m."""
         return np.asarray(balls.height(ball, normal) + self.probe.tip_radius - self.probe.pretravel(normal))
 
     def _way(
@@ -291,11 +291,11 @@ class ProbeMeasurements:
         scatter: Array,
         shift: Array = _NO_SHIFT,
     ) -> Array:
-        """Return the way of the tip along unit directions (n, 3) until it trips on a ball each (n,), m; NaN: never.
+        """Return the path length of the tip along unit directions (n, 3) to the trip on a ball each (n,), m; NaN: none.
 
-        It trips never on a ball that it moves off, and at once where it is tripped and does not.
+        It does not trip on a ball from which it moves away, and trips immediately where it touches and approaches.
 
-        The error of the tip and the reach towards a ball vary by 1e-4 of the way at most: a few rounds settle them.
+        The error of the tip and the reach towards a ball vary by 1e-4 of the path at most: a few iterations converge.
         """
         centre = balls.centre[ball] + shift
         way = np.einsum("ni,ni->n", centre - start, direction)
@@ -315,16 +315,16 @@ class ProbeMeasurements:
         return np.asarray(np.maximum(way, 0.0))
 
     def _trigger(self, start: Array, target: Array, t: float) -> float:
-        """Return a standard normal number that belongs to a way at a time."""
+        """Return a standard normal number that depends on a path and a time."""
         bits = np.array([*start, *target, t], dtype=float).view(np.int64)
         return float(kernels.normal(kernels.stream_key(self.seed, _TRIGGER, *bits), 0))
 
     # ------------------------------------------------------------------ temperatures
 
     def sensor_temperatures(self, t: ArrayLike, *, seed: int = 0, noise: float = TEMPERATURE_NOISE) -> Array:
-        """Return what sensors at all places read at times t, degC, shape (n, sensor).
+        """Return the readings of all temperature sensors at times t, degC, shape (n, sensor).
 
-        The noise of a reading belongs to its sensor and time, whatever else is asked.
+        The noise of a reading depends on its sensor and time only.
         """
         times = np.atleast_1d(np.asarray(t, dtype=float))
         readings = self.temperatures(times)

@@ -1,4 +1,4 @@
-"""The line profiler in the spindle: its properties, its disturbances, and its profiles."""
+"""A line profiler in the spindle: its properties, its disturbances, and its profiles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _JITTER_Y, _BLOBS, _STREAMS = 1, 2, 10
 
 @dataclass(frozen=True)
 class Disturbances:
-    """Disturbances of the heights of a real profiler. Zero disables one; infinity disables the limit of slope.
+    """Disturbances of the heights by a real profiler. Zero switches a part off, infinity the limit of the slope.
 
     Attributes
     ----------
@@ -27,14 +27,14 @@ class Disturbances:
     speckle, speckle_points : float
         Standard deviation, m, and number of points over which its correlation falls to 1/e.
     steepest : float
-        Slope beyond which there is no reading, 1.
+        Slope above which there is no reading, 1.
     edge_lift, edge_reach, edge_loss : float
         Stray light at edges: a lift in m, half of it random, which falls off within the reach (m); in the innermost
         third of it this share of the points is lost.
     outliers, outlier_spread : float
-        Ambient light: share of points that are off, and by how much, standard deviation, m.
+        Ambient light: share of outliers, and their standard deviation, m.
     missing : float
-        Share of points without a reading anywhere.
+        Share of points without a reading.
     blobs, blob_radius : float
         Patches without readings in each scan, and their mean radius, m.
     """
@@ -66,7 +66,7 @@ class Disturbances:
         return cls(noise=noise, steepest=np.inf, outliers=0.0, missing=0.0, blobs=0, **off)
 
     def sizes(self) -> Array:
-        """Return what the compiled loop takes, shape (11,)."""
+        """Return the values for the compiled loop, shape (11,)."""
         keep = np.exp(-1 / self.speckle_points) if self.speckle_points > 0 else 0.0
         edge = (self.edge_lift, self.edge_reach, self.edge_loss)
         light = (self.outliers, self.outlier_spread, self.missing)
@@ -75,7 +75,7 @@ class Disturbances:
 
 @dataclass(frozen=True)
 class Profiler:
-    """A line profiler: it reads z of its own frame at positions x of its own frame, in the plane y = 0.
+    """A line profiler: it measures z at positions x of its own frame, in the plane y = 0.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Profiler:
     low, high : float
         Measuring range in z, m.
     disturbances : Disturbances
-        What is wrong with it.
+        Of the heights.
     """
 
     points: int = 3200
@@ -101,17 +101,17 @@ class Profiler:
         return np.asarray((np.arange(self.points) - self.points // 2) * self.pitch, dtype=float)
 
     def scan(self, artefact: Artefact, poses: Array, *, key: tuple[int, ...] = (0,)) -> Array:
-        """Return the profiles that it takes of an artefact.
+        """Return the profiles of an artefact.
 
         Parameters
         ----------
         artefact : Artefact
-            The artefact.
+            The piece.
         poses : ndarray, (line, 4, 4)
-            Takes coordinates of the profiler's frame at each line to those of the artefact's; m. Jitter along the feed
+            From the profiler's frame at each line to the artefact's; m. Jitter along the feed
             shifts a line in the direction from its neighbour before to its neighbour behind.
         key : tuple of int
-            Of the random streams: another key, another scan; the same key, the same numbers.
+            Of the random streams: the same key gives the same numbers.
 
         Returns
         -------
@@ -119,7 +119,7 @@ class Profiler:
             z in the profiler's frame, m; NaN = no reading.
         """
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
-            raise BenchError(f"A scan needs poses of shape (line, 4, 4), two lines at least; found {poses.shape}.")
+            raise BenchError(f"expected poses of shape (line, 4, 4) with two lines at least; found {poses.shape}")
         wrong = self.disturbances
         poses = np.ascontiguousarray(poses, dtype=float)
         if wrong.jitter_y > 0:
@@ -146,7 +146,7 @@ class Profiler:
         return out
 
     def _cut_blobs(self, out: Array, poses: Array, key: np.uint64) -> None:
-        """Take the readings away in round patches."""
+        """Remove the readings in round patches."""
         lines, x = len(out), self.x
         pitch = float(np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3])) / (lines - 1)
         rng = np.random.default_rng(int(key))

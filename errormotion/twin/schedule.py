@@ -1,4 +1,4 @@
-"""What the machine is told to do: spindle speeds, compensation, and the steps of a sphere."""
+"""Commands to the machine: spindle speeds, compensation, and the steps of a sphere."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
 
-#: Time in which the control takes a compensation away or brings it back, s.
+#: Time in which the control switches a compensation off or on, s.
 SLEW = 0.5
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that is commanded at a time.
+    """A command at a time.
 
     Attributes
     ----------
     time : float
         Seconds after the start.
     spindle_speed : float, optional
-        New spindle speed, 1/min; None leaves it.
+        New spindle speed, 1/min; None: unchanged.
     compensation : mapping of str to bool, optional
-        Thermal compensation of the axes X, Y, Z on or off; what is not named stays.
+        Thermal compensation of the axes X, Y, Z on or off; axes that are not named are unchanged.
     """
 
     time: float
@@ -37,27 +37,27 @@ class Event:
 
 @dataclass(frozen=True)
 class StepProgram:
-    """A sphere on the spindle, stepped along a line with a rest at each place.
+    """A sphere in the spindle, moved along a line with a rest at each position.
 
     At ``begin`` the sphere leaves ``home`` and reaches ``start`` after ``approach`` seconds; it rests ``dwell`` seconds
-    at each of ``count`` places, travels ``travel`` seconds between two, and goes home in ``approach`` seconds.
+    at each of ``count`` positions, moves ``travel`` seconds between two, and returns home in ``approach`` seconds.
 
     Attributes
     ----------
     start : (3,) array_like
-        Commanded centre of the sphere at the first place, m, in machine coordinates.
+        Commanded centre of the sphere at the first position, m, in machine coordinates.
     direction : (3,) array_like
         Direction of the steps; normalised here.
     step : float
-        Distance of two places, m.
+        Distance of two positions, m.
     count : int
-        Number of places.
+        Number of positions.
     dwell, travel, approach : float
         Times, s.
     begin : float
-        Time of the machine at which the program begins, s.
+        Time of the machine at the start of the program, s.
     home : (3,) array_like, optional
-        Where the sphere is before and after; the middle of the line where not given.
+        Position of the sphere before and after; the middle of the line where not given.
     """
 
     start: Any
@@ -75,11 +75,11 @@ class StepProgram:
         start, direction = _vector(self.start, "start"), _vector(self.direction, "direction")
         length = float(np.linalg.norm(direction))
         if length == 0:
-            raise BenchError("The steps need a direction; found (0, 0, 0).")
+            raise BenchError("expected a direction of the steps; found (0, 0, 0)")
         if self.count < 1 or self.dwell <= 0 or self.travel <= 0 or self.approach <= 0:
             raise BenchError(
-                "A step program needs at least one place and positive dwell, travel and approach times; found "
-                f"count = {self.count}, dwell = {self.dwell} s, travel = {self.travel} s, approach = {self.approach} s."
+                "expected at least one position and positive dwell, travel and approach times; found "
+                f"count = {self.count}, dwell = {self.dwell} s, travel = {self.travel} s, approach = {self.approach} s"
             )
         line = start + np.arange(self.count)[:, None] * self.step * (direction / length)
         home = (line[0] + line[-1]) / 2 if self.home is None else _vector(self.home, "home")
@@ -87,18 +87,18 @@ class StepProgram:
 
     @property
     def arrivals(self) -> Array:
-        """Times at which the sphere comes to rest at each of ``places``, s, shape (count + 2,); the first is -inf."""
+        """Start of the rest at each of ``places``, s, shape (count + 2,); the first is -inf."""
         steps = self.begin + self.approach + np.arange(self.count) * (self.dwell + self.travel)
         return np.concatenate([[-np.inf], steps, [self.end]])
 
     @property
     def departures(self) -> Array:
-        """Times at which the sphere leaves each of ``places``, s, shape (count + 2,); the last is inf."""
+        """End of the rest at each of ``places``, s, shape (count + 2,); the last is inf."""
         return np.concatenate([[self.begin], self.arrivals[1:-1] + self.dwell, [np.inf]])
 
     @property
     def end(self) -> float:
-        """Time at which the sphere is home again, s."""
+        """Time at which the sphere is back home, s."""
         return self.begin + 2 * self.approach + self.count * self.dwell + (self.count - 1) * self.travel
 
     @property
@@ -109,7 +109,7 @@ class StepProgram:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Events in order, with what follows from them: the speed, the angle of the spindle, and the compensation.
+    """Events in order, and the speed, the angle of the spindle and the compensation that follow from them.
 
     Attributes
     ----------
@@ -123,10 +123,10 @@ class Schedule:
     events: tuple[Event, ...]
     spin_up: float
     top_speed: float
-    #: times and speeds (1/min) from which a commanded speed holds; the first is (0, 0) or an event at 0
+    #: times and values (1/min) of commanded speeds; the first is (0, 0) or an event at 0
     speed_times: Array = field(init=False, repr=False)
     speeds: Array = field(init=False, repr=False)
-    #: times of the spindle's phases, and (turns, turns/s, turns/s^2 / 2) at their begin
+    #: times of the spindle's phases, and (turns, turns/s, turns/s^2 / 2) at their start
     phase_times: Array = field(init=False, repr=False)
     phases: Array = field(init=False, repr=False)
 
@@ -142,17 +142,17 @@ class Schedule:
     def _check(self) -> None:
         times = [event.time for event in self.events]
         if any(time < 0 or not np.isfinite(time) for time in times) or sorted(times) != times:
-            raise BenchError(f"The events of a schedule need finite times from 0 on, in order; found {times} s.")
+            raise BenchError(f"expected events at finite times from 0 on, in order; found {times} s")
         for event in self.events:
             speed = event.spindle_speed
             if speed is not None and not 0 <= speed <= self.top_speed:
-                raise BenchError(f"The spindle turns at 0 to {self.top_speed:g} /min; commanded were {speed:g} /min.")
+                raise BenchError(f"The spindle turns at 0 to {self.top_speed:g} /min; found {speed:g} /min")
             unknown = set(event.compensation or {}) - {"X", "Y", "Z"}
             if unknown:
-                raise BenchError(f"The axes with compensation are X, Y and Z; found {', '.join(sorted(unknown))}.")
+                raise BenchError(f"expected compensation of the axes X, Y and Z; found {', '.join(sorted(unknown))}")
 
     def _spin(self) -> None:
-        """Lay out the phases: constant acceleration up to each commanded speed, then constant speed."""
+        """Compute the phases: constant acceleration up to each commanded speed, then constant speed."""
         times, phases = [0.0], [(0.0, 0.0, 0.0)]
         for time, speed in zip(self.speed_times, self.speeds / 60, strict=True):
             while times[-1] > time:  # a change while the spindle still accelerates
@@ -190,7 +190,7 @@ class Schedule:
         return self.turning(t)[..., 1] * 60
 
     def compensation(self, t: ArrayLike) -> Array:
-        """Return how much of the compensation of X, Y, Z is in effect at times t, 0 to 1, shape (n, 3)."""
+        """Return the effective share of the compensation of X, Y, Z at times t, 0 to 1, shape (n, 3)."""
         t = np.asarray(t, dtype=float)
         share = np.ones((*t.shape, 3))
         for axis, name in enumerate("XYZ"):
@@ -204,7 +204,7 @@ class Schedule:
 
     @property
     def cuts(self) -> Array:
-        """Times of every kink, and five pieces of each slew of the compensation, s, sorted."""
+        """Times of all changes of slope, with five pieces of each change of the compensation, s, sorted."""
         slews = [event.time + np.linspace(0, SLEW, 6) for event in self.events if event.compensation]
         return np.unique(np.concatenate([self.phase_times, self.speed_times, *slews]))
 
@@ -212,5 +212,5 @@ class Schedule:
 def _vector(value: Any, name: str) -> Array:
     vector = np.asarray(value, dtype=float)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise BenchError(f"'{name}' needs three finite numbers (x, y, z) in m; found {value!r}.")
+        raise BenchError(f"expected '{name}' as three finite numbers (x, y, z) in m; found {value!r}")
     return vector

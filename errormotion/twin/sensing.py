@@ -1,4 +1,4 @@
-"""What the five sensors read on the bar and on the sphere, sample by sample."""
+"""Readings of the five sensors on the bar and on the sphere, sample by sample."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Channels = NDArray[np.int64]
 #: grid of the slow motion, s, and its intervals per chunk
 GRID = 0.5
 CHUNK = 64
-#: how well the machine finds a position again, m (one sigma, each axis)
+#: repeatability of a position of the machine, m (one sigma, each axis)
 REPEATABILITY = 0.3e-6
-#: what the speckle does to a reading on the sphere at rest, m (one sigma)
+#: effect of the speckle on a reading on the sphere at rest, m (one sigma)
 SPECKLE = 0.5e-6
 
 _BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
@@ -30,7 +30,7 @@ _BAR_NOISE, _SPHERE_NOISE, _STEPS = 1, 2, 3
 
 @dataclass(frozen=True)
 class _Piece:
-    """The slow motion over a piece of time in which it hardly bends, ready for the kernel."""
+    """The slow motion over an interval in which it is nearly linear, as the kernel takes it."""
 
     times: Array
     slow: Array
@@ -47,9 +47,9 @@ class Sensing:
     seed : int
         Of the noise.
     frame, bar, sphere_radius, state
-        Who looks at what, and how it moves.
+        The sensors, their targets, and the motion.
     sensors_on_for : float
-        For how long the sensors have been on at time 0, s.
+        Time since the sensors were switched on, at time 0, s.
     """
 
     seed: int
@@ -73,7 +73,7 @@ class Sensing:
         return readings + self.frame.warm_up_offset(t + self.sensors_on_for) if warm_up else readings
 
     def read_bar(self, out: Array, first: int, rate: float, chosen: Channels) -> None:
-        """Fill ``out`` (chosen, n) with the samples first .. first + n - 1 on the turning bar."""
+        """Fill ``out`` (chosen, n) with the samples first .. first + n - 1 on the rotating bar."""
         keys = np.array([kernels.stream_key(self.seed, _BAR_NOISE, channel) for channel in chosen])
         span = GRID * CHUNK
         for chunk in range(int(first / rate / span), int((first + out.shape[1]) / rate / span) + 1):
@@ -92,7 +92,7 @@ class Sensing:
                 )
 
     def _pieces(self, chunk: int) -> tuple[_Piece, ...]:
-        """Return the slow motion of one chunk of time, cut where it bends; the same numbers whoever asks."""
+        """Return the slow motion of one chunk of time, divided where its slope changes; independent of the caller."""
         pieces = self._chunks.get(chunk)
         if pieces is None:
             grid = (chunk * CHUNK + np.arange(CHUNK + 1)) * GRID
@@ -136,7 +136,7 @@ class Sensing:
         )
 
     def _draws(self, motion: StepProgram, streams: Channels | tuple[int, ...]) -> Array:
-        """Return standard normal numbers (stream, place) that belong to this program on this machine."""
+        """Return standard normal numbers (stream, place) that depend on this program and this machine."""
         bits = np.array([motion.begin, *motion.places[1], *motion.places[-2]]).view(np.int64)
         labels = (self.seed, _STEPS, *(int(b) for b in bits))
         return np.array([kernels.normals(kernels.stream_key(*labels, s), 0, len(motion.places)) for s in streams])

@@ -36,13 +36,13 @@ class StageSensor:
     check_bar: CheckBar
 
     def _set_up_point_sensor(self, rng: np.random.Generator) -> None:
-        """Mount the sensor, and place gauge and bar on the table."""
+        """Mount the sensor, and position gauge and bar on the table."""
         self.point_sensor = seeded_point_sensor(rng)
         self.sine_gauge = SineGauge(self.seed, np.array(PIVOT))
         self.check_bar = seeded_check_bar(rng, np.array(BAR_POSITION))
 
     def home(self, sensor: PointSensor | None = None) -> Array:
-        """Return the place of the stage, m, (3,), at which the nominal beam has the gauge's pivot at mid-range."""
+        """Return the position of the stage, m, (3,), at which the gauge's pivot is at mid-range of the nominal beam."""
         sensor = sensor or self.point_sensor
         return np.asarray(self.sine_gauge.pivot - sensor.nominal_origin - sensor.mid_range * sensor.nominal_direction)
 
@@ -57,33 +57,33 @@ class StageSensor:
         key: tuple[int, ...] = (),
         beyond: bool = False,
     ) -> Array:
-        """Return what the point sensor reads, with all that is wrong with it.
+        """Return the readings of the point sensor, with all its deviations.
 
         Parameters
         ----------
         t : (n,)
-            Times of the world's clock, s.
+            Times of the simulated clock, s.
         stage : (n, 3) or (3,)
-            Where the stage is then, m.
+            Positions of the stage, m.
         target : Plane or CheckBar
-            What it looks at.
+            The surface.
         sensor : PointSensor, optional
             ``point_sensor`` where not given.
         first : int
-            Number of the first reading: the same number, the same noise.
+            Number of the first reading; the noise depends on it.
         key : tuple of int
-            Another sensor, another noise; another target, another texture.
+            Selects the noise of the sensor and the texture of the target.
         beyond : bool
-            Whether out of range reads as minus or plus infinity, and not as NaN.
+            Whether a reading outside of the range is minus or plus infinity, and not NaN.
 
         Returns
         -------
         ndarray, (n,)
-            m; NaN out of range, and where the beam misses.
+            m; NaN outside of the range, and where the beam misses the target.
         """
         sensor = sensor or self.point_sensor
         times = np.atleast_1d(np.asarray(t, dtype=float))
-        places = np.atleast_2d(np.asarray(stage, dtype=float))
-        still = sensor.still(target, places, beyond=beyond) + sensor.speckles((self.seed, TEXTURE, *key), places)
+        positions = np.atleast_2d(np.asarray(stage, dtype=float))
+        still = sensor.still(target, positions, beyond=beyond) + sensor.speckles((self.seed, TEXTURE, *key), positions)
         noise = sensor.noise * kernels.normals(kernels.stream_key(self.seed, NOISE, *key), first, times.size)
         return np.asarray(still + sensor.warm_up_offset(self.sensors_on_for + times) + noise)

@@ -1,4 +1,4 @@
-"""How warm the machine is, and what that does to the spindle."""
+"""Temperatures of the machine, and the thermal error of its spindle."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ThermalState:
     correction : ndarray, (3,)
         Steady correction of X, Y, Z by the control at top speed, m.
     schedule : Schedule
-        What is commanded.
+        The commands.
     """
 
     kind: MachineKind
@@ -48,7 +48,7 @@ class ThermalState:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Places with a temperature: the bodies, the middle of the column, and the air."""
+        """Names of the temperatures: of the bodies, the middle of the column, and the air."""
         return (*self.network.names, "column", "ambient")
 
     def power(self, speed: ArrayLike) -> Array:
@@ -69,12 +69,12 @@ class ThermalState:
         return np.column_stack([bodies, column, self.ambient(t)])
 
     def warming(self, body: str, t: ArrayLike) -> Array:
-        """Return by how much a body has become warmer since the cold state, K, shape (n,)."""
+        """Return the temperature rise of a body since the cold state, K, shape (n,)."""
         place = self.network.names.index(body)
         return np.asarray(self.bodies(t)[:, place] - self._cold[place])
 
     def correction_at(self, t: ArrayLike) -> Array:
-        """Return how far the control's model would shift X, Y, Z, were it on, m, shape (n, 3)."""
+        """Return the full correction of X, Y, Z by the control's model, m, shape (n, 3)."""
         load = self.power(self.schedule.speeds) / self.power(self.kind.top_speed)
         rates = np.array([1 / self.kind.compensation[axis][1] for axis in "XYZ"])
         return np.asarray(lag_response(t, rates, self.schedule.speed_times, load) * rates * self.correction)
@@ -84,7 +84,7 @@ class ThermalState:
         return self.twist_and_turn(t)[0]
 
     def twist_and_turn(self, t: ArrayLike) -> tuple[Array, Array]:
-        """Return `twist`, and the part of its rotation that turns the frame of the axes, rad, shape (n, 3)."""
+        """Return `twist`, and the part of its rotation that rotates the frame of the axes, rad, shape (n, 3)."""
         warming = self.bodies(t) - self._cold
         twist, turn = np.zeros((warming.shape[0], 6)), np.zeros((warming.shape[0], 3))
         for body, name in enumerate(self.network.names):
@@ -97,14 +97,14 @@ class ThermalState:
 
 
 def seeded_ambient(rng: np.random.Generator) -> Ambient:
-    """Return the air of a good workshop: a daily wave of 0.1 K and a wander of hundredths of a kelvin."""
+    """Return the air of a good workshop: a daily wave of 0.1 K and faster ones of hundredths of a kelvin."""
     period = np.array([86400.0, *(rng.uniform(*span) for span in ((9000, 15000), (4000, 7000), (1500, 3000)))])
     amplitude = np.array([0.1, 0.03, 0.02, 0.01]) * rng.uniform(0.8, 1.2, 4)
     return Ambient(20.0 + rng.uniform(-0.5, 0.5), amplitude, 2 * np.pi / period, rng.uniform(0, 2 * np.pi, 4))
 
 
 def seeded_state(kind: MachineKind, rng: np.random.Generator, schedule: Schedule) -> ThermalState:
-    """Return the thermal side of one machine: the tables, with amplitudes off by up to 1.5 percent."""
+    """Return the thermal side of one machine: the tables, with amplitudes within 1.5 percent."""
     network = ThermalNetwork.of(kind.capacity, kind.links, kind.to_air, kind.heat_share)
     growth = np.array([[kind.growth[dof].get(body, 0.0) * 1e-6 for body in network.names] for dof in _DOF])
     growth *= rng.uniform(0.985, 1.015, (6, 1))

@@ -1,6 +1,6 @@
-"""The compiled loops of the line profiler: surfaces, rays on them, and what a real sensor does to the heights.
+"""The compiled loops of the line profiler: surfaces, rays on them, and the disturbances of a real sensor.
 
-A surface is a number for its shape, a vector of parameters and a table: shapes that share one loop without a call back
+A surface is a number for its shape, a vector of parameters and a table: all shapes share one loop without a call back
 into Python. All lengths are metres, in the frame of the artefact: z up, 0 in the middle of its top.
 """
 
@@ -19,7 +19,7 @@ FREEFORM, PLANE, SPHERE, POCKET = 0, 1, 2, 3
 #: parameters: half size in x and y; then of the free form x0, y0 (of the first coefficient) and knots per metre,
 #: of the sphere its radius, of the pocket radius, depth and spot
 PARAMETERS = 5
-#: Newton's iteration on a ray ends below this step, m, and gives up after so many
+#: Newton's iteration on a ray: largest last step, m, and largest number of steps
 STEP, STEPS = 1e-13, 20
 
 _ROOT_2 = math.sqrt(2.0)
@@ -66,7 +66,7 @@ def freeform(p: Array, table: Array, x: float, y: float) -> tuple[float, float, 
 
 @compiled
 def surface(shape: int, p: Array, table: Array, x: float, y: float) -> tuple[float, float, float]:
-    """Return height and both slopes of a smooth surface; NaN where there is none."""
+    """Return height and both slopes of a smooth surface; NaN off the surface."""
     if shape == FREEFORM:
         return freeform(p, table, x, y)
     if shape == SPHERE:
@@ -80,7 +80,7 @@ def surface(shape: int, p: Array, table: Array, x: float, y: float) -> tuple[flo
 
 @compiled
 def edge_distance(shape: int, p: Array, x: float, y: float) -> float:
-    """Return the distance of a position from the nearest edge, m, negative outside the artefact."""
+    """Return the distance of a position from the nearest edge, m, negative off the artefact."""
     inside = min(p[0] - abs(x), p[1] - abs(y))
     if shape == SPHERE:
         inside = min(inside, p[2] - math.hypot(x, y))
@@ -91,9 +91,9 @@ def edge_distance(shape: int, p: Array, x: float, y: float) -> float:
 
 @compiled
 def _pocket(p: Array, pose: Array, x: float) -> tuple[float, float, float]:
-    """Return where a ray meets a pocket: z in the profiler's frame, and x, y in the artefact's at the rim's height.
+    """Return where a ray meets a pocket: z in the profiler's frame, and x, y in the artefact's at the rim.
 
-    Where the spot straddles the rim, the reading is the mean of both levels, weighted by the shares of the spot.
+    Across the rim, the reading is the mean of both levels, weighted by the shares of the spot.
     """
     z = -(pose[2, 3] + pose[2, 0] * x) / pose[2, 2]
     qx = pose[0, 0] * x + pose[0, 2] * z + pose[0, 3]
@@ -106,16 +106,16 @@ def _pocket(p: Array, pose: Array, x: float) -> tuple[float, float, float]:
 def profile(
     shape: int, p: Array, table: Array, pose: Array, x: Array, out: Array, edge: NDArray[np.float32], steepest: float
 ) -> None:
-    """Fill one line of heights: where the rays x, 0, z of the profiler's frame meet the surface.
+    """Fill one line of heights: intersections of the rays x, 0, z of the profiler's frame with the surface.
 
     Parameters
     ----------
     pose : ndarray, (4, 4)
-        Takes coordinates of the profiler's frame to those of the artefact's.
+        From the profiler's frame to the artefact's.
     x : ndarray, (point,)
         m, along the line.
     out : ndarray, (point,)
-        z in the profiler's frame, m; NaN outside the artefact, and where the surface is steeper than ``steepest``.
+        z in the profiler's frame, m; NaN off the artefact, and where the surface is steeper than ``steepest``.
     edge : ndarray, (point,)
         Distance to the nearest edge, m.
     """
@@ -143,7 +143,7 @@ def profile(
             z = -pose[2, 3] / pose[2, 2]
             continue
         edge[i] = edge_distance(shape, p, qx, qy)
-        # slope in the profiler's frame: the normal (-sx, -sy, 1), turned back
+        # slope in the profiler's frame: the normal (-sx, -sy, 1), rotated back
         nx = -sx * pose[0, 0] - sy * pose[1, 0] + pose[2, 0]
         ny = -sx * pose[0, 1] - sy * pose[1, 1] + pose[2, 1]
         nz = -sx * pose[0, 2] - sy * pose[1, 2] + pose[2, 2]
@@ -181,9 +181,9 @@ def scan(
     out : ndarray, (line, point)
         Heights, m; NaN = none.
     sizes : ndarray, (11,)
-        Noise, jitter of a line in z, speckle (m), what one point keeps of its neighbour's speckle, greatest slope,
-        lift at an edge and how far it reaches (m), share of points lost at an edge, share of outliers and their spread
-        (m), share of points lost anywhere.
+        Noise, jitter of a line in z, speckle (m), correlation of neighbouring points' speckle, greatest slope,
+        lift at an edge and its range (m), share of points lost at an edge, share of outliers and their spread
+        (m), share of points lost elsewhere.
     low, high : float
         Measuring range, m.
     keys : ndarray of uint64, (6,)
@@ -219,7 +219,7 @@ def scan(
 
 @compiled
 def heights(shape: int, p: Array, table: Array, x: Array, y: Array, out: Array) -> None:
-    """Fill ``out`` (n,) with the heights of an artefact at positions x, y (n,), m; NaN outside it."""
+    """Fill ``out`` (n,) with the heights of an artefact at positions x, y (n,), m; NaN off it."""
     for i in range(x.size):
         out[i] = math.nan
         if edge_distance(shape, p, x[i], y[i]) >= 0.0:

@@ -1,4 +1,4 @@
-"""Artefacts on the table of the gantry, and the readings of the line profiler in a pass of the carriage."""
+"""Pieces on the table of the gantry, and their scans by the line profiler as the carriage passes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from errormotion.twin.artefacts import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
 from errormotion.twin.profiler import Profiler
 
-#: default distance of artefacts, m
+#: default distance of two artefacts, m
 SPACING = 0.2
-#: margin around an artefact in which the profiler is evaluated, m: an artefact is off its position by 0.2 mm (one
-#: sigma), and the profiler, whose frame leans by some mrad, sees 20 mm up and down
+#: margin of a scan beyond the artefact, m: an artefact is off its position by 0.2 mm (one
+#: sigma), and the profiler, tilted by some mrad, measures 20 mm up and down
 BESIDE = 3e-3
-#: lines computed at once; their noise does not depend on the start of a stream
+#: lines per block; their noise does not depend on the start of a stream
 CHUNK = 64
 
 
@@ -32,7 +32,7 @@ class Target:
     artefact : Artefact
         Its shape.
     pose : ndarray, (4, 4)
-        Its pose in the machine, m.
+        In the machine, m.
     position : float
         Of the axis over its middle, m.
     """
@@ -43,7 +43,7 @@ class Target:
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Between which positions of the axis the profiler may see it, m."""
+        """Lowest and highest position of the axis at which the profiler may see it, m."""
         half = self.artefact.half_size[1] + BESIDE
         return self.position - half, self.position + half
 
@@ -69,8 +69,8 @@ class Table:
             if one.reach[1] > other.reach[0]:
                 apart = one.reach[1] - one.position + other.position - other.reach[0]
                 raise BenchError(
-                    f"Two such pieces stand {apart * 1e3:.0f} mm or more apart along Y; found {one.artefact.name} at "
-                    f"{one.position:g} m and {other.artefact.name} at {other.position:g} m."
+                    f"expected pieces {apart * 1e3:.0f} mm or more apart along Y; found {one.artefact.name} at "
+                    f"{one.position:g} m and {other.artefact.name} at {other.position:g} m"
                 )
         object.__setattr__(self, "targets", tuple(ordered))
 
@@ -88,16 +88,16 @@ class Table:
             yield slice(first, y.size), None
 
     def scan(self, target: Target, profiler: Profiler, t: Array, positions: Array, key: tuple[int, ...]) -> Array:
-        """Return the lines that the profiler takes of a piece, each under the error at its own moment.
+        """Return the lines that the profiler takes of a piece, each with the error at its own time.
 
         Parameters
         ----------
         target : Target
-            What is seen.
+            The piece.
         profiler : Profiler
-            Sees it.
+            The sensor.
         t : ndarray, (n,)
-            Time since the warm-up started, s, of each line; cold before 0.
+            Time since the start of the warm-up, s, of each line; cold before 0.
         positions : ndarray, (n, 3)
             Commanded X, Y and Z, m.
         key : tuple of int
@@ -119,7 +119,7 @@ class Table:
 def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocket: float | None = None) -> Table:
     """Return a table with a swept free form at each position of the axis, m, and perhaps a circular pocket.
 
-    The free forms are slightly misaligned, see `Crossbeam.artefact_pose`; the pocket was cut by
+    The free forms are misaligned under the profiler by `Crossbeam.artefact_pose`; the pocket was cut by
     the cold machine itself at the position ``pocket`` and Z = 0.
 
     Raises
@@ -136,6 +136,6 @@ def set_table(crossbeam: Crossbeam, seed: int, positions: Sequence[float], pocke
 
 
 def default_positions(travel: tuple[float, float]) -> list[float]:
-    """Return the positions of artefacts that fit a travel, one every 200 mm and as far from both ends, m."""
+    """Return the positions of artefacts in a travel, one every 200 mm and as far from both ends, m."""
     n = int(round((travel[1] - travel[0]) / SPACING, 6))
     return [round(travel[0] + SPACING * k, 9) for k in range(1, n)]

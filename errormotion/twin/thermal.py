@@ -2,8 +2,8 @@
 
 The bodies obey ``C dT/dt = -G T + g T_ambient + h P``: C heat capacities (J/K), G conductances among the bodies and to
 the air (W/K), g conductances to the air, h the share of each body in the spindle's heat P (W). The eigenvectors of
-C^-1/2 G C^-1/2 take it apart into first-order lags, for which the answer to a piecewise constant P and to a sinusoidal
-T_ambient is known exactly: temperatures at any time need no stepping.
+C^-1/2 G C^-1/2 decouple it into first-order lags, for which the response to a piecewise constant P and to a sinusoidal
+T_ambient is known exactly: temperatures at any time need no time stepping.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class ThermalNetwork:
         return _combine(lag_response(t, self.rates, times, power) * self._heat, self._modes)
 
     def air_response(self, t: ArrayLike, ambient: Ambient) -> Array:
-        """Return each body's temperature in a long used machine that stands still, degC, shape (n, body)."""
+        """Return each body's temperature in the steady state of a machine at standstill, degC, shape (n, body)."""
         t = np.asarray(t, dtype=float)
         transfer = self._modes @ (self._air[:, None] / (self.rates[:, None] + 1j * ambient.omega))  # body, wave
         wave = ambient.amplitude * np.exp(1j * (ambient.omega * t[:, None] + ambient.phase))

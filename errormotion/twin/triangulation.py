@@ -1,7 +1,7 @@
-"""What laser triangulation does to a reading: the surface's tilt, and its speckle.
+"""Effects of laser triangulation on a reading: the surface's tilt, and its speckle.
 
 The receiving lens has an aperture. A surface that is tilted scatters unevenly into it, so that the light's centre of
-gravity in the aperture shifts, and with it the angle under which the sensor believes to look. Out of focus that moves
+gravity in the aperture shifts, and with it the apparent angle of the received beam. Out of focus that moves
 the image: in proportion to the depth, not at all at mid-range.
 """
 
@@ -16,17 +16,17 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.twin import kernels
 
-#: rings of places in the aperture: radius as a share of the aperture's, number of places, weight of each
+#: rings of points in the aperture: radius as a share of the aperture's, number of points, weight of each
 _RINGS = ((0.0, 1, 1.0), (0.55, 6, 1.2), (0.9, 12, 1.0))
-#: cosine between surface normal and received beam below which the receiver gets no light
+#: least cosine between surface normal and received beam with light at the receiver
 _LEAST_COSINE = 0.02
-#: waves that make a speckle field
+#: number of waves of a speckle field
 _WAVES = 256
 
 
 @dataclass(frozen=True)
 class Optics:
-    """The receiving side of a sensor, and how the surface scatters.
+    """The receiving side of a sensor, and the scattering of the surface.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Optics:
     scale : float
         Relative error of the reading at right angles, 1.
     steepest : float
-        Inclination beyond which the sensor sees nothing, rad.
+        Largest inclination with light at the receiver, rad.
     """
 
     triangulation_angle: float = np.radians(28.0)
@@ -65,7 +65,7 @@ class Optics:
         Returns
         -------
         ndarray, (...)
-            NaN where the sensor does not see the surface.
+            NaN without light at the receiver.
         """
         tilts = np.asarray(q, dtype=float)
         steep = np.hypot(tilts[..., 0], tilts[..., 1])
@@ -79,7 +79,7 @@ class Optics:
         return np.asarray((cosine - sine * q[..., 0]) / np.hypot(1.0, steep))
 
     def _light_centre(self, q: Array) -> Array:
-        """Return where in the aperture the light's centre is, towards the emitted beam, rad.
+        """Return the position of the light's centre in the aperture, towards the emitted beam, rad.
 
         In coordinates (in the triangulation plane, across it, towards the sensor) of the emitted beam.
         """
@@ -101,7 +101,7 @@ def _unit(vectors: Array) -> Array:
 
 @lru_cache(maxsize=32)
 def _aperture(half_angle: float) -> tuple[Array, Array, Array]:
-    """Return places in the aperture along and across the triangulation plane, rad, and their weights, each (n,)."""
+    """Return points in the aperture along and across the triangulation plane, rad, and their weights, each (n,)."""
     radius = np.concatenate([np.full(n, share) for share, n, _ in _RINGS]) * half_angle
     angle = np.concatenate([2 * np.pi * np.arange(n) / n for _, n, _ in _RINGS])
     weight = np.concatenate([np.full(n, each) for _, n, each in _RINGS])
@@ -117,9 +117,9 @@ def speckle(key: int, places: Array, length: float) -> Array:
     Parameters
     ----------
     key : int
-        Which field.
+        Of the field.
     places : ndarray, (n, 3)
-        m. The value at a place does not depend on what else is asked for.
+        m. The value at a position does not depend on the other positions.
     length : float
         m.
 

@@ -1,4 +1,4 @@
-"""The truth as error datasets: values that are known exactly, so with covariance 0."""
+"""True errors as error datasets: values that are known exactly, with covariance 0."""
 
 from __future__ import annotations
 

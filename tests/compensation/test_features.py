@@ -69,8 +69,8 @@ def test_temperatures_count_from_the_first_that_is_known() -> None:
     ("wrong", "message"),
     [
         (data().drop_vars("temperature"), "expected temperature"),
-        (data(time=[0.0, 2.0, 1.0]), "expected times that increase"),
-        (data(sensor=["a", "a"]), "a name of its own for each sensor; found a, a"),
+        (data(time=[0.0, 2.0, 1.0]), "expected increasing times"),
+        (data(sensor=["a", "a"]), "different names of the sensors; found a, a"),
         (data().isel(time=0), "expected temperatures over time; found the dims sensor"),
     ],
 )

@@ -62,25 +62,25 @@ def checked(model, warm_ups, tmp_path_factory):
 
 def test_figures_of_the_check_stand_on_the_page(checked):
     found, html = checked
-    told = {row[0]: row[1:] for row in rows(html, "Root mean square of what was measured")}
+    told = {row[0]: row[1:] for row in rows(html, "Root mean square of the measured errors")}
     for i, name in enumerate(DOF):
         assert number(told[name][1]) == pytest.approx(found.rms[i] / SIZE[i], abs=0.006)
         assert number(told[name][2]) == pytest.approx(found.remaining[i] / SIZE[i], abs=0.006)
         assert told[name][3] == fixed(100 * found.removed[i], 0)
         assert told[name][4] == fixed(100 * found.held[i], 0)
     least = DOF[int(np.argmin(found.removed))]
-    assert f"(least of {least})" in words(html)
+    assert f"(lowest: {least})" in words(html)
 
 
 def test_candidates_and_their_scores_are_those_of_the_provenance(checked, model):
     steps = json.loads(model.dataset.attrs["provenance"])["steps"]
     tried = next(step["tried"] for step in steps if "tried" in step)
-    told = rows(checked[1], "What was tried")[1:]
+    told = rows(checked[1], "Candidates: the best of each variant")[1:]
     assert len(told) == len(tried) == 2
     for row, each in zip(told, tried, strict=True):
         assert row[0] == each["variant"]
         assert number(row[3]) == pytest.approx(each["score"], rel=0.005)
-    assert [row[4] for row in told] == ["chosen", ""]
+    assert [row[4] for row in told] == ["selected", ""]
     assert "spindle_front and column" in told[0][2]
 
 
@@ -128,9 +128,9 @@ def test_error_that_was_not_measured_is_not_compared(model, warm_ups, tmp_path):
     figures = {name: getattr(found, name) for name in FIGURES}
     page = write_model_report(model.dataset, part, tmp_path / "r.html", predicted=found.predicted, figures=figures)
     html = page.read_text(encoding="utf-8")
-    assert "Not compared, because unknown: EC." in words(html)
+    assert "Not compared because unknown: EC." in words(html)
     assert html.count("not compared") == 2
-    row = next(row for row in rows(html, "Root mean square of what was measured") if row[0] == "EC")
+    row = next(row for row in rows(html, "Root mean square of the measured errors") if row[0] == "EC")
     assert row[2].startswith("—")
 
 
@@ -138,7 +138,7 @@ def test_prediction_shows_its_numbers_and_that_nothing_was_measured(model, warm_
     predicted = model.predict(warm_ups[2])
     html = write_report(predicted, tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<h1>Errors predicted by a thermal model</h1>" in html
-    assert "nothing of this was measured" in words(html)
+    assert "instants; not measured." in words(html)
     told = {row[0]: row for row in rows(html, "The six errors as predicted")}
     for i, name in enumerate(DOF):
         expanded = 2 * float(np.sqrt(predicted["covariance"][-1, i, i])) / SIZE[i]
@@ -151,9 +151,9 @@ def test_prediction_beyond_training_is_told_and_shaded(model, warm_ups, tmp_path
     assert 0 < out.sum() < out.size
     html = write_report(predicted, tmp_path / "r.html").read_text(encoding="utf-8")
     text = words(html)
-    assert f"{out.sum()} of {out.size} instants lie beyond what the model was trained on" in text
-    assert "Coloured ground: beyond" in text
-    told = rows(html, "Inputs beyond what the model was trained on")[1:]
+    assert f"{out.sum()} of {out.size} instants lie outside the training range" in text
+    assert "Coloured background: outside" in text
+    told = rows(html, "Inputs outside the training range")[1:]
     by_input = predicted["outside_feature"].sum("time")
     expected = {
         str(name): str(int(n)) for name, n in zip(predicted["feature"].values, by_input.values, strict=True) if n

@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
-from errormotion.compensation.thermal_model.fitting import LEAST_SAMPLES
+from errormotion.compensation.thermal_model.fitting import FEWEST_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
 from errormotion.datasets.schemas import DOF
@@ -74,7 +74,7 @@ def test_times_beyond_the_training_are_flagged(model: ThermalModel, pair: list[x
     predicted = model.predict(hot)
     assert not predicted["outside"].sel(time=slice(0, 7200)).any()
     assert predicted["outside"].sel(time=slice(7300, None)).all()
-    assert "beyond what the model was trained on" in json.loads(predicted.attrs["notes"])[0]
+    assert "outside the training range" in json.loads(predicted.attrs["notes"])[0]
 
 
 def test_an_unknown_temperature_makes_an_unknown_error_and_is_counted(
@@ -85,7 +85,7 @@ def test_an_unknown_temperature_makes_an_unknown_error_and_is_counted(
     predicted = model.predict(torn)
     assert np.isnan(predicted["EZ"][4])
     assert int(np.isnan(predicted["EZ"]).sum()) == 1
-    assert "1 of 31 times without a prediction" in predicted.attrs["notes"]
+    assert "1 of 31 times have no prediction" in predicted.attrs["notes"]
 
 
 def test_figures_are_those_of_the_datasets(model: ThermalModel, pair: list[xr.Dataset]) -> None:
@@ -149,14 +149,14 @@ def test_campaigns_that_do_not_belong_together_are_refused(pair: list[xr.Dataset
         fit([first, changed(second, machine="Another")])
     with pytest.raises(DatasetError, match=r"Campaign 2: expected the functional point .* Move the errors"):
         fit([first, changed(second, functional_point=np.array([0.0, 0.0, 0.3]))])
-    with pytest.raises(DatasetError, match=f"at least {LEAST_SAMPLES} known values"):
+    with pytest.raises(DatasetError, match=f"at least {FEWEST_SAMPLES} known values"):
         fit([first.isel(time=slice(0, 4))])
-    with pytest.raises(DatasetError, match=r"sensors: expected names that all campaigns have .*; found nose"):
+    with pytest.raises(DatasetError, match=r"sensors: expected sensors of all campaigns .*; found nose"):
         fit(pair, Settings(sensors=("nose",)))
 
 
 def test_the_same_campaign_twice_is_no_second_one(pair: list[xr.Dataset]) -> None:
-    with pytest.raises(DatasetError, match="Campaign 2 is campaign 1 again"):
+    with pytest.raises(DatasetError, match="Campaign 2 equals campaign 1"):
         fit([pair[0], pair[0].copy()])
 
 
@@ -168,7 +168,7 @@ def test_a_sensor_that_one_campaign_never_knew_is_not_taken(pair: list[xr.Datase
     assert len(model.sensors) == 2
     assert "head" not in model.sensors
     deaf["temperature"][:] = np.nan
-    with pytest.raises(DatasetError, match="needs a temperature that all campaigns have"):
+    with pytest.raises(DatasetError, match="Expected a temperature sensor common to all campaigns"):
         fit([pair[0], deaf], Settings(variant="lagged"))
 
 

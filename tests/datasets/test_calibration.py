@@ -120,7 +120,7 @@ def test_a_hole_is_refused_where_it_is_used(holed: InclinationCalibration) -> No
     q = tilt_vector(np.radians([30.0, 30.0]), np.radians([5.0, 45.0]))
     assert holed.supported(q).tolist() == [True, False]
     with pytest.raises(
-        MethodError, match=r"rotation 45\.0 deg lies where the calibrated settings leave a hole \(1 of 2"
+        MethodError, match=r"rotation 45\.0 deg lies in a hole between the calibrated settings \(1 of 2"
     ):
         holed.compensate([1e-3, 1e-3], q)
     assert holed.compensate([1e-3, 1e-3], q, extrapolate=True).uncertainty[1] > 0

@@ -299,10 +299,14 @@ BEFORE = 25  # answers until a first reading is over: 9 for the identity, 5 unit
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("silence", InstrumentTimeoutError, "node 5 gives no answer within 0.7 s; its last heartbeat said OPERATIONAL"),
+        (
+            "silence",
+            InstrumentTimeoutError,
+            "node 5 gives no answer within 0.7 s; its last heartbeat stated OPERATIONAL",
+        ),
         ("drop", InstrumentTimeoutError, "node 5 gives no answer"),
         ("unplugged", InstrumentTimeoutError, "node 5 gives no answer"),
-        ("stopped", InstrumentTimeoutError, "its last heartbeat said"),
+        ("stopped", InstrumentTimeoutError, "its last heartbeat stated"),
         ("garbage", ProtocolError, "node 5, 0x6130:1"),
         ("bus_off", InstrumentError, "the controller is bus-off"),
         ("abort&code=0x08000000", SdoRefusal, "0x6130:1 is refused: Code 0x08000000, General error"),
@@ -326,7 +330,7 @@ def test_a_stopped_node_says_so_in_its_heartbeat() -> None:
         with pytest.raises(InstrumentTimeoutError):
             thermometer.read()
         await_state(thermometer, "STOPPED")
-        with pytest.raises(InstrumentTimeoutError, match="its last heartbeat said STOPPED"):
+        with pytest.raises(InstrumentTimeoutError, match="its last heartbeat stated STOPPED"):
             thermometer.read()
 
 

@@ -286,7 +286,7 @@ def test_a_recorded_cycle_plays_back(tmp_path: Path) -> None:
 
 
 class Controller:
-    """A controller whose probe trips where a test says: along X, m."""
+    """A controller whose probe trips where a test states: along X, m."""
 
     def __init__(self, trips: Callable[[int, float, float], float | None]) -> None:
         self.trips = trips

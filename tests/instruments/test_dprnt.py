@@ -112,7 +112,7 @@ def test_without_numbers_the_place_decides() -> None:
     assert belongs(printed(0), 0) == 0
     assert belongs(printed(3), 1, printed(0)) == 3  # two lines are missing
     assert belongs(printed(0), 1, printed(0)) == REPEATED
-    assert belongs(printed(0, 2.001), 4, printed(3)) == 0  # the next cycle has begun
+    assert belongs(printed(0, 2.001), 4, printed(3)) == 0  # the next cycle has started
     with pytest.raises(InstrumentError, match=r"Y 55\.000 Z 0\.000 mm, which is on the way of no touch"):
         belongs(printed(5).replace("50.", "55."), 0)
 
@@ -134,7 +134,7 @@ def test_the_place_says_what_came_of_the_touch(x: float, flag: str) -> None:
     assert math.isnan(contact.position[0]) == bool(flag)
 
 
-# ---------------------------------------------------------------------- a machine that sends what a test says
+# ---------------------------------------------------------------------- a machine that sends what a test states
 
 
 class Machine:
@@ -228,7 +228,7 @@ def test_a_lost_connection_is_an_error(machine: Machine, probe: Dprnt) -> None:
     machine.say(printed(0))
     source = probe.measure(TOUCHES)
     assert next(source).flag == ""
-    machine.server.hang_up()
+    machine.server.disconnect()
     with pytest.raises(InstrumentError, match=r"Touch 2 of 5 .* is lost"):
         next(source)
 

@@ -176,9 +176,9 @@ def test_a_pocket_at_two_lifts_is_that_of_the_twin() -> None:
             assert controller.state()["position"][2] == pytest.approx(lift)
             finish(controller)
             along = found.encoder * 1e-6
-            truth, _, _ = crossbeam.pocket_scans(circular_pocket(), PROFILER, along, np.array([lift]), (0,))
+            truth = PROFILER.scan(circular_pocket(), crossbeam.pocket_lines(along, lift), key=(0,))
             assert np.isfinite(truth).mean() > 0.5
-            assert same(found.heights, truth[0], STEP / 2 + 1e-12)
+            assert same(found.heights, truth, STEP / 2 + 1e-12)
 
 
 def test_noise_differs_from_scan_to_scan_and_a_campaign_repeats_to_the_bit() -> None:
@@ -350,14 +350,14 @@ def test_profiles_by_command_before_and_within_a_scan_leave_it_as_it_is() -> Non
         stream.close()
     rest = Pass(found, [])
     encoder = np.concatenate([first.encoder, rest.encoder])
-    (before,) = np.flatnonzero(np.diff(encoder) == 0)  # the profile at whose place it was taken
+    (before,) = np.flatnonzero(np.diff(encoder) == 0)  # the profile at whose position it was taken
     assert np.delete(encoder, before + 1).tolist() == whole.encoder.tolist()
     heights = np.delete(np.concatenate([first.heights, rest.heights]), before + 1, axis=0)
     assert np.array_equal(heights, whole.heights, equal_nan=True)
 
 
 def heard(profiler: str, timeout: float) -> tuple[Pass, int]:
-    """A pass with a rest of 5 s, heard by somebody who asks anew after a silence; how often that was."""
+    """A pass with a rest of 5 s, heard by somebody who queries again after a silence; how often that was."""
     found, silences = Pass([], []), 0
     with gantry(profiler, LJXSettings(timeout=timeout)) as (controller, device):
         controller.run_program("G1 Y5.3 F1500\nG4 P5\nG1 Y30\nM30")

@@ -55,8 +55,8 @@ def test_moves_that_go_nowhere_take_no_time_and_nothing_is_read_behind_the_end()
     [
         ("G91", "write G90"),
         ("G20 G1 Y1", "inches"),
-        ("M0", "nobody is there"),
-        ("M01", "nobody is there"),
+        ("M0", "remove the stop"),
+        ("M01", "remove the stop"),
         ("G2 Y10 I5", "'G2' is not understood; understood are %"),
         ("G1.5 Y10", "'G1.5' is not understood"),
         ("M8", "'M8' is not understood"),
@@ -90,7 +90,7 @@ def test_what_is_not_understood_is_refused_with_its_line(line: str, why: str) ->
 
 
 def test_a_move_needs_its_kind_and_its_feed() -> None:
-    with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a place, but neither G0 nor G1"):
+    with pytest.raises(InstrumentError, match=r"Line 1 'Y10': a position, but neither G0 nor G1"):
         run("Y10", "M30")
     with pytest.raises(InstrumentError, match=r"Line 2 'G1 Y20': .* no feed F"):
         run("G0 Y10", "G1 Y20", "M30")

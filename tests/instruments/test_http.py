@@ -23,7 +23,7 @@ def part(body: bytes) -> bytes:
 
 
 class Site:
-    """A server of which a test says what it answers, path by path."""
+    """A server of which a test states what it answers, path by path."""
 
     def __init__(self) -> None:
         self.pages: dict[str, list[bytes] | None] = {}
@@ -74,7 +74,7 @@ def test_a_connection_that_the_server_ended_is_renewed(site: Site, http: HttpTra
     assert [http.get("/once").body for _ in range(2)] == [b"1", b"1"]
     with pytest.raises(InstrumentError, match="ends it without an answer"):
         http.get("/gone")
-    assert len(site.asked) == 3  # on a new connection nobody asks twice
+    assert len(site.asked) == 3  # on a new connection nobody queries twice
     assert http.get("/once").body == b"1"
 
 
@@ -92,8 +92,8 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
     [
         ([b"\x00\xff" + answer(b"<x/>")], ProtocolError, "expected an answer of HTTP"),
         ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an answer of HTTP"),
-        ([answer(b"1")[:-5]], InstrumentTimeoutError, "silent"),
-        ([], InstrumentTimeoutError, "silent"),
+        ([answer(b"1")[:-5]], InstrumentTimeoutError, "sent no data"),
+        ([], InstrumentTimeoutError, "sent no data"),
         ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
         ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
         ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n"], ProtocolError, "cut off"),

@@ -12,7 +12,7 @@ from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.line_profiler.keyence_ljx import codec, kernels
 from errormotion.instruments.line_profiler.keyence_ljx.codec import GARBLED, INTENSITY, LOST, REASONS, StreamLayout
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import (
-    PATIENCE,
+    UNSYNCHRONISED_PROFILES,
     HeightDecoder,
     StreamDecoder,
     StreamEndedError,
@@ -223,7 +223,7 @@ def test_the_trigger_count_may_overflow() -> None:
     assert decode(stream, layout())[1].tolist() == [0, 0, LOST, 0]
 
 
-@pytest.mark.parametrize("count", [3, 4, 5 + kernels.LARGEST_GAP + 1])
+@pytest.mark.parametrize("count", [3, 4, 5 + kernels.MAX_GAP_PROFILES + 1])
 def test_a_trigger_count_that_goes_back_or_leaps_is_a_protocol_error_behind_the_profiles_before_it(count: int) -> None:
     profiles, _, end = decode(profile(4) + profile(count), layout())
     assert len(profiles) == 1
@@ -272,7 +272,7 @@ def test_stray_bytes_cost_at_most_the_profile_that_they_hit(place: int, stray: b
 @given(garbage=st.randoms(use_true_random=False), pieces=st.lists(st.integers(0, 10_000), max_size=10))
 def test_endless_garbage_is_a_protocol_error_that_says_what_to_do(garbage: object, pieces: list[int]) -> None:
     where = layout()
-    rubbish = garbage.randbytes((PATIENCE + 3) * where.words * 4)
+    rubbish = garbage.randbytes((UNSYNCHRONISED_PROFILES + 3) * where.words * 4)
     profiles, _, end = decode(profile(0) + b"\1" + rubbish, where, pieces)
     assert len(profiles) == 1
     if end is not None or not pieces:
@@ -281,7 +281,7 @@ def test_endless_garbage_is_a_protocol_error_that_says_what_to_do(garbage: objec
 
 
 def test_zeros_are_no_profiles_although_their_checksum_is_right() -> None:
-    end = decode(profile(0) + bytes(PATIENCE * 68 + 100), layout())[2]
+    end = decode(profile(0) + bytes(UNSYNCHRONISED_PROFILES * 68 + 100), layout())[2]
     assert isinstance(end, ProtocolError)
 
 

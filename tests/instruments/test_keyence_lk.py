@@ -67,7 +67,7 @@ def test_readings_count_along_the_beam_whichever_side_the_controller_counts_to()
         with KeyenceLK(f"{SIX}&positive={positive}", LKSettings(positive=positive)) as sensor:
             assert sensor.read() == pytest.approx(1.2345e-3)
             assert sensor.read() == pytest.approx(-4.273e-3)
-    with KeyenceLK(f"{SIX}&positive=far") as sensor:  # told wrongly
+    with KeyenceLK(f"{SIX}&positive=far") as sensor:  # reported wrongly
         assert sensor.read() == pytest.approx(-1.2345e-3)
 
 
@@ -130,7 +130,7 @@ def test_on_the_machine_beyond_the_range_is_told_from_before_it() -> None:
 
 
 def test_a_reading_on_the_machine_is_as_noisy_as_the_settings_say() -> None:
-    """Of 200 readings in one place the scatter is that of the noise and of the last digit, to 5 sigma (25 %)."""
+    """Of 200 readings in one position the scatter is that of the noise and of the last digit, to 5 sigma (25 %)."""
     with KeyenceLK("sim://cframe/lk?seed=3", PATIENT) as sensor:
         here = world("cframe", 3)
         here.set_target("plane", INCLINED, 0.0)
@@ -291,7 +291,7 @@ def test_out_of_range_is_nan_with_its_reason(fault: str, reason: str) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_garbage_spoils_the_reading_it_hits_and_no_other(seed: int) -> None:
-    """Behind a spoilt answer the driver and the controller agree anew which answer belongs to which request."""
+    """Behind a spoilt answer the driver and the controller agree again which answer belongs to which request."""
     address = f"sim://cframe/lk?seed={seed}&readings=1,2,3,4,5,6,7&fault=garbage&fault_at=8&fault_every=6"
     with KeyenceLK(address, PATIENT) as sensor:
         blocks = take(sensor, 3, block=20)
@@ -305,7 +305,7 @@ def test_garbage_spoils_the_reading_it_hits_and_no_other(seed: int) -> None:
 def test_a_late_answer_is_not_taken_for_the_next_one() -> None:
     with KeyenceLK("sim://cframe/lk?readings=1,2,3", PATIENT) as sensor:
         assert sensor.read() == pytest.approx(1e-3)
-        sensor.transport.write(b"MS,01\r")  # asked by somebody who did not wait for the answer
+        sensor.transport.write(b"MS,01\r")  # read by somebody who did not wait for the answer
         sensor._in_step = False
         assert sensor.read() == pytest.approx(3e-3)
 
@@ -442,13 +442,13 @@ def test_a_real_sensor_is_asked_in_the_rhythm_of_its_rate(monkeypatch: pytest.Mo
         on_clock(monkeypatch, sensor, clock)
         blocks = take(sensor, 2, block=50)
     assert values(blocks).size == 100
-    assert clock.slept == pytest.approx(99 * (0.02 - 0.004))  # the first is asked at once
+    assert clock.slept == pytest.approx(99 * (0.02 - 0.004))  # the first is queried at once
 
 
 def test_a_sensor_that_cannot_keep_the_rate_is_an_error_with_figures(monkeypatch: pytest.MonkeyPatch, device) -> None:
     with KeyenceLK(device.url, LKSettings(rate=100.0)) as sensor:
         on_clock(monkeypatch, sensor, Clock(answering=0.035))
-        with pytest.raises(InstrumentError, match=r"100 readings/s were asked for, but 41 took 1\.4 s; lower the rate"):
+        with pytest.raises(InstrumentError, match=r"100 readings/s were requested, but 41 took 1\.4 s; lower the rate"):
             take(sensor, 10)
 
 

@@ -1,4 +1,4 @@
-"""What an LK-G or LK-H says, without a wire."""
+"""What an LK-G or LK-H states, without a wire."""
 
 import math
 
@@ -52,7 +52,7 @@ def test_anything_else_is_garbled(text: str) -> None:
 
 
 def test_other_decimals_than_the_display_has_are_an_error_and_no_reading_off_by_ten() -> None:
-    with pytest.raises(ProtocolError, match=r"4 decimals, as the settings say; found '\+001\.234'"):
+    with pytest.raises(ProtocolError, match=r"4 decimals, as the settings state; found '\+001\.234'"):
         codec.parse_value("+001.234", MM4)
 
 
@@ -114,7 +114,7 @@ def test_an_answer_repeats_what_was_asked(request_text: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "MS,02,+01.2345", "MS,011,+01.2345", "M", "R0", "xMS,01,+01.2345", "ER", "ER,MS"])
 def test_an_answer_to_something_else_is_a_protocol_error(text: str) -> None:
-    with pytest.raises(ProtocolError, match="begins with 'MS,01'"):
+    with pytest.raises(ProtocolError, match="starts with 'MS,01'"):
         codec.parse_answer("MS,01", text)
 
 
@@ -164,7 +164,7 @@ def test_a_line_of_other_bytes_is_a_protocol_error(line: bytes) -> None:
 
 
 def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
-    # 6 bytes to ask, 15 to answer, 10 bits each: 210 bits a reading
+    # 6 bytes to query, 15 to answer, 10 bits each: 210 bits a reading
     codec.check_rate(45.0, 9600, CONTROLLERS["LK-G5000"])
-    with pytest.raises(InstrumentError, match=r"6 bytes to ask and 15 to answer, x 10 bits \(8N1\) = 10500 bit/s"):
+    with pytest.raises(InstrumentError, match=r"6 bytes to query and 15 to answer, x 10 bits \(8N1\) = 10500 bit/s"):
         codec.check_rate(50.0, 9600, CONTROLLERS["LK-G5000"])

@@ -68,7 +68,7 @@ def port() -> Iterator[int]:
 
 def connected(port: int, settings: EmSconSettings) -> LeicaEmScon:
     tracker = LeicaEmScon(f"tcp://127.0.0.1:{port}", settings)
-    for _ in range(100):  # it says that it is up shortly before it listens
+    for _ in range(100):  # it states that it is up shortly before it listens
         try:
             tracker.open()
         except InstrumentError as error:
@@ -94,7 +94,7 @@ def test_a_simulator_of_another_origin_is_spoken_to_without_change(port: int) ->
         tracker.close()
     assert (identity.serial_number, identity.firmware) == ("390793", "emScon 3.8.900")
     assert (air.temperature, air.pressure, air.humidity) == (22.0, 101_325.0, 0.42)
-    assert (index, reflectors) == (1.00027, ())  # it says that it knows 0 reflectors
+    assert (index, reflectors) == (1.00027, ())  # it states that it knows 0 reflectors
     assert np.isfinite(direction).all()
     assert changes == ["initialisation changed", "ready to measure", "statistics changed"]
 

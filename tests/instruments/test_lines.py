@@ -106,7 +106,7 @@ def test_lines_are_recorded_beside_one_another_and_play_back(device: Twofold, tm
 
 def test_silence_on_one_line_is_its_own(device: Twofold) -> None:
     lines = open_lines(device.url, {"data": 1}, timeout=0.2)
-    with pytest.raises(InstrumentTimeoutError, match="silent"):
+    with pytest.raises(InstrumentTimeoutError, match="sent no data"):
         lines.line("data").read()
     assert talk(lines) == b"HELLO"
     lines.close()

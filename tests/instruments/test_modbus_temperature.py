@@ -212,7 +212,7 @@ def test_another_unit_does_not_answer() -> None:
     device = SimulatedModbus(parse_address(LOGGER))
     try:
         port = parse_address(device.url).port
-        with pytest.raises(InstrumentTimeoutError, match="unit 9 is silent"):
+        with pytest.raises(InstrumentTimeoutError, match="unit 9 did not answer"):
             ModbusTemperature(f"modbus+tcp://127.0.0.1:{port}?unit=9", QUICK).open()
     finally:
         device.close()
@@ -244,9 +244,9 @@ def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> No
 @pytest.mark.parametrize(
     ("fault", "error", "message"),
     [
-        ("silence", InstrumentTimeoutError, "unit 1 is silent for 0.7 s"),
-        ("drop", InstrumentTimeoutError, "unit 1 is silent"),
-        ("unplugged", InstrumentTimeoutError, "unit 1 is silent"),
+        ("silence", InstrumentTimeoutError, "unit 1 did not answer within 0.7 s"),
+        ("drop", InstrumentTimeoutError, "unit 1 did not answer"),
+        ("unplugged", InstrumentTimeoutError, "unit 1 did not answer"),
         ("exception&code=6", ModbusRefusal, r"exception 6 \(server device busy\)"),
         ("garbage", ProtocolError, "(?i)expected"),
         ("short", ProtocolError, "bytes more within 0.7 s"),

@@ -27,7 +27,7 @@ def test_a_state_is_what_the_machine_does() -> None:
         control.spindle(6000.0)
         control.move_to((0.1, 0.05, 0.2), 0.05)
         told, true = agent.state(), control.state()
-    assert told["time"] == pytest.approx(true["time"], abs=1e-5)  # the agent tells microseconds
+    assert told["time"] == pytest.approx(true["time"], abs=1e-5)  # the agent reports microseconds
     assert told["position_time"] == told["time"]
     for key in ("position", "commanded_position"):
         assert told[key] == pytest.approx(true[key], abs=0.6e-7)  # half the last digit, 0.1 um
@@ -128,7 +128,7 @@ def test_a_restart_while_nobody_listened_is_noticed_too() -> None:
     agent = MTConnect(ADDRESS)
     with agent:
         agent.sample()
-    agent._instance = 1  # what it was before: a simulated agent always begins with the same
+    agent._instance = 1  # what it was before: a simulated agent always starts with the same
     with agent:
         assert agent.restarts == 1
         assert agent.sample().restarted

@@ -1,4 +1,4 @@
-"""XML of MTConnect agents: every version, hostile documents, and which data item tells what."""
+"""XML of MTConnect agents: every version, hostile documents, and which data item reports what."""
 
 import math
 
@@ -189,7 +189,7 @@ def test_times_without_a_zone_are_utc() -> None:
     assert parse_time("2025-03-01T12:00:00") == parse_time("2025-03-01T13:00:00+01:00") == 1740830400.0
 
 
-# ---------------------------------------------------------------------- which item tells what
+# ---------------------------------------------------------------------- which item reports what
 
 
 def test_native_names_and_machine_coordinates_decide() -> None:
@@ -209,7 +209,7 @@ def test_a_path_position_stands_in_where_no_axis_tells_its_own() -> None:
 
 
 def test_two_spindles_are_named_and_a_setting_decides() -> None:
-    with pytest.raises(InstrumentError, match=r"Several data items tell 'spindle_speed': .*[cb]v .*items = "):
+    with pytest.raises(InstrumentError, match=r"Several data items report 'spindle_speed': .*[cb]v .*items = "):
         choose(*device())
     assert choose(*device(items={"spindle_speed": "bv"}))["spindle_speed"].id == "bv"
     with pytest.raises(InstrumentError, match="no rotary axis 'S'; it has B, C"):

@@ -219,7 +219,7 @@ def test_a_counter_that_starts_again_is_a_protocol_error() -> None:
 
 
 def reference_split(data: bytes) -> tuple[list[int], bytes]:
-    """The plain way to tell values from the rest, of a complete stretch of bytes."""
+    """The plain way to report values from the rest, of a complete stretch of bytes."""
     triple = re.compile(rb"[\x00-\x3f][\x40-\x7f][\x80-\xff]")
     values = [codec.decode_value(match[0]) for match in triple.finditer(data)]
     return values, triple.sub(b"", data)
@@ -228,7 +228,7 @@ def reference_split(data: bytes) -> tuple[list[int], bytes]:
 @given(st.lists(st.binary(max_size=12) | st.integers(0, (1 << 18) - 1).map(codec.encode_value), max_size=30))
 @compiled
 def test_the_compiled_splitter_agrees_with_the_plain_one(parts: list[bytes]) -> None:
-    data = b"".join(parts) + b"\xff\xff"  # closes whatever was begun
+    data = b"".join(parts) + b"\xff\xff"  # closes whatever was started
     values = np.empty(len(data), dtype=np.uint32)
     text = np.empty(len(data), dtype=np.uint8)
     used, n_values, n_text, _ = kernels.split(np.frombuffer(data, dtype=np.uint8), values, text, False)

@@ -146,7 +146,7 @@ def test_all_mistakes_are_told_at_once(tmp_path: Path) -> None:
     [
         ((), "expected lines of measurements"),
         (("S1,1,,20,1013,40",), "not a single length in it"),
-        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "a second table begins"),
+        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "a second table starts"),
     ],
 )
 def test_tables_without_lengths_or_in_two_parts_are_refused(tmp_path: Path, lines: tuple[str, ...], words: str) -> None:

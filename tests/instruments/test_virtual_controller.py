@@ -57,7 +57,7 @@ def test_the_state_follows_the_schedule() -> None:
             "time": 0.0,
             "position": [0.0, 0.0, 0.0],
             "commanded_position": [0.0, 0.0, 0.0],
-            "spindle_speed": 0.0,  # it has only been told to turn
+            "spindle_speed": 0.0,  # it has only been reported to turn
             "commanded_spindle_speed": 15000.0,
             "spindle_load": 0.0,
             "feed": 0.0,

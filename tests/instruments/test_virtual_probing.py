@@ -208,7 +208,7 @@ def test_a_speed_commanded_in_a_stream_changes_no_sample_that_was_made() -> None
     turning, when = session(faster=True)
     still, _ = session(faster=False)
     same = min(int(when * 1500), still.size)
-    # a block that is made after the order is laid out anew up to the change: the still reading is good to 0.5 nm
+    # a block that is made after the order is laid out again up to the change: the still reading is good to 0.5 nm
     np.testing.assert_allclose(turning[:same], still[:same], atol=1e-9)
     assert np.std(turning[int((when + 1.0) * 1500) :]) > 2 * np.std(still)  # runout
 
@@ -219,7 +219,7 @@ def test_a_speed_commanded_in_a_stream_changes_no_sample_that_was_made() -> None
 def test_a_stop_leaves_the_axes_where_they_are(controller: VirtualController) -> None:
     controller.spindle(5000.0)
     controller.run_program(PROGRAM)
-    controller.elapse(8.0)  # begun after 0.5 s to 2.5 s; 100 mm/s
+    controller.elapse(8.0)  # started after 0.5 s to 2.5 s; 100 mm/s
     state = controller.state()
     assert (state["mode"], state["program"], state["running"]) == ("automatic", "TO AND FRO", True)
     assert state["feed"] == pytest.approx(0.1, rel=1e-9)
@@ -301,7 +301,7 @@ def test_an_emergency_stop_in_a_program_stops_axes_and_spindle(controller: Virtu
     controller.stop(spindle=True)  # always allowed
     controller.reset()
     controller.elapse(60.0)
-    assert controller.state()["spindle_speed"] == 0.0  # nothing begins by itself
+    assert controller.state()["spindle_speed"] == 0.0  # nothing starts by itself
     assert controller.state()["position"] == place
 
 
@@ -417,10 +417,10 @@ class Held:
 
 @pytest.mark.parametrize("order", ["run_program", "run_steps"])
 def test_no_motion_begins_within_a_block_under_way(order: str) -> None:
-    """At 100 samples/s a block lasts 41 s: what is ordered meanwhile begins after it."""
+    """At 100 samples/s a block lasts 41 s: what is ordered meanwhile starts after it."""
     here, stream = VirtualWorld("cframe", 5), Held()
     here.mount("sphere")
-    here.begin_stream(stream)
+    here.start_stream(stream)
     assert stream.pushing.wait(10.0)
     if order == "run_program":
         begin = here.run_program("G1 X10 F600\nM30").begin

@@ -135,7 +135,7 @@ def test_without_a_target_a_sensor_is_one_of_the_frame_again() -> None:
 
 
 def test_a_streaming_sensor_sees_the_stage_move() -> None:
-    """The face leans in Y by 20 deg, the beam does not: the reading goes with y as the plane says."""
+    """The face leans in Y by 20 deg, the beam does not: the reading goes with y as the plane states."""
     with (
         VirtualController(f"sim://cframe/c?{SEED}") as controller,
         OptoNCDT(f"sim://cframe/lds?{SEED}&range=20", LONG) as opto,

@@ -95,7 +95,7 @@ def test_the_same_orders_give_the_same_samples() -> None:
 
 
 def test_a_schedule_is_kept_whatever_is_buffered() -> None:
-    """The bar is seen to begin to turn at 20 s, although the samples were made long before they were read."""
+    """The bar is seen to start to turn at 20 s, although the samples were made long before they were read."""
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
         VirtualController("sim://cframe/c?seed=3") as controller,

@@ -60,6 +60,13 @@ def test_locks_hold_what_pyproject_asks_for() -> None:
             )
 
 
+def test_the_citation_names_the_version_that_is_built() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text().splitlines()
+    assert f"version: {project['version']}" in citation
+    assert f"license: {project['license']}" in citation
+
+
 @pytest.fixture
 def house(tmp_path: Path) -> Path:
     """Return a copy of the files that set-up uses; its setup only counts how often it is called."""

@@ -282,7 +282,7 @@ BROKEN = [
     ("identify", PassesAsReal),
     ("open_and_close_twice", OpensOnce),
     ("use_before_open", AttributeErrorBeforeOpen),
-    ("nobody_there", WaitsForever),
+    ("no_device", WaitsForever),
     ("readings", ReadsText),
     ("plausible_magnitudes", ReadsMillimetres),
     ("stream_blocks", StreamsSinglePrecision),

@@ -91,7 +91,7 @@ def test_tilted_ray_reaches_the_floor_of_the_pocket_farther_on():
 
 
 def test_unphysical_artefacts_are_refused_in_words():
-    with pytest.raises(BenchError, match="radius of an artefact is a positive length"):
+    with pytest.raises(BenchError, match="radius of an artefact as a positive length"):
         artefacts.circular_pocket(-1)
     with pytest.raises(BenchError, match="not finite"), np.errstate(invalid="ignore"):
         artefacts.freeform(lambda x, y: np.sqrt(x))

@@ -225,7 +225,7 @@ def test_sensors_read_the_temperature_with_a_noise_of_their_own(machine):
 
 
 def test_balls_are_counted(cframe):
-    with pytest.raises(BenchError, match="from 0 to 3; found 4"):
+    with pytest.raises(BenchError, match="0 to 3; found 4"):
         cframe.balls.moved(4, (0, 0, 0))
 
 

@@ -1,7 +1,7 @@
-"""Thermal model: from temperatures and working parameters to the six errors, with an interval.
+"""Thermal model: prediction of the six errors with their uncertainty from temperatures and working parameters.
 
-`fit` makes a `ThermalModel` of error datasets of warm-ups; the model predicts an error dataset of its own, says how far
-it can be trusted, and is saved as a dataset (schema ``errormotion.model.thermal/1``).
+`fit` determines a `ThermalModel` from error datasets of warm-ups. The model predicts an error dataset, states the
+uncertainty of the prediction, and is stored as a dataset (schema ``errormotion.model.thermal/1``).
 """
 
 from errormotion.compensation.thermal_model.check import Check, check

@@ -1,4 +1,4 @@
-"""A model against a campaign that it has not seen."""
+"""Comparison of a model with a campaign that was not used for its fit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from errormotion.errors import DatasetError
 
 @dataclass(frozen=True)
 class Check:
-    """What a model does at one campaign; NaN for errors that are not seen.
+    """Comparison of a model with one campaign; NaN for errors that are unknown.
 
     Attributes
     ----------
@@ -26,9 +26,9 @@ class Check:
     removed : (6,)
         1 - remaining / rms.
     held : (6,)
-        Share of the times at which the 95 % interval of measured minus predicted holds 0.
+        Fraction of the times at which the 95 % interval of measured minus predicted contains 0.
     outside : float
-        Share of the times beyond what the model was trained on.
+        Fraction of the times outside the training range.
     predicted : Dataset
     """
 
@@ -46,7 +46,7 @@ def check(model: ThermalModel, campaign: xr.Dataset) -> Check:
     Raises
     ------
     DatasetError
-        The campaign is of another component or functional point, or lacks an input of the model.
+        The campaign has another component or functional point, or lacks an input of the model.
     """
     for name in ("component", "frame"):
         if campaign.attrs.get(name) != model.dataset.attrs[name]:
@@ -55,7 +55,9 @@ def check(model: ThermalModel, campaign: xr.Dataset) -> Check:
             )
     there, here = (np.asarray(each.attrs["functional_point"], dtype=float) for each in (model.dataset, campaign))
     if not np.allclose(here, there, atol=1e-6):
-        raise DatasetError(f"Expected errors at {there.tolist()} m; found {here.tolist()} m. Use ds.em.at(point).")
+        raise DatasetError(
+            f"Expected errors at {there.tolist()} m; found {here.tolist()} m. Move the errors with ds.em.at(point)."
+        )
     predicted = model.predict(campaign)
     measured = np.column_stack([campaign[name].values for name in DOF])
     difference = measured - np.column_stack([predicted[name].values for name in DOF])

@@ -1,6 +1,6 @@
-"""What the errors are linear in: temperatures, now or some time ago, and first-order answers to what heats.
+"""Features, in which the errors are linear: temperatures, present or lagged, and first-order responses.
 
-All features are linear in the inputs and 0 in the reference state, so that the model has no constant.
+All features are 0 in the reference state, so that the model has no constant.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Feature:
     parameter : bool
         Whether it is a working parameter.
     power : int
-        Of the working parameter: friction grows with the speed and with its square.
+        Power of the working parameter: friction depends on the speed and on its square.
     lag : float
-        How long ago, s.
+        Lag, s.
     time_constant : float
-        Of the first-order answer, s; 0: the value itself.
+        Of the first-order response, s; 0: the value itself.
     """
 
     source: str
@@ -41,38 +41,38 @@ class Feature:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name in messages and reports."""
         text = self.source if self.power == 1 else f"{self.source}^{self.power}"
         text += f", {self.lag / 60:g} min ago" if self.lag else ""
         return text + (f", time constant {self.time_constant / 60:g} min" if self.time_constant else "")
 
 
 def lagged(sensors: Sequence[str], lags: Sequence[float]) -> tuple[Feature, ...]:
-    """Return temperatures now and some time ago."""
+    """Return present and lagged temperatures."""
     return tuple(Feature(sensor, lag=lag) for sensor in sensors for lag in (0.0, *lags))
 
 
 def dynamics(sensors: Sequence[str], time_constants: Sequence[float], parameters: Sequence[str]) -> tuple[Feature, ...]:
-    """Return temperatures, and first-order answers to them and to working parameters with their squares."""
+    """Return temperatures, and first-order responses to them, to working parameters and to their squares."""
     temperatures = [Feature(s, time_constant=tau) for s in sensors for tau in (0.0, *time_constants)]
-    answers = [
+    responses = [
         Feature(name, True, power, time_constant=tau)
         for name in parameters
         for power in (1, 2)
         for tau in time_constants
     ]
-    return (*temperatures, *answers)
+    return (*temperatures, *responses)
 
 
 def matrix(inputs: Inputs, features: Sequence[Feature]) -> Array:
     """Return the value of each feature at each time, shape (n, feature).
 
-    A value that is not known is NaN where it would count now; in the past it is bridged by its neighbours.
+    An unknown value is NaN at its own time; for lags and responses it is interpolated from its neighbours.
 
     Raises
     ------
     DatasetError
-        An input that a feature needs is not there.
+        An input of a feature is missing.
     """
     return (
         np.column_stack([_column(inputs, feature) for feature in features])
@@ -91,12 +91,12 @@ def _column(inputs: Inputs, feature: Feature) -> Array:
     known = np.isfinite(values)
     if not known.any():
         return np.full(values.size, np.nan)
-    bridged = np.interp(inputs.time, inputs.time[known], values[known])
+    filled = np.interp(inputs.time, inputs.time[known], values[known])
     if feature.lag:
-        bridged = np.interp(inputs.time - feature.lag, inputs.time, bridged, left=0.0)
+        filled = np.interp(inputs.time - feature.lag, inputs.time, filled, left=0.0)
     if feature.time_constant:
-        bridged = first_order(inputs.time, bridged, feature.time_constant, held=feature.parameter)
-    return np.where(known, bridged, np.nan)
+        filled = first_order(inputs.time, filled, feature.time_constant, held=feature.parameter)
+    return np.where(known, filled, np.nan)
 
 
 def first_order(time: Array, values: Array, time_constant: float, *, held: bool) -> Array:
@@ -105,11 +105,11 @@ def first_order(time: Array, values: Array, time_constant: float, *, held: bool)
     Parameters
     ----------
     time, values : (n,)
-        u is known at these times, s.
+        Times, s, and values of u.
     time_constant : float
         s.
     held : bool
-        Whether ``values[k]`` held all the time since the instant before; else u is linear in between.
+        Whether ``values[k]`` applies since the previous time; else u is linear between the times.
     """
     out = np.zeros(values.size)
     steps = np.diff(time) / time_constant
@@ -117,7 +117,7 @@ def first_order(time: Array, values: Array, time_constant: float, *, held: bool)
     for k in range(1, values.size):
         if held:
             out[k] = out[k - 1] * decay[k - 1] + values[k] * (1 - decay[k - 1])
-        else:  # the exact answer to a ramp from u0 to u1
+        else:  # exact response to a ramp from u0 to u1
             ramp = (values[k] - values[k - 1]) / steps[k - 1]
             out[k] = values[k] - ramp + (out[k - 1] - values[k - 1] + ramp) * decay[k - 1]
     return out

@@ -1,7 +1,7 @@
-"""Making a thermal model: which sensors, which lags or time constants, how much regularisation.
+"""Fit of a thermal model: selection of sensors, lags or time constants, and regularisation.
 
-Everything is chosen by the error at campaigns that were left out whole: samples of one warm-up resemble their
-neighbours so much that leaving out samples would praise any model.
+Everything is selected by cross-validation that leaves out whole campaigns: neighbouring samples of a warm-up are so
+similar that leaving out single samples would favour any model.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (
     (600.0, 3600.0),
     (300.0, 1800.0, 7200.0),
 )
-"""Tried where the settings name none, s."""
+"""Candidates where the settings have none, s."""
 
 SAME = ("component", "frame", "reference", "machine")
-"""Attributes in which the campaigns of one model have to agree."""
+"""Attributes that must be equal in the campaigns of one model."""
 
-LEAST_SAMPLES = 8
-"""Known errors without which nothing is fitted."""
+FEWEST_SAMPLES = 8
+"""Smallest number of known values of an error."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to make the model, and how well it predicts campaigns that it has not seen.
+    """A candidate of the model, with its cross-validated error.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Candidate:
         Lags or time constants, s.
     features : tuple of Feature
     score : float
-        Sum over the freedoms of the mean square error as a share of the mean square of the errors themselves.
+        Sum over the errors of the mean square residual over the mean square of the error.
     """
 
     variant: str
@@ -61,13 +61,13 @@ class Candidate:
 
 
 def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> ThermalModel:
-    """Make a thermal model of measured warm-ups.
+    """Fit a thermal model to measured warm-ups.
 
     Parameters
     ----------
     campaigns : sequence of Dataset
-        Error datasets over time with ``temperature(time, sensor)``; two or more for a model that can be trusted. Of one
-        alone, blocks in time take the place of campaigns, and the model says so.
+        Error datasets over time with ``temperature(time, sensor)``; two or more for a valid uncertainty. For a single
+        one, blocks in time replace the campaigns, and the model states this.
     settings : Settings, optional
 
     Returns
@@ -77,16 +77,18 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     Raises
     ------
     DatasetError
-        Campaigns of different machines, components or functional points, without common sensors, or too few values.
+        Campaigns of different machines, components or functional points, no common sensors, or too few values.
     """
     settings = settings or Settings()
     if not campaigns:
-        raise DatasetError("A thermal model needs the errors of at least one campaign; found none.")
+        raise DatasetError("Expected the errors of at least one campaign; found none.")
     _check_alike(campaigns)
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
-    seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= LEAST_SAMPLES]
+    seen = [k for k in range(6) if sum(int(np.isfinite(r.errors[:, k]).sum()) for r in records) >= FEWEST_SAMPLES]
     if not seen:
-        raise DatasetError(f"Expected at least {LEAST_SAMPLES} known values of an error in all campaigns; found fewer.")
+        raise DatasetError(
+            f"Expected at least {FEWEST_SAMPLES} known values of an error in all campaigns together; found fewer."
+        )
     columns = regression.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)
@@ -97,23 +99,23 @@ def _check_alike(campaigns: Sequence[xr.Dataset]) -> None:
     hashes = [provenance.hash_dataset(ds) for ds in campaigns]
     for number, ds in enumerate(campaigns[1:], start=2):
         if (same := hashes.index(hashes[number - 1]) + 1) < number:
-            raise DatasetError(f"Campaign {number} is campaign {same} again: it cannot tell what a model is worth.")
+            raise DatasetError(f"Campaign {number} equals campaign {same}; a validation needs different campaigns.")
         for name in SAME:
             if ds.attrs.get(name) != first.attrs.get(name):
                 raise DatasetError(
-                    f"Campaign {number}: expected {name} '{first.attrs.get(name)}' as in the first; "
+                    f"Campaign {number}: expected {name} '{first.attrs.get(name)}' as in campaign 1; "
                     f"found '{ds.attrs.get(name)}'"
                 )
         here, there = (np.asarray(each.attrs["functional_point"], dtype=float) for each in (ds, first))
         if not np.allclose(here, there, atol=1e-6):
             raise DatasetError(
-                f"Campaign {number}: expected the functional point {there.tolist()} m as in the first; found "
+                f"Campaign {number}: expected the functional point {there.tolist()} m as in campaign 1; found "
                 f"{here.tolist()} m. Move the errors with ds.em.at(point)."
             )
 
 
 def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings) -> tuple[Candidate, list[Candidate]]:
-    """Return the best candidate, and the best of every variant and set of constants."""
+    """Return the best candidate, and the best candidates of all variants and constants."""
     records = columns.records
     temperatures = [r.inputs.temperature for r in records]
     common = [n for n in temperatures[0] if all(np.isfinite(known.get(n, np.nan)).any() for known in temperatures)]
@@ -121,7 +123,7 @@ def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings
         missing = [name for name in settings.sensors if name not in common]
         if missing:
             raise DatasetError(
-                f"sensors: expected names that all campaigns have ({', '.join(common)}); found {', '.join(missing)}"
+                f"sensors: expected sensors of all campaigns ({', '.join(common)}); found {', '.join(missing)}"
             )
     parameters = tuple(
         name
@@ -129,16 +131,18 @@ def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings
         if wanted and all(name in r.inputs.parameter for r in records)
     )
     variants = ("lagged", "dynamics") if settings.variant == "auto" else (settings.variant,)
-    tried = []
+    candidates = []
     for variant in variants:
         given = settings.lags if variant == "lagged" else settings.time_constants
         for constants in (LAGS if variant == "lagged" else TIME_CONSTANTS) if given is None else (given,):
             best = _with_sensors(columns, seen, variant, constants, common, parameters, settings)
             if best is not None:
-                tried.append(best)
-    if not tried:
-        raise DatasetError("A thermal model needs a temperature that all campaigns have, or the spindle's speed.")
-    return min(tried, key=lambda candidate: candidate.score), tried
+                candidates.append(best)
+    if not candidates:
+        raise DatasetError(
+            "Expected a temperature sensor common to all campaigns, or the spindle speed; found neither."
+        )
+    return min(candidates, key=lambda candidate: candidate.score), candidates
 
 
 def _with_sensors(
@@ -150,7 +154,7 @@ def _with_sensors(
     parameters: tuple[str, ...],
     settings: Settings,
 ) -> Candidate | None:
-    """Return the candidate with the sensors that were asked for, or one sensor after the other while it pays."""
+    """Return the candidate with the given sensors, or with sensors added one by one while the error decreases."""
 
     def candidate(sensors: tuple[str, ...]) -> Candidate | None:
         features = lagged(sensors, constants) if variant == "lagged" else dynamics(sensors, constants, parameters)
@@ -165,7 +169,7 @@ def _with_sensors(
         if not further:
             break
         next_best = min(further, key=lambda each: each.score)
-        # The score is a square: a gain of 3 % in the error is one of 6 % in it.
+        # The score is a mean square.
         if best is not None and next_best.score > best.score * (1 - settings.least_gain) ** 2:
             break
         best = next_best
@@ -207,18 +211,18 @@ def _made(
         A = (X[known] * weight[known, None]).T @ X[known]
         strengths[k] = strength
         coefficient[k] = regression.solve(X[known], y[known], weight[known], np.array([strength]))[0] / scale
-        # Campaigns differ: the one that was predicted worst says what to expect of the next.
+        # The campaign with the largest residuals is taken for the uncertainty of a new one.
         square = max(
             found
             for number in np.unique(group)
             if np.isfinite(found := regression.mean_square(residual[group == number], weight[group == number]))
         )
         freedom = max(regression.effective_count(residual, group), 1.0)
-        # A standard uncertainty with few degrees of freedom, widened so that twice of it still makes 95 %.
+        # Standard uncertainty with few degrees of freedom, enlarged so that k = 1.96 gives 95 %.
         misfit[k] = np.sqrt(square) * student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)
         inverse = np.linalg.inv(A + strength * weight[known].sum() * np.eye(p))
-        alike = known.sum() / freedom  # rows that are worth one
-        covariance[k] = square * alike * inverse / np.outer(scale, scale)
+        correlated = known.sum() / freedom  # rows for each independent one
+        covariance[k] = square * correlated * inverse / np.outer(scale, scale)
         share[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
     physical = X[np.isfinite(X).all(axis=1)] * scale
     parts = Parts(

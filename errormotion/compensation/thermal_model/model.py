@@ -1,4 +1,4 @@
-"""A thermal model: what it is as a dataset, and what it predicts."""
+"""A thermal model: its dataset, and its prediction."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ SCHEMA = "errormotion.model.thermal/1"
 
 VERSION = "1"
 
-BEYOND = 0.1
-"""Share of the trained range of a feature by which a value may lie beyond it."""
+EXTRAPOLATION = 0.1
+"""Distance from the training range of a feature that is still accepted, relative to this range."""
 
 _FREE = (-float("inf"), float("inf"))
 _POSITIVE = (0.0, float("inf"))
 
 ROWS = (
-    Row("coefficient", ("dof", "feature"), "", *_FREE, "error per unit of each feature; NaN = error not seen"),
+    Row("coefficient", ("dof", "feature"), "", *_FREE, "error per unit of each feature; NaN = error unknown"),
     Row("coefficient_covariance", ("dof", "feature", "feature_"), "", *_FREE, "of the coefficients of each error"),
-    Row("misfit", ("dof",), "", *_POSITIVE, "standard uncertainty of a prediction from campaigns that were left out"),
-    Row("strength", ("dof",), "", *_POSITIVE, "of the regularisation that cross-validation chose"),
-    Row("removed", ("dof",), "1", -1e3, 1.0, "share of the error's RMS that the model took away at left-out campaigns"),
+    Row("misfit", ("dof",), "", *_POSITIVE, "standard uncertainty of a prediction, from campaigns that were left out"),
+    Row("strength", ("dof",), "", *_POSITIVE, "of the regularisation, from cross-validation"),
+    Row("removed", ("dof",), "1", -1e3, 1.0, "removed fraction of the error's RMS at campaigns that were left out"),
     Row("feature_power", ("feature",), "", 1, 2, "power of the working parameter"),
-    Row("feature_lag", ("feature",), "s", *_POSITIVE, "how long ago"),
-    Row("feature_time_constant", ("feature",), "s", *_POSITIVE, "of the first-order answer; 0: the value itself"),
+    Row("feature_lag", ("feature",), "s", *_POSITIVE, "lag"),
+    Row("feature_time_constant", ("feature",), "s", *_POSITIVE, "of the first-order response; 0: the value itself"),
     Row("feature_parameter", ("feature",), "", 0, 1, "1: a working parameter, 0: a temperature"),
-    Row("feature_low", ("feature",), "", *_FREE, "least value in training"),
-    Row("feature_high", ("feature",), "", *_FREE, "greatest value in training"),
+    Row("feature_low", ("feature",), "", *_FREE, "lowest value in training"),
+    Row("feature_high", ("feature",), "", *_FREE, "highest value in training"),
 )
-"""The model, one row a variable. Temperatures count in K since the start, speeds in 1000/min, feeds in m/min."""
+"""Variables of the model. Temperatures are changes since the start in K, speeds in 1000/min, feeds in m/min."""
 
 ATTRIBUTES = ("schema", "component", "frame", "machine", "reference", "functional_point", "variant", "provenance")
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What the fit found.
+    """Results of the fit.
 
     Attributes
     ----------
@@ -77,23 +77,23 @@ class Parts:
 
 
 class ThermalModel:
-    """Predicts the six errors of a machine from its temperatures and working parameters.
+    """Predicts the six errors of a machine from temperatures and working parameters.
 
     Attributes
     ----------
     dataset : Dataset
-        All that the model is, schema ``errormotion.model.thermal/1``.
+        The model, schema ``errormotion.model.thermal/1``.
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
         found = violations(dataset)
         if found:
-            raise DatasetError(f"This is no thermal model of schema {SCHEMA}:", found)
+            raise DatasetError(f"Not a thermal model of schema {SCHEMA}:", found)
         self.dataset = dataset
 
     @classmethod
     def of(cls, parts: Parts, attrs: Mapping[str, Any], where: Mapping[str, Any]) -> ThermalModel:
-        """Make a model of what a fit found, with the attributes of its campaigns and a provenance."""
+        """Return the model for the results of a fit, the attributes of its campaigns and a provenance."""
         features = parts.features
         data = {
             "coefficient": (("dof", "feature"), parts.coefficient),
@@ -126,7 +126,7 @@ class ThermalModel:
         Raises
         ------
         DatasetError
-            The file cannot be read, or is no thermal model.
+            The file cannot be read, or is not a thermal model.
         """
         with reading(Path(path)), load_dataset(path) as dataset:
             if dataset.attrs.get("schema") != SCHEMA:
@@ -134,12 +134,12 @@ class ThermalModel:
             return cls(dataset.load())
 
     def save(self, path: str | Path) -> None:
-        """Write the model as NetCDF; never over a file that is there."""
+        """Write the model as NetCDF; an existing file is not overwritten."""
         save(self.dataset, Path(path))
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
-        """What the errors are linear in."""
+        """The features."""
         ds = self.dataset
         return tuple(
             Feature(str(source), bool(parameter), int(power), float(lag), float(constant))
@@ -155,29 +155,30 @@ class ThermalModel:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Temperature sensors that the model needs."""
+        """Required temperature sensors."""
         return tuple(dict.fromkeys(f.source for f in self.features if not f.parameter))
 
     def predict(self, data: xr.Dataset) -> xr.Dataset:
-        """Return the errors that temperatures and working parameters let expect.
+        """Return the errors predicted from temperatures and working parameters.
 
         Parameters
         ----------
         data : Dataset
-            With ``temperature(time, sensor)`` and, where the model needs it, ``spindle_speed(time)`` or ``feed(time)``:
-            the log of a monitor, a raw dataset or an error dataset. The first time is the reference state.
+            With ``temperature(time, sensor)`` and, if the model requires them, ``spindle_speed(time)`` or
+            ``feed(time)``: the log of a monitor, a raw dataset or an error dataset. The first time is the reference
+            state.
 
         Returns
         -------
         Dataset
-            Error dataset over ``time``. NaN where an input is unknown. ``outside(time)`` is 1 where an input lies
-            beyond what the model was trained on; ``outside_feature(time, feature)`` says which. The uncertainty of the
-            coefficients and the misfit are sources of one draw each: they are alike at all times.
+            Error dataset over ``time``; NaN where an input is unknown. ``outside(time)`` is 1 where a feature lies
+            outside the training range, ``outside_feature(time, feature)`` for each feature. The uncertainty of the
+            coefficients and the misfit are fully correlated in time.
 
         Raises
         ------
         DatasetError
-            An input that the model needs is not there.
+            A required input is missing.
         """
         inputs = read_inputs(data)
         X = matrix(inputs, self.features)
@@ -190,21 +191,25 @@ class ThermalModel:
         influence, names, kinds = self._influence(np.nan_to_num(X))
         covariance = np.einsum("stj,stk->tjk", influence, influence)
         span = ds["feature_high"].values - ds["feature_low"].values
-        beyond = (ds["feature_high"].values + BEYOND * span < X) | (ds["feature_low"].values - BEYOND * span > X)
-        outside = beyond.any(axis=1).astype(np.int8)
+        features_outside = (ds["feature_high"].values + EXTRAPOLATION * span < X) | (
+            ds["feature_low"].values - EXTRAPOLATION * span > X
+        )
+        outside = features_outside.any(axis=1).astype(np.int8)
         extras = {
             "outside": xr.DataArray(
-                outside, dims="time", attrs={"units": "1", "long_name": "1: beyond what the model was trained on"}
+                outside, dims="time", attrs={"units": "1", "long_name": "1: outside the training range"}
             ),
             "outside_feature": xr.DataArray(
-                beyond.astype(np.int8), dims=("time", "feature"), coords={"feature": [f.name for f in self.features]}
+                features_outside.astype(np.int8),
+                dims=("time", "feature"),
+                coords={"feature": [f.name for f in self.features]},
             ),
         }
         result = build_errors(
             values,
             covariance,
             dims=("time",),
-            coords={"time": ("time", inputs.time, {"units": "s"}), **_known_inputs(data)},
+            coords={"time": ("time", inputs.time, {"units": "s"}), **_inputs(data)},
             component=str(ds.attrs["component"]),
             machine=str(data.attrs.get("machine", ds.attrs["machine"])),
             frame=str(ds.attrs["frame"]),
@@ -223,18 +228,16 @@ class ThermalModel:
             source_groups=kinds,
             extras=extras,
         )
-        notes = (
-            [f"{int(unknown.sum())} of {n} times without a prediction: an input is unknown"] if unknown.any() else []
-        )
+        notes = [f"{int(unknown.sum())} of {n} times have no prediction: an input is unknown"] if unknown.any() else []
         if outside.any():
-            which = ", ".join(self.features[k].name for k in np.flatnonzero(beyond.any(axis=0)))
-            notes.append(f"{int(outside.sum())} of {n} times beyond what the model was trained on: {which}")
+            which = ", ".join(self.features[k].name for k in np.flatnonzero(features_outside.any(axis=0)))
+            notes.append(f"{int(outside.sum())} of {n} times are outside the training range: {which}")
         if notes:
             result.attrs["notes"] = json.dumps(notes)
         return result
 
     def _influence(self, X: Array) -> tuple[Array, list[str], list[str]]:
-        """Return the effect of one standard uncertainty of the coefficients and of the misfit, (source, n, 6)."""
+        """Return the effects of one standard uncertainty of coefficients and misfit, (source, n, 6)."""
         ds = self.dataset
         n, p = X.shape
         columns, names, kinds = [], [], []
@@ -257,7 +260,7 @@ class ThermalModel:
         return np.array(columns), names, kinds
 
 
-def _known_inputs(data: xr.Dataset) -> dict[str, Any]:
+def _inputs(data: xr.Dataset) -> dict[str, Any]:
     coords: dict[str, Any] = {
         "sensor": [str(name) for name in data["sensor"].values],
         "temperature": (
@@ -273,7 +276,7 @@ def _known_inputs(data: xr.Dataset) -> dict[str, Any]:
 
 
 def violations(dataset: xr.Dataset) -> list[str]:
-    """Return every violation of the model's schema, one sentence each."""
+    """Return all violations of the model's schema, one sentence each."""
     if dataset.attrs.get("schema") != SCHEMA:
         return [f"attribute 'schema': expected {SCHEMA}; found {dataset.attrs.get('schema', 'none')}"]
     found = storable_violations(dataset)

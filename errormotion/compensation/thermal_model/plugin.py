@@ -8,7 +8,7 @@ from errormotion.plugins import DatasetInfo, lazy
 
 
 class ThermalModelDataset:
-    """A thermal model as a dataset, and the error datasets that it predicts."""
+    """Thermal models, and the error datasets that they predict."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
         id="thermal_model",

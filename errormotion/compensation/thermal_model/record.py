@@ -1,4 +1,4 @@
-"""One campaign as a model sees it: inputs over time, and the errors where they are known."""
+"""Input data of a model: temperatures and working parameters over time, and errors where known."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from errormotion.errors import DatasetError
 
 @dataclass(frozen=True)
 class Inputs:
-    """What is known of a machine over time.
+    """Temperatures and working parameters over time.
 
     Attributes
     ----------
     time : (n,)
         s, increasing.
     temperature : dict of str to (n,)
-        Change of each sensor since the first time at which it is known, K; NaN = unknown.
+        Change of each sensor since its first known value, K; NaN = unknown.
     parameter : dict of str to (n,)
-        ``spindle_speed`` in 1000/min and ``feed`` in m/min, which acted since the time before; 0 before the first.
-        Only those that the data have; NaN = unknown.
+        ``spindle_speed`` in 1000/min and ``feed`` in m/min since the previous time, if the data contain them; 0 before
+        the first time; NaN = unknown.
     """
 
     time: Array
@@ -43,7 +43,7 @@ class Record:
     ----------
     inputs : Inputs
     errors : (n, 6)
-        m and rad; NaN = not seen.
+        m and rad; NaN = unknown.
     variance : (n, 6)
         Of the errors.
     """
@@ -53,8 +53,8 @@ class Record:
     variance: Array
 
 
-#: name of a working parameter to its factor: numbers near 1 in the model
 PARAMETERS = {"spindle_speed": 1e-3, "feed": 60.0}
+"""Factors of the working parameters to the units of the model."""
 
 
 def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
@@ -63,19 +63,19 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
     Raises
     ------
     DatasetError
-        There is no time, or no temperature, or the times do not increase.
+        No time, no temperature, or times that do not increase.
     """
     if "time" not in ds.dims or "time" not in ds.coords:
         raise DatasetError(f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}")
     if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
-        raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Put a thermometer on the bench.")
+        raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.")
     time = np.asarray(ds["time"].values, dtype=float)
     if time.size > 1 and not (np.diff(time) > 0).all():
-        raise DatasetError(f"{what}: expected times that increase; found some that do not")
+        raise DatasetError(f"{what}: expected increasing times")
     values = np.asarray(ds["temperature"].transpose("time", "sensor").values, dtype=float)
     names = [str(name) for name in ds["sensor"].values]
     if len(set(names)) < len(names):
-        raise DatasetError(f"{what}: expected a name of its own for each sensor; found {', '.join(names)}")
+        raise DatasetError(f"{what}: expected different names of the sensors; found {', '.join(names)}")
     temperature = {name: since_start(values[:, k]) for k, name in enumerate(names)}
     parameter = {
         name: np.asarray(ds[name].values, dtype=float) * factor
@@ -86,23 +86,23 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
 
 
 def since_start(values: Array) -> Array:
-    """Return values less the first that is known; NaN stays."""
+    """Return values minus the first known one; NaN where unknown."""
     known = np.flatnonzero(np.isfinite(values))
     return values - values[known[0]] if known.size else values
 
 
 def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
-    """Return a campaign from an error dataset over time.
+    """Return the record of an error dataset over time.
 
     Raises
     ------
     DatasetError
-        The dataset has other dimensions than time, or no temperatures.
+        The dataset has other dimensions, or no temperatures.
     """
     inputs = read_inputs(ds, what)
     if ds["EX"].dims != ("time",):
         dims = ", ".join(map(str, ds["EX"].dims))
-        raise DatasetError(f"{what}: expected errors over time alone; found ({dims}). Select one place first.")
+        raise DatasetError(f"{what}: expected errors over time alone; found ({dims}). Select one position first.")
     errors = np.column_stack([np.asarray(ds[name].values, dtype=float) for name in DOF])
     covariance = ds["covariance"].transpose("time", "dof", "dof_").values
     variance = np.diagonal(covariance, axis1=1, axis2=2).copy()
@@ -110,11 +110,11 @@ def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
 
 
 def instruments_of(datasets: Iterable[xr.Dataset]) -> list[Any]:
-    """Return the instruments behind datasets, each once: what was simulated must not pass for measured."""
+    """Return the instruments of datasets, each once, so that simulated data remain marked as such."""
     found: list[Any] = []
     for ds in datasets:
-        told = json.loads(str(ds.attrs.get("provenance", "{}"))).get("instruments")
-        for instrument in told or json.loads(str(ds.attrs.get("instruments", "[]"))):
+        stated = json.loads(str(ds.attrs.get("provenance", "{}"))).get("instruments")
+        for instrument in stated or json.loads(str(ds.attrs.get("instruments", "[]"))):
             if instrument not in found:
                 found.append(instrument)
     return found

@@ -1,4 +1,4 @@
-"""Weighted ridge regression over campaigns, and what is learnt by leaving one campaign out."""
+"""Weighted ridge regression over campaigns, with cross-validation that leaves out one campaign."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from errormotion.compensation.thermal_model.features import Feature, matrix
 from errormotion.compensation.thermal_model.record import Record
 
 STRENGTHS = 10.0 ** np.arange(-7.0, 1.0)
-"""Of the regularisation, as shares of the sum of weights; features have unit mean square."""
+"""Candidates of the regularisation, relative to the sum of weights; features have unit mean square."""
 
 BLOCKS = 4
-"""Into which a single campaign is cut for cross-validation."""
+"""Number of blocks of a single campaign for cross-validation."""
 
 
 class Columns:
-    """The features of all campaigns, each computed once.
+    """Features of all campaigns, each computed once.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Columns:
         self._known: dict[Feature, Array] = {}
 
     def of(self, features: Sequence[Feature]) -> tuple[Array, Array]:
-        """Return the features in units of their root mean square, (n, feature), and that unit, (feature,)."""
+        """Return the features divided by their root mean square, (n, feature), and this, (feature,)."""
         for feature in features:
             if feature not in self._known:
                 self._known[feature] = np.vstack([matrix(r.inputs, [feature]) for r in self.records])[:, 0]
@@ -44,7 +44,7 @@ class Columns:
 
 
 def groups(records: Sequence[Record]) -> NDArray[np.int64]:
-    """Return the number of the campaign of each row; a single campaign is cut into blocks in time."""
+    """Return the number of the campaign of each row; a single campaign is divided into blocks in time."""
     if len(records) > 1:
         return np.repeat(np.arange(len(records)), [record.inputs.time.size for record in records])
     n = records[0].inputs.time.size
@@ -59,7 +59,7 @@ def target(records: Sequence[Record], freedom: int) -> tuple[Array, Array]:
     if not good.any():
         return y, np.zeros(y.size)
     floor = np.median(variance[good & (variance > 0)]) if (variance[good] > 0).any() else 1.0
-    # The reference state itself has no variance: it must not outweigh everything else.
+    # The reference state has no variance: its weight is limited.
     weight = np.where(good, 1 / np.maximum(variance, floor), 0.0)
     return y, weight / weight[good].mean()
 
@@ -73,7 +73,7 @@ def solve(X: Array, y: Array, weight: Array, strengths: Array) -> Array:
 
 
 def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> Array:
-    """Return measured minus predicted of each row by models that have not seen its campaign, (n, strength)."""
+    """Return measured minus predicted of each row by models fitted without its campaign, (n, strength)."""
     known = (weight > 0) & np.isfinite(X).all(axis=1)
     residual = np.full((y.size, STRENGTHS.size), np.nan)
     rows = np.flatnonzero(known)
@@ -84,13 +84,13 @@ def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int6
 
 
 def mean_square(residual: Array, weight: Array) -> float:
-    """Return the weighted mean square of what is known; infinite where nothing is."""
+    """Return the weighted mean square of the known values; infinite if there are none."""
     known = np.isfinite(residual) & (weight > 0)
     return float(np.average(residual[known] ** 2, weights=weight[known])) if known.any() else float("inf")
 
 
 def best_strength(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> tuple[float, float, Array]:
-    """Return the regularisation that predicts best, its mean square error, and its residuals."""
+    """Return the regularisation with the smallest mean square error, this error, and the residuals."""
     residual = left_out_residuals(X, y, weight, group)
     scores = [mean_square(column, weight) for column in residual.T]
     best = int(np.argmin(scores))
@@ -98,7 +98,7 @@ def best_strength(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -
 
 
 def effective_count(residual: Array, group: NDArray[np.int64]) -> float:
-    """Return how many independent values residuals are worth: neighbours in time are alike (AR(1))."""
+    """Return the effective number of independent residuals: neighbours in time are correlated (AR(1))."""
     total = 0.0
     for number in np.unique(group):
         values = residual[group == number]
@@ -106,6 +106,6 @@ def effective_count(residual: Array, group: NDArray[np.int64]) -> float:
         if values.size < 3 or not (values**2).sum() > 0:
             total += float(bool(values.size))
             continue
-        alike = float(np.clip((values[1:] * values[:-1]).sum() / (values**2).sum(), 0.0, 0.99))
-        total += max(1.0, values.size * (1 - alike) / (1 + alike))
+        correlation = float(np.clip((values[1:] * values[:-1]).sum() / (values**2).sum(), 0.0, 0.99))
+        total += max(1.0, values.size * (1 - correlation) / (1 + correlation))
     return total

@@ -1,4 +1,4 @@
-"""Calibrations of a sensor's inclination error: what the tilt of a surface does to a reading, with its uncertainty.
+"""Calibrations of the inclination error of a sensor: effect of the tilt of a surface on a reading, with uncertainty.
 
 A sensor whose beam meets the surface at the tilt q = tan(alpha) (cos beta, sin beta) reads
 
@@ -63,7 +63,7 @@ ROWS = (
     Row("degree", ("term", "axis"), "", 0, 20, "degrees of the two polynomials of each term"),
     Row("tilt_scale", (), "1", 1e-6, 1.0, "s: tan of half the steepest calibrated inclination"),
     Row("mid_range", (), "m", *_DEPTH, "reading at which the error vanishes, as stated"),
-    Row("mid_range_found", (), "m", *_FREE, "the same as the readings say; NaN where they cannot"),
+    Row("mid_range_found", (), "m", *_FREE, "the same, estimated from the readings; NaN where undetermined"),
     Row("mid_range_uncertainty", (), "m", 0.0, _FREE[1], "standard uncertainty of that; NaN where unknown"),
     Row("reading_low", (), "m", *_DEPTH, "lowest calibrated reading"),
     Row("reading_high", (), "m", *_DEPTH, "highest calibrated reading"),
@@ -196,12 +196,12 @@ class InclinationCalibration:
             folder that the environment variable ``ERRORMOTION_CALIBRATIONS`` names. While a campaign runs, the folder
             of its file counts as ``folder`` does.
         folder : str or Path, optional
-            Where the file stands that names the calibration.
+            Folder of the file that names the calibration.
 
         Raises
         ------
         DatasetError
-            Not found (says where it was looked for, and what is there instead), or no calibration.
+            Not found (with the paths that were searched and the calibrations found there), or no calibration.
         """
         bases = [Path(folder)] if folder is not None else []
         bases += [base for base in dict.fromkeys((*folders_beside(), Path.cwd())) if base not in bases]
@@ -218,8 +218,8 @@ class InclinationCalibration:
         there = sorted({path.stem for home in homes if home.is_dir() for path in home.glob("*.nc")})
         known = f" Calibrations there: {', '.join(there)}." if there else ""
         raise DatasetError(
-            f"calibration '{name}': not found. Looked for {', '.join(map(str, places))}.{known} Give a path, or put "
-            f"the file into one of these folders; {VARIABLE} names one more folder"
+            f"calibration '{name}': not found. Searched: {', '.join(map(str, places))}.{known} Give a path, or copy "
+            f"the file to one of these folders; {VARIABLE} names one more folder"
         )
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -228,7 +228,7 @@ class InclinationCalibration:
 
     @property
     def serial_number(self) -> str:
-        """Serial number of the calibrated sensor; empty where the file does not hold it."""
+        """Serial number of the calibrated sensor; empty where the file does not state it."""
         return owner.serial_number(self.dataset.attrs, "point_lds")
 
     def require_sensor(self, serial_number: str, mid_range: float, *, allow_other_sensor: bool = False) -> list[str]:
@@ -255,7 +255,7 @@ class InclinationCalibration:
 
     @property
     def order(self) -> int:
-        """Order of the polynomial that cross-validation chose; the terms beyond it are what it may leave out."""
+        """Order of the polynomial that cross-validation chose; the terms of higher order are what it may leave out."""
         return int(self.dataset.attrs["order"])
 
     @property
@@ -264,14 +264,14 @@ class InclinationCalibration:
         used = self._values("setting_left_out") == 0
         return np.asarray(tilt_vector(self._values("inclination"), self._values("rotation"))[used])
 
-    def told(self) -> dict[str, str]:
-        """Return name and hash, for the provenance of what it was used for; the hash is not of the name."""
+    def reference(self) -> dict[str, str]:
+        """Return name and hash for the provenance of a result; the hash does not depend on the name."""
         attrs = {name: value for name, value in self.dataset.attrs.items() if name != "name"}
         return {"name": self.name, "hash": hash_dataset(self.dataset.drop_attrs(deep=False).assign_attrs(attrs))}
 
     @cached_property
     def support(self) -> TiltSupport:
-        """Where the calibrated settings speak for a tilt."""
+        """The region of tilts that the calibrated settings support."""
         return TiltSupport(self.settings, float(self.dataset["support_gap"]), float(self.dataset["support_margin"]))
 
     def jacobian(self, q: ArrayLike) -> Array:
@@ -300,7 +300,7 @@ class InclinationCalibration:
         return self.support.holds(np.asarray(q, float))
 
     def require(self, q: ArrayLike) -> None:
-        """Refuse tilts (..., 2) that the calibration does not speak for; NaN is let through.
+        """Refuse tilts (..., 2) outside the support of the calibration; NaN is accepted.
 
         Raises
         ------
@@ -318,9 +318,9 @@ class InclinationCalibration:
         where = (
             "beyond the steepest calibrated setting"
             if np.hypot(*first) > steepest + self.support.margin
-            else "where the calibrated settings leave a hole"
+            else "in a hole between the calibrated settings"
         )
-        many = f" ({len(wrong)} of {len(points)} tilts lie so)" if len(points) > 1 else ""
+        many = f" ({len(wrong)} of {len(points)} such tilts)" if len(points) > 1 else ""
         raise MethodError(
             f"Calibration '{self.name}': {tilt_text(first)} lies {where}{many}; nearest calibrated: {near}. "
             "Calibrate there, measure within the calibrated settings, or allow extrapolation (extrapolate = true in "
@@ -330,7 +330,7 @@ class InclinationCalibration:
     def compensate(
         self, reading: ArrayLike, q: ArrayLike, mid_range: float | None = None, extrapolate: bool = False
     ) -> Compensated:
-        """Take the inclination error off readings.
+        """Compensate readings for the inclination error.
 
         Parameters
         ----------
@@ -341,12 +341,12 @@ class InclinationCalibration:
         mid_range : float, optional
             Reading at which the error vanishes, m; default: that of the calibration.
         extrapolate : bool
-            Compensate also where the calibration does not speak for a tilt or a depth.
+            Compensate also outside the support and the calibrated range.
 
         Raises
         ------
         MethodError
-            A tilt in a hole or beyond the calibrated settings, or a reading beyond the calibrated range.
+            A tilt outside the support, or a reading outside the calibrated range.
         """
         r, q = np.asarray(reading, float), np.asarray(q, float)
         m = self.mid_range if mid_range is None else float(mid_range)
@@ -391,25 +391,25 @@ def terms(x: Array, degrees: NDArray[np.int64]) -> Array:
 
 
 def tilt_text(q: Array) -> str:
-    """Return a tilt vector (2,) as people say it."""
+    """Return a tilt vector (2,) as text: inclination and rotation."""
     alpha, beta = inclination_rotation(q)
     return f"inclination {np.degrees(alpha):.1f} deg at rotation {np.degrees(beta):.1f} deg"
 
 
 def hole_texts(holes: Sequence[Hole]) -> list[str]:
-    """Return holes as people say them; those between the same inclinations, as symmetry makes them, in one."""
+    """Return holes as texts; holes between the same inclinations, as symmetry makes them, in one text."""
     texts: dict[str, list[str]] = {}
     for hole in holes:
         low, high = np.degrees(hole.inclination)
-        begin, end = np.degrees(hole.rotation)
-        where = "" if end - begin > _ALL_AROUND else f"{begin:.0f} to {end % 360:.0f}"
+        start, end = np.degrees(hole.rotation)
+        where = "" if end - start > _ALL_AROUND else f"{start:.0f} to {end % 360:.0f}"
         texts.setdefault(f"inclination {low:.0f} to {high:.0f} deg", []).append(where)
-    told = []
+    holes_found = []
     for inclination, found in texts.items():
         *first, last = found
         rotations = f"{', '.join(first)} and {last}" if first else last
-        told.append(f"{inclination} at " + (f"rotation {rotations} deg" if last else "every rotation"))
-    return told
+        holes_found.append(f"{inclination} at " + (f"rotation {rotations} deg" if last else "every rotation"))
+    return holes_found
 
 
 def violations(ds: xr.Dataset) -> list[str]:

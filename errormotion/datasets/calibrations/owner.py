@@ -35,7 +35,7 @@ def serial_number(attrs: Mapping[str, Any], kind: str) -> str:
 
 
 def known(serial: str) -> str:
-    """Return a serial number, or nothing where the text says that there is none."""
+    """Return a serial number; empty where the text states that there is none."""
     text = serial.strip()
     return "" if text.lower() == UNKNOWN or text.lower().startswith("not ") else text
 

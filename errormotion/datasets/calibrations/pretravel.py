@@ -1,11 +1,11 @@
-"""Pre-travel maps of touch probes: how far the machine goes on between touching and tripping, by direction.
+"""Pre-travel maps of touch probes: displacement of the machine between touching and tripping, by direction.
 
-When the probe trips, the middle of its tip is by the pre-travel s(n) nearer to the surface than it was when they met;
+When the probe trips, the centre of its tip has moved by the pre-travel s(n) towards the surface since the contact;
 n is the outward normal of the surface. The map is a sum of real spherical harmonics of n (the axis of the stylus is z):
 three lobes around the stylus, as the three contacts of a probe's seat make them, are one term of degree 3.
 
-The terms of degree 1 are missing on purpose: on one ball they cannot be told from the place of the ball. All that they
-do is to displace every measured centre alike.
+There are no terms of degree 1: on one ball they cannot be separated from the position of the ball. They displace every
+measured centre in the same way.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class PretravelMap:
 
     @property
     def serial_number(self) -> str:
-        """Serial number of the calibrated probe; empty where the file does not hold it."""
+        """Serial number of the calibrated probe; empty where the file does not state it."""
         return owner.serial_number(self.dataset.attrs, "touch_probe")
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -129,7 +129,7 @@ class PretravelMap:
         Returns
         -------
         value, uncertainty : ndarray, (n,)
-            m. They say nothing where `supported` is false.
+            m. They are without meaning where `supported` is false.
         """
         J = self.jacobian(normals)
         variance = np.einsum("ni,ij,nj->n", J, self.coefficient_covariance, J)
@@ -215,7 +215,7 @@ def _value_violations(ds: xr.Dataset) -> list[str]:
     if (np.abs(orders) > degrees).any():
         found.append("order: expected -degree to degree; found another one")
     if (degrees == 1).any():
-        found.append("degree: expected no term of degree 1, which no ball tells from its place; found one")
+        found.append("degree: expected no term of degree 1 (not separable from the position of the ball); found one")
     C = ds["coefficient_covariance"].transpose("term", "term_").values
     if C.shape[0] != C.shape[1] or not np.allclose(C, C.T, rtol=1e-8, atol=0.0):
         found.append("coefficient_covariance: expected a symmetric matrix; found another")

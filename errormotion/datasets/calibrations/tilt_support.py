@@ -1,23 +1,23 @@
-"""Where calibrated tilts surround a point closely enough to speak for it.
+"""Support of a calibration: the region of tilts that the calibrated tilts surround closely enough.
 
 The calibrated tilt vectors are joined to triangles (Delaunay), so that the circle through the corners of each is empty.
-A triangle counts, unless it is part of a hole:
+A triangle counts unless it is part of a hole:
 
-* across: its circle is wider than ``gap``, half a wave of what may lie between; or
-* along the inclination: with h the usual step of the inclination, which is the median over the triangles of the range
-  of inclination between corners, no setting comes within `REACH` h of the inclination at the middle of the circle, or
-  of that half-way between the corners. Settings are looked for no farther along the rotation than the triangle is wide,
-  or than `REACH` h.
+* across rotations: its circle is wider than ``gap``, half a period of the finest variation; or
+* along the inclination: with h the usual step of the inclination (the median over the triangles of the range of
+  inclination between corners), no setting comes within `REACH` h of the inclination at the middle of the circle, or of
+  that half-way between the corners. Settings are searched along the rotation no farther than the triangle is wide, or
+  than `REACH` h.
 
-Why there are two rules: across rotations, the surface that is fitted to few settings knows how little they say of what
-is between them, and its uncertainty grows. Along the inclination many settings on either side of a hole make it look
-certain inside. What vouches for the uncertainty is the prediction of settings that were left out, and leaving one out
-opens a hole of two steps, no wider. `REACH` to both sides makes that two and a half, since steps are not all alike. It
-is empty places that both rules ask for: a narrow triangle between scattered settings is none.
+Two rules are needed. Across rotations, a surface that is fitted to few settings has a large uncertainty between them.
+Along the inclination, the many settings on both sides of a hole give it a small uncertainty inside the hole. The stated
+uncertainty is confirmed by predictions of settings that were left out, and leaving one out opens a hole of two steps.
+`REACH` on both sides allows two and a half, since steps are not equal. Both rules search for empty regions: a narrow
+triangle between scattered settings is none.
 
-A side counts with its triangles; or by itself if it is shorter than ``gap``, no setting is inside the circle on it, and
-its ends are no more than 2 `REACH` h apart in inclination, so that a row of settings speaks for itself. A tilt is
-supported if it lies in what counts or within ``margin`` of it.
+A side counts with its triangles. It also counts by itself if it is shorter than ``gap``, no setting is inside the
+circle on it, and its ends are at most 2 `REACH` h apart in inclination, so that a single row of settings counts. A tilt
+is supported if it lies in what counts or within ``margin`` of it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from errormotion.datasets.calibrations.tilt_mesh import Mesh
 from errormotion.kinematics.beams import inclination_rotation
 
 REACH = 1.25
-"""Steps of the inclination within which a setting must lie on either side of the middle of an empty place."""
+"""Steps of the inclination within which a setting must lie on either side of the middle of an empty region."""
 
 _TURN = 2 * np.pi
 _SQUARE = 1e-9
@@ -46,12 +46,12 @@ _BLOCK = 2**21
 
 @dataclass(frozen=True)
 class Hole:
-    """A region between calibrated tilts that they do not speak for.
+    """A region between calibrated tilts without support.
 
     Attributes
     ----------
     inclination : (low, high)
-        Of the settings around it, rad; from 0 if the surface at right angles is in it.
+        Of the settings around it, rad; from 0 if it contains the untilted surface.
     rotation : (low, high)
         Of the settings around it, rad, ``low`` in [0, 2 pi); 2 pi apart if it goes all around.
     middle : ndarray (2,)
@@ -64,7 +64,7 @@ class Hole:
 
 
 class TiltSupport:
-    """The region of tilts that calibrated ones speak for.
+    """The region of tilts that the calibrated tilts support.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class TiltSupport:
         return held.reshape(np.shape(q)[:-1])
 
     def holes(self) -> list[Hole]:
-        """Return the regions between calibrated tilts that these do not speak for, by inclination and rotation."""
+        """Return the regions without support between calibrated tilts, by inclination and rotation."""
         bare = ~self._counts
         bare[bare] = ~self.holds(self._mesh.corners[bare].mean(axis=1))
         # A row of settings that counts by itself parts two holes.
@@ -138,17 +138,17 @@ class TiltSupport:
             counts[counts] = self._met(along[counts], mesh.corners[counts])
         return counts
 
-    def _met(self, places: Array, corners: Array) -> NDArray[np.bool_]:
-        """Return whether a setting has about the inclination of each place (m, 2) and is not far along the rotation."""
+    def _met(self, points: Array, corners: Array) -> NDArray[np.bool_]:
+        """Return whether a setting has about the inclination of each point (m, 2) and is not far along the rotation."""
         wide = np.maximum(_way(corners, corners[:, [1, 2, 0]]).max(axis=1, initial=0.0), self._reach)
 
         def near(some: NDArray[np.int64], settings: Array) -> NDArray[np.bool_]:
-            at = places[some, None]
+            at = points[some, None]
             apart = np.abs(np.arctan(_size(at)) - np.arctan(_size(settings)))
             found: NDArray[np.bool_] = ((apart <= self._reach) & (_way(at, settings) <= wide[some, None])).any(axis=1)
             return found
 
-        found = near(np.arange(len(places)), corners)
+        found = near(np.arange(len(points)), corners)
         rest = np.flatnonzero(~found)
         step = max(1, _BLOCK // len(self.tilts))
         for start in range(0, len(rest), step):
@@ -207,13 +207,13 @@ def _arc(corners: Array) -> tuple[float, float]:
     off[_size(corners) < _SQUARE] = 0.0
     low, high = middle + off.min(axis=1), middle + off.max(axis=1)
     order = np.argsort(low)
-    # Twice around, so that what begins before 0 is seen to go on.
+    # Twice around, so that an interval that starts before 0 is one interval.
     low, high = (np.concatenate([ends[order], ends[order] + _TURN]) for ends in (low, high))
     reached = np.maximum.accumulate(high)
-    begins = np.flatnonzero(low[1:] > reached[:-1] + _SAME) + 1
-    if not len(begins):
+    starts = np.flatnonzero(low[1:] > reached[:-1] + _SAME) + 1
+    if not len(starts):
         return 0.0, _TURN
-    begin = float(low[begins[0]])
-    length = float(reached[begins[1] - 1] if len(begins) > 1 else reached[-1]) - begin
-    begin = 0.0 if _TURN - begin % _TURN < _SAME else begin % _TURN
-    return begin, begin + length
+    start = float(low[starts[0]])
+    length = float(reached[starts[1] - 1] if len(starts) > 1 else reached[-1]) - start
+    start = 0.0 if _TURN - start % _TURN < _SAME else start % _TURN
+    return start, start + length

@@ -1,4 +1,4 @@
-"""A text file with header lines and tables, taken apart: what each line says is for others to judge."""
+"""A text file with header lines and tables, split into lines and cells, without any interpretation."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class VirtualController(Driver):
         return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
 
     def identify(self) -> Identity:
-        """Ask the controller who it is."""
+        """Request the identity of the controller."""
         facts = self._call("identify")
         return Identity(
             manufacturer=str(facts["manufacturer"]),
@@ -144,7 +144,7 @@ class VirtualController(Driver):
         self._call("mount", tool=tool)
 
     def start(self, schedule: Iterable[Any]) -> None:
-        """Begin anew, cold, at time 0 with a schedule of events.
+        """Start again, cold, at time 0 with a schedule of events.
 
         An event has ``time`` (s), and optionally ``spindle_speed`` (1/min) and ``compensation`` (axis to on or off).
         The first sample of the next stream is taken at time 0.
@@ -171,13 +171,13 @@ class VirtualController(Driver):
     ) -> dict[str, Any]:
         """Step the mounted sphere along a line; returns at once.
 
-        The motion begins some time after the next sample; that time is short but not known. The sphere rests
-        ``dwell`` s at each of ``count`` places and travels ``travel`` s between two.
+        The motion starts some time after the next sample; that time is short but not known. The sphere rests
+        ``dwell`` s at each of ``count`` positions and travels ``travel`` s between two.
 
         Parameters
         ----------
         start : (3,)
-            Commanded centre of the sphere at the first place, m.
+            Commanded centre of the sphere at the first position, m.
         direction : (3,)
             Of the steps.
         step : float
@@ -206,7 +206,7 @@ class VirtualController(Driver):
     def run_program(self, text: str) -> dict[str, Any]:
         """Run an NC program; returns at once.
 
-        The motion begins a short and unknown time after the order. ``state()["running"]`` says when it is over;
+        The motion starts a short and unknown time after the order. ``state()["running"]`` states when it is over;
         simulated time passes by samples or ``elapse`` only.
 
         Parameters
@@ -224,7 +224,7 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            Another program runs; a word is not understood or a place out of travel: nothing moves, and the message
+            Another program runs; a word is not understood or a position out of travel: nothing moves, and the message
             names the line.
         """
         return dict(self._call("run_program", text=str(text)))
@@ -233,7 +233,7 @@ class VirtualController(Driver):
         """Move the axes in a straight line.
 
         Simulated time passes by as much as the move takes; while sensors stream it passes with their samples, and
-        ``state()["running"]`` says when the move is over.
+        ``state()["running"]`` states when the move is over.
 
         Parameters
         ----------
@@ -250,18 +250,18 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            The place is out of travel, or something else moves: nothing moves.
+            The position is out of travel, or something else moves: nothing moves.
         """
         place = [float(x) for x in position]
         return dict(self._call("move_to", position=place, feed=None if feed is None else float(feed)))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
-        """Move the touch probe in a straight line until it trips; there the machine stands, or at the target.
+        """Move the touch probe in a straight line until it trips; the machine then rests there, or at the target.
 
         Parameters
         ----------
         target : (3,)
-            Commanded place of the tip, X, Y, Z, m.
+            Commanded position of the tip, X, Y, Z, m.
         feed : float
             m/s.
 
@@ -298,7 +298,7 @@ class VirtualController(Driver):
         self._call("estop")
 
     def reset(self) -> None:
-        """Leave alarm and emergency stop; nothing begins to move by itself."""
+        """Leave alarm and emergency stop; nothing starts to move by itself."""
         self._call("reset")
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
@@ -320,12 +320,12 @@ class VirtualController(Driver):
         self._call("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Have the laser tracker beside the machine carried to a place in its coordinates, m, to some millimetres.
+        """Have the laser tracker beside the machine carried to a position in its coordinates, m, to some millimetres.
 
         Raises
         ------
         InstrumentError
-            No tracker stands there, or something streams.
+            No tracker is there, or something streams.
         """
         self._call("set_station", position=[float(x) for x in position])
 
@@ -343,5 +343,5 @@ class VirtualController(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

@@ -57,7 +57,7 @@ _UNITS = {"°C": "degC", "C": "degC", "K": "kelvin", "mbar": "mbar", "%RH": "%",
 
 @dataclass(frozen=True)
 class Readings:
-    """What a table says.
+    """The contents of a table.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def read_table(
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]
-        raise DatasetError(f"{path}, line {line}: a second table begins; expected one, without empty lines in it")
+        raise DatasetError(f"{path}, line {line}: a second table starts; expected one, without empty lines in it")
     (table,) = tables
     complaints = Complaints(path)
     columns = _columns(table, complaints)
@@ -125,7 +125,7 @@ def read_table(
 
 
 def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]:
-    """Return place and unit of each column that is known."""
+    """Return position and unit of each column that is known."""
     line, titles = table.head
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
     others |= {other: name for name, them in KEYS.items() for other in them}
@@ -241,7 +241,7 @@ def _placed(
             complaints.add(
                 rows[k][0],
                 f"station '{station}', target '{target}': comes again; line {rows[group[0]][0]} has it already. Remove "
-                "one, or say with 'repeats' which counts",
+                "one, or state with 'repeats' which counts",
             )
         group.append(k)
     found = {name: np.full(shape, np.nan) for name in QUANTITIES}

@@ -134,7 +134,7 @@ class TrackerTable:
         return self._readings
 
     def identify(self) -> Identity:
-        """Tell the table by its hash, its stations and targets, and what is missing."""
+        """Identify the table by its hash, its stations and targets, and what is missing."""
         readings = self.readings
         return Identity(
             manufacturer="table",

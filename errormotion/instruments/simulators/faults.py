@@ -2,7 +2,7 @@
 
 ``fault=`` one of
 
-* ``silence``: it says nothing any more
+* ``silence``: it sends nothing any more
 * ``split``: everything comes in pieces of a few bytes
 * ``garbage``: stray bytes between the right ones
 * ``checksum``: wrong checksums, where the protocol has one
@@ -11,8 +11,8 @@
 * ``disconnect``: the connection breaks; it can be opened again
 
 ``fault_at`` is the sample (of a stream) or answer (of others) from which on; default 0. A silence without ``fault_at``
-begins before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for`` how many
-samples ``out_of_range`` lasts (default: for ever).
+starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for`` how many
+samples ``out_of_range`` lasts (default: without end).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FAULTS = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "di
 
 @dataclass
 class Fault:
-    """One entry of the menu, and where it begins.
+    """One entry of the menu, and where it starts.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Fault:
     every : int
         Period.
     length : int
-        Samples; 0 = for ever.
+        Samples; 0 = without end.
     from_the_start : bool
         Whether ``fault_at`` was left out.
     """
@@ -74,7 +74,7 @@ class Fault:
 
 
 def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -> Fault:
-    """Return the fault that an address asks for.
+    """Return the fault that an address requests.
 
     Raises
     ------

@@ -148,13 +148,13 @@ class FiveSensorFrame:
         if kind is None:
             self.close()
             return
-        with suppress(InstrumentError):  # what happened inside says more
+        with suppress(InstrumentError):  # the first error states the cause
             self.close()
 
     # ------------------------------------------------------------------ asking
 
     def identify(self) -> Identity:
-        """Ask all sensors for their identity."""
+        """Query all sensors for their identity."""
         parts = {name: sensor.identify() for name, sensor in self._open_sensors().items()}
         return Identity(
             manufacturer=", ".join(sorted({part.manufacturer for part in parts.values()})),

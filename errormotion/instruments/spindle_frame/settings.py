@@ -69,7 +69,7 @@ class FrameSettings(SensorSettings):
     frame_temperature: str = Field(default="frame", description="name of the thermometer channel on the frame")
     reference_temperature: Temperature = Field(default=20.0, description="temperature at which the geometry holds")
     powered_since: datetime | None = Field(
-        default=None, description="when the sensors were switched on, for sensors that do not tell; with time zone"
+        default=None, description="when the sensors were switched on, for sensors that do not report it; with time zone"
     )
 
     @field_validator("addresses", "sensors", "origin", "direction")

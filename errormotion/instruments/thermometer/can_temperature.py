@@ -1,4 +1,4 @@
-"""Thermometers with CANopen that follow CiA 404: float values, asked by SDO."""
+"""Thermometers with CANopen that follow CiA 404: float values, read by SDO."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class CanSettings(ThermometerSettings):
     )
     node: int = Field(default=1, description="node number, where the URL names none", ge=1, le=127)
     unit: Literal["as stated", "degC", "K"] = Field(
-        default="as stated", description="unit of the values; 'as stated': what object 0x6131 says"
+        default="as stated", description="unit of the values; 'as stated': what object 0x6131 states"
     )
     start: bool = Field(default=False, description="send the node to OPERATIONAL when it is opened")
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
@@ -96,11 +96,11 @@ class CanTemperature(Thermometer):
 
     @property
     def state(self) -> str:
-        """NMT state that the node's last heartbeat told; empty before the first one."""
+        """NMT state that the node's last heartbeat reported; empty before the first one."""
         return self.node.state
 
     def identify(self) -> Identity:
-        """Ask the node for its profile, its name and its numbers.
+        """Query the node for its profile, its name and its numbers.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class CanTemperature(Thermometer):
         return scale * value + offset, flag_of(status, value)
 
     def _learn(self) -> None:
-        """Ask once for what does not change: the units, and whether inputs tell a status."""
+        """Query once for what does not change: the units, and whether inputs have a status."""
         node, settings = self.node, self.settings
         self._scales: list[tuple[float, float]] = []
         for subindex in settings.subindices:
@@ -173,7 +173,7 @@ class CanTemperature(Thermometer):
             retry=self.settings.retry,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         if self.settings.start:
             self.node.start_node()
         self.identify()

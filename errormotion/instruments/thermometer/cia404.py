@@ -54,7 +54,7 @@ def to_celsius(unit: int) -> tuple[float, float]:
         return 10.0**prefix, -ZERO_CELSIUS
     raise InstrumentError(
         f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}) or K (0x{KELVIN:08X}), with a prefix. "
-        "If it is one of these all the same, say so in the setting 'unit'."
+        "If it is one of these all the same, state so in the setting 'unit'."
     )
 
 

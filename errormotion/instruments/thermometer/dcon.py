@@ -14,12 +14,12 @@ from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, Thermometer, ThermometerSettings
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
 OPEN_SENSOR = 9999.0  # degC: this and more, either sign, is no temperature but an open or overrun input
-UNDER_RANGE = "-0000"  # the ADAM way to say the same
+UNDER_RANGE = "-0000"  # the ADAM way to state the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
 
 
@@ -91,7 +91,7 @@ class DconSettings(ThermometerSettings):
 
 
 class DconTemperature(Thermometer):
-    """A DCON thermocouple module: ``#AA`` asks for all inputs.
+    """A DCON thermocouple module: ``#AA`` requests all inputs.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ class DconTemperature(Thermometer):
     settings: DconSettings
 
     def identify(self) -> Identity:
-        """Ask the module for its name and firmware."""
-        name, firmware = (self._ask(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
+        """Query the module for its name and firmware."""
+        name, firmware = (self._query(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
         return Identity(
             manufacturer="DCON",
             model=name,
@@ -129,7 +129,7 @@ class DconTemperature(Thermometer):
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:
-        values = parse_temperatures(">" + self._ask(f"#{self._unit}", ">"))
+        values = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
         if len(values) < len(self.channels):
             raise ProtocolError(
                 f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(values)}"
@@ -142,21 +142,21 @@ class DconTemperature(Thermometer):
     def _unit(self) -> str:
         return f"{self.settings.unit:02X}"
 
-    def _ask(self, request: str, expected: str) -> str:
+    def _query(self, request: str, expected: str) -> str:
         """Send a request and return the answer behind the start that was expected."""
         with_checksum = self.settings.checksum
         line = self.transport
-        forget_input(line)
+        discard_input(line)
         line.write(encode(request, with_checksum=with_checksum))
         try:
             answer = decode(line.read_until(LINE_END, limit=512), with_checksum=with_checksum)
         except InstrumentTimeoutError:
-            give_up_silent(line)
+            disconnect_after_timeout(line)
             raise
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
         if not answer.startswith(expected):
-            raise ProtocolError(f"'{request}': expected an answer that begins with '{expected}'; found '{answer}'")
+            raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'")
         return answer.removeprefix(expected)
 
     def _connect(self) -> Transport:
@@ -169,5 +169,5 @@ class DconTemperature(Thermometer):
             baudrate=self.settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

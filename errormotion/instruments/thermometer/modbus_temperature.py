@@ -43,11 +43,11 @@ class ModbusTemperature(Thermometer):
 
     @property
     def repeated(self) -> int:
-        """How many damaged answers had to be asked for again since the connection was opened."""
+        """How many damaged answers had to be requested again since the connection was opened."""
         return self.line.repeated
 
     def identify(self) -> Identity:
-        """Ask for the first register, to see that somebody is there; Modbus thermometers have no common name."""
+        """Request the first register as a check that the device answers; Modbus thermometers have no common name."""
         line, settings = self.line, self.settings
         line.registers(settings.function, min(settings.addresses), SIZES[settings.type])
         return Identity(
@@ -86,5 +86,5 @@ class ModbusTemperature(Thermometer):
             baudrate=settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

@@ -34,13 +34,13 @@ MAPS: Mapping[str, Mapping[str, Any]] = {
     "adam-6018": {"function": 3, "first": 0, "type": "u16", "open_codes": (65535,)},
     "logger-16": {"function": 3, "first": 0x20, "type": "i16", "scale": 0.1, "open_from": 10000},
 }
-_MOST = {"adam-6018": 8, "logger-16": 16}
+_MAX_CHANNELS = {"adam-6018": 8, "logger-16": 16}
 
 
 class ModbusSettings(ThermometerSettings):
     """Settings of a thermometer with Modbus.
 
-    A temperature is ``scale * number + offset``. What is not given is as the ``map`` says.
+    A temperature is ``scale * number + offset``. What is not given is as the ``map`` states.
     """
 
     map: Literal["custom", "adam-6018", "logger-16"] = Field(
@@ -58,10 +58,10 @@ class ModbusSettings(ThermometerSettings):
     registers: tuple[int, ...] = Field(
         default=(), description="register of each channel, where they are not evenly spaced"
     )
-    most: int = Field(default=125, description="registers asked for at once", ge=2, le=125)
+    most: int = Field(default=125, description="registers requested at once", ge=2, le=125)
     type: Kind = Field(default="i16", description="u16, i16, u32, i32 or f32")
     word_order: Order = Field(default="big", description="big: the upper 16 bits come first")
-    byte_order: Order = Field(default="big", description="of the two bytes of a register; the standard says big")
+    byte_order: Order = Field(default="big", description="of the two bytes of a register; the standard states big")
     scale: float | tuple[float, ...] = Field(default=1.0, description="degC for one count; one for all or for each")
     offset: float | tuple[float, ...] = Field(default=0.0, description="degC at the count 0; one for all or for each")
     open_codes: tuple[int, ...] = Field(default=(), description="counts that mean an open sensor")
@@ -72,7 +72,7 @@ class ModbusSettings(ThermometerSettings):
     baudrate: int = Field(default=9600, description="of a serial line, where its URL names none", gt=0)
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
     retry: Time = Field(default=1.0, description="least time between two attempts to connect again", ge=0)
-    retries: int = Field(default=1, description="how often a damaged answer is asked for again", ge=0, le=10)
+    retries: int = Field(default=1, description="how often a damaged answer is requested again", ge=0, le=10)
 
     @model_validator(mode="before")
     @classmethod
@@ -92,8 +92,8 @@ class ModbusSettings(ThermometerSettings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         n = len(self.channels)
-        if n > _MOST.get(self.map, n):
-            raise ValueError(f"the {self.map} has {_MOST[self.map]} channels; found {n} names")
+        if n > _MAX_CHANNELS.get(self.map, n):
+            raise ValueError(f"the {self.map} has {_MAX_CHANNELS[self.map]} channels; found {n} names")
         if self.registers and len(self.registers) != n:
             raise ValueError(f"'registers': expected one for each of the {n} channels; found {len(self.registers)}")
         for name in ("scale", "offset", "thermocouples"):
@@ -104,7 +104,7 @@ class ModbusSettings(ThermometerSettings):
         if self.stride is not None and self.stride < size:
             raise ValueError(f"'stride': a {self.type} fills {size} registers; found {self.stride}")
         if max(self.addresses) + size > 1 << 16:
-            raise ValueError(f"registers end at 65535; the last channel would begin at {max(self.addresses)}")
+            raise ValueError(f"registers end at 65535; the last channel would start at {max(self.addresses)}")
         return self
 
     @property

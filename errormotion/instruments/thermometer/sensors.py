@@ -1,4 +1,4 @@
-"""What all thermometers share: named sensors with places on the machine, and a flag where one gives no temperature."""
+"""Base of thermometers: named sensors with positions on the machine, and a flag for each missing temperature."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Thermometer(Driver):
 
     @property
     def places(self) -> dict[str, tuple[float, float, float] | None]:
-        """Where each sensor sits on the machine, m; None where nobody has said so."""
+        """Where each sensor sits on the machine, m; None where unknown."""
         return {name: self.settings.places.get(name) for name in self.channels}
 
     @property
@@ -72,13 +72,13 @@ class Thermometer(Driver):
         return tuple(name for name, flag in self.flags.items() if flag not in (GOOD, NOT_READ))
 
     def open(self) -> None:
-        """Open the connection and greet the device; idempotent."""
+        """Open the connection and check the device; idempotent."""
         if self._transport is None:
             self.flags = dict.fromkeys(self.channels, NOT_READ)
         super().open()
 
     def read(self) -> dict[str, float]:
-        """Return the temperatures now, degC by channel; NaN for a sensor without one, whose flag says why.
+        """Return the temperatures now, degC by channel; NaN for a sensor without one, whose flag states why.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""A touch probe that a controller moves and hears: straight probing moves, G38.2 and its like."""
+"""A touch probe that a controller moves and reads: straight probing moves, G38.2 and its like."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from errormotion.instruments.touch_probe.touching import (
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _SAME = 1e-9  # m
-_ROUNDS_AT_MOST = 1e-6  # m
+_ROUNDING = 1e-6  # m
 
 
 class ControllerProbeSettings(ProbeSettings):
@@ -63,7 +63,7 @@ class ControllerProbe:
     """A touch probe at a controller.
 
     From touch to touch the tip rises by the clearance, goes across and down, on guard all the way: it stops where it
-    touches something. Nothing moves on after an error; the contacts that were made have been handed over by then.
+    touches something. Nothing moves on after an error; the contacts that were made have been passed on by then.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class ControllerProbe:
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="controller_probe",
         kind="touch_probe",
-        summary="Touch probe that a controller moves and hears, with slow repeats and wrong triggers found",
+        summary="Touch probe that a controller moves and reads, with slow repeats and wrong triggers found",
         status="simulated_only",
         simulator="errormotion.instruments.simulators.controller.virtual:SimulatedController",
     )
@@ -114,7 +114,7 @@ class ControllerProbe:
         Raises
         ------
         InstrumentError
-            Nobody there, or a controller that cannot probe.
+            No device answers, or a controller that cannot probe.
         DatasetError
             The pre-travel map cannot be read.
         """
@@ -148,7 +148,7 @@ class ControllerProbe:
         if kind is None:
             self.close()
             return
-        with suppress(InstrumentError):  # what happened inside says more
+        with suppress(InstrumentError):  # the first error states the cause
             self.close()
 
     @property
@@ -178,7 +178,7 @@ class ControllerProbe:
         return self._map
 
     def identify(self) -> Identity:
-        """Tell whose probe it is."""
+        """Return the identity of the controller."""
         whose: Identity = self.control.identify()
         return replace(
             whose,
@@ -221,7 +221,7 @@ class ControllerProbe:
         InstrumentError
             Touches from a side that the pre-travel map does not know, alarm, emergency stop, a lost connection,
             something in the way, a probe that never trips or stays tripped. All motion has been stopped then, where
-            the controller still hears.
+            the controller still receives.
         """
         touches = list(touches)
         refuse_unmapped(self._map, touches)
@@ -239,7 +239,7 @@ class ControllerProbe:
                 if isinstance(error, StuckError):
                     yield self._kept(Contact(NOWHERE, self._time(), TRIPPED))
                 raise type(error)(what) from error
-            except BaseException:  # somebody interrupts: the machine must not be left moving
+            except BaseException:  # an interruption must not leave the machine moving
                 self._stop()
                 raise
             missed = [*missed, touch.item] if contact.flag == NO_TRIP else []
@@ -262,13 +262,13 @@ class ControllerProbe:
         return corrected(self._map, touch, contact)
 
     def _way(self, touches: Sequence[Touch], number: int) -> list[Any]:
-        """Return the places on the way to the start of a touch: up, across, down.
+        """Return the positions on the way to the start of a touch: up, across, down.
 
         Within an item the tip rises above the starts of its touches, else above those of all.
         """
         here = np.array(self.control.state()["position"], dtype=float)
         start = np.array(touches[number].start, dtype=float)
-        if np.abs(here - start).max() <= _ROUNDS_AT_MOST:
+        if np.abs(here - start).max() <= _ROUNDING:
             return []
         before = touches[number - 1] if number else None
         within = before is not None and before.item == touches[number].item

@@ -15,7 +15,7 @@ from errormotion.plugins import Contact, Touch
 Array = NDArray[np.float64]
 
 NO_TRIP, TRIPPED, DIFFERS, NOT_MADE = "no trip", "tripped at the start", "repeat differs", "not made"
-_TRIPPED_BEFORE = "tripped before it moves"  # what controllers say
+_TRIPPED_BEFORE = "tripped before it moves"  # what controllers state
 NOWHERE = (float("nan"),) * 3
 
 
@@ -100,14 +100,14 @@ class Toucher:
         StuckError
             The probe is tripped before it moves.
         InstrumentError
-            It touched something on the way: the machine stands there.
+            It touched something on the way: the machine is at rest there.
         """
         found = self._probe(place, self._how.approach_feed)
         if found is not None:
             x, y, z = 1e3 * np.asarray(found["position"], dtype=float)
             raise InstrumentError(
                 f"the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} mm, where its way should have been "
-                "free; the machine stands there. See what is in the way, or raise the clearance"
+                "free; the machine is at rest there. See what is in the way, or raise the clearance"
             )
 
     def touch(self, touch: Touch) -> Contact:
@@ -118,7 +118,7 @@ class Toucher:
         StuckError
             The probe is tripped at the start, and stays so.
         InstrumentError
-            The controller refuses, or says that it tripped off the way.
+            The controller refuses, or states that it tripped off the way.
         """
         start, target = np.array(touch.start, dtype=float), np.array(touch.target, dtype=float)
         way = target - start
@@ -177,14 +177,14 @@ class Toucher:
         return Contact((x, y, z), time)
 
     def _along(self, found: dict[str, Any], start: Array, direction: Array, length: float) -> float:
-        """Return how far along the way the probe tripped, m; refuse a place that is not on the way."""
+        """Return how far along the way the probe tripped, m; refuse a position that is not on the way."""
         offset = np.asarray(found["position"], dtype=float) - start
         along = float(offset @ direction)
         aside = float(np.linalg.norm(offset - along * direction))
         if not (aside <= self._how.margin and -self._how.margin <= along <= length + self._how.margin):
             raise InstrumentError(
-                f"expected the probe to trip on its way of {1e3 * length:.3f} mm; the controller says "
-                f"{1e3 * along:.3f} mm along it and {1e3 * aside:.3f} mm aside. Does it tell places of the machine?"
+                f"expected the probe to trip on its way of {1e3 * length:.3f} mm; the controller states "
+                f"{1e3 * along:.3f} mm along it and {1e3 * aside:.3f} mm aside. Does it use machine coordinates?"
             )
         return along
 

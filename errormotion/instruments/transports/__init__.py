@@ -44,14 +44,14 @@ def open_transport(
     recorder : Recorder or path, optional
         Where every frame of the session is written.
     timeout : float
-        Time limit of a silent read, s.
+        Time limit of a read without data, s.
     baudrate : int, optional
         Of a serial line; the address wins where it names one.
 
     Raises
     ------
     InstrumentError
-        Unknown scheme, nobody at the address, no simulator for this instrument.
+        Unknown scheme, no device at the address, no simulator for this instrument.
     """
     from errormotion.instruments.transports.recording import Recorder, RecordingTransport, ReplayTransport
 

@@ -1,4 +1,4 @@
-"""What a transport is: bytes out, bytes in, a time limit on silence."""
+"""What a transport is: bytes out, bytes in, a time limit."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Transport(ABC):
     url : str
         The address.
     timeout : float
-        Time limit of a silent read, s.
-    holds_back : bool
-        Whether a device waits (or loses data itself, visibly) while nobody reads here. On a serial line nothing holds
-        the bytes back: they are lost without a trace.
+        Time limit of a read without data, s.
+    flow_control : bool
+        Whether a device waits (or loses data itself, visibly) while nothing is read here. A serial line holds
+        nothing back: bytes are lost without a trace.
     simulated : bool
         Whether a simulator is at the other end.
     """
 
-    holds_back = True
+    flow_control = True
     simulated = False
 
     def __init__(self, url: str, timeout: float) -> None:
@@ -86,7 +86,7 @@ class Transport(ABC):
         Raises
         ------
         InstrumentTimeoutError
-            Fewer within the time limit; the message says how many came.
+            Fewer within the time limit; the message states how many came.
         """
         allowed = self.timeout if timeout is None else timeout
         end, data = time.monotonic() + allowed, b""
@@ -99,8 +99,8 @@ class Transport(ABC):
                 ) from None
         return data
 
-    def handed_over(self, samples: int) -> None:  # noqa: B027 - most transports do not care
-        """Told how many samples of the running stream the caller has had by now.
+    def report_delivered(self, samples: int) -> None:  # noqa: B027 - most transports do not care
+        """Take note of the number of samples of the running stream that the caller has received.
 
         A real device does not care. A virtual clock does: it counts the time that its reader has seen.
         """

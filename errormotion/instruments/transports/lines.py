@@ -24,7 +24,7 @@ from errormotion.instruments.transports.recording import (
 from errormotion.instruments.transports.simulated import SimulatedTransport
 from errormotion.instruments.transports.tcp import TcpTransport
 
-FIRST = "command"
+COMMAND = "command"
 """Name of the first line in recordings."""
 
 
@@ -35,7 +35,7 @@ class ManyLines(Transport):
         self._lines = dict(lines)
         self._first = next(iter(self._lines.values()))
         super().__init__(self._first.url, self._first.timeout)
-        self.holds_back = self._first.holds_back
+        self.flow_control = self._first.flow_control
         self.simulated = self._first.simulated
 
     def line(self, name: str) -> Transport:
@@ -73,7 +73,7 @@ def open_lines(
     Parameters
     ----------
     url : str
-        ``tcp://host:port``, where a parameter ``name=port`` says where a further line is; ``sim://``; ``replay://``.
+        ``tcp://host:port``, where a parameter ``name=port`` states where a further line is; ``sim://``; ``replay://``.
     further : mapping of str to int
         Further lines by name, with the port where the address names none.
     simulator, timeout
@@ -84,7 +84,7 @@ def open_lines(
     Raises
     ------
     InstrumentError
-        Another scheme, nobody at one of the ports, a recording that is there already.
+        Another scheme, no device at one of the ports, a recording that is there already.
     """
     address = parse_address(url)
     lines: dict[str, Transport] = {}
@@ -107,17 +107,17 @@ def _opened(
 ) -> Iterator[tuple[str, Transport]]:
     match address.scheme:
         case "tcp":
-            yield FIRST, TcpTransport(address, timeout=timeout)
+            yield COMMAND, TcpTransport(address, timeout=timeout)
             for name, port in further.items():
                 yield name, TcpTransport(address.line(name, port), timeout=timeout)
         case "sim":
             first = SimulatedTransport(address, load_simulator(simulator, address.url), timeout=timeout)
-            yield FIRST, first
+            yield COMMAND, first
             for name in further:
                 yield name, first.further(name)
         case "replay":
             recordings = read_index(Path(address.path))
-            for name in (FIRST, *further):
+            for name in (COMMAND, *further):
                 if name not in recordings:
                     raise ReplayError(f"The recording {address.path} has no line '{name}'; is it of another device?")
                 yield name, ReplayTransport(recordings[name], timeout=timeout)

@@ -72,7 +72,7 @@ class RecordingTransport(Transport):
         super().__init__(inner.url, inner.timeout)
         self._inner = inner
         self._recorder = recorder
-        self.holds_back = inner.holds_back
+        self.flow_control = inner.flow_control
         self.simulated = inner.simulated
 
     def _send(self, data: bytes) -> None:
@@ -84,9 +84,9 @@ class RecordingTransport(Transport):
         self._recorder.frame("R", data)
         return data
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Pass on how far the reader is."""
-        self._inner.handed_over(samples)
+        self._inner.report_delivered(samples)
 
     def close(self) -> None:
         """Close the connection, then the recording; idempotent."""
@@ -112,7 +112,7 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
     if len(head) != 3 or head[0] != FORMAT:
         raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
     if len(lines) < 2 or not lines[-1].startswith("END "):
-        raise ReplayError(f"The recording {path} is cut off: its last line should begin with 'END'; record it again")
+        raise ReplayError(f"The recording {path} is cut off: its last line should start with 'END'; record it again")
     frames: list[tuple[str, bytes]] = []
     crc = 0
     for number, line in enumerate(lines[1:-1], start=2):

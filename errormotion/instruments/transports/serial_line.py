@@ -1,4 +1,4 @@
-"""A serial line, 8N1 where the address says nothing else."""
+"""A serial line, 8N1 where the address states nothing else."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ DEFAULT_BAUDRATE = 9600
 
 
 class SerialTransport(Transport):
-    """A serial line: 8 data bits, no parity, one stop bit; or as ``parity=E``, ``parity=O``, ``stopbits=2`` say."""
+    """A serial line: 8 data bits, no parity, one stop bit; or as ``parity=E``, ``parity=O``, ``stopbits=2`` state."""
 
-    holds_back = False
+    flow_control = False
 
     def __init__(self, address: Address, *, timeout: float = 1.0, baudrate: int | None = None) -> None:
         super().__init__(address.url, timeout)
@@ -52,7 +52,7 @@ class SerialTransport(Transport):
         except (OSError, TypeError) as error:  # TypeError: pyserial's, when the port is closed meanwhile
             raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
         if not data:
-            raise InstrumentTimeoutError(f"{self.url} is silent for {timeout:g} s")
+            raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s")
         return data
 
     def close(self) -> None:

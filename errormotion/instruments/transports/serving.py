@@ -16,7 +16,7 @@ SEND_BUFFER = 32768
 
 
 class Server(ABC):
-    """One device's end of a wire, with a thread that hands over what comes in.
+    """One device's end of a wire, with a thread that passes received bytes on.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Server(ABC):
         self._thread = threading.Thread(target=self._run, name=f"sim-{name}", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start listening."""
         self._thread.start()
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class Server(ABC):
         if self._ended.is_set():
             return
         self._ended.set()
-        self.hang_up()
+        self.disconnect()
         self._wake_write.send(b".")
         if self._thread is not threading.current_thread() and self._thread.ident is not None:
             self._thread.join()
@@ -54,10 +54,10 @@ class Server(ABC):
 
     @abstractmethod
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
 
     @abstractmethod
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
 
     @abstractmethod
@@ -79,14 +79,14 @@ class TcpServer(Server):
         self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def await_connection(self, timeout: float) -> bool:
-        """Wait until somebody is connected; False when nobody is within ``timeout`` s.
+        """Wait for a connection; False where there is none within ``timeout`` s.
 
-        Who has just connected may not be let in yet: on a line where he says nothing himself, only this tells.
+        A new connection may not be accepted yet; on a line that only sends, nothing else shows it.
         """
         return self._connected.wait(timeout)
 
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
         with self.lock:
             line = self._line
             if line is None:
@@ -97,7 +97,7 @@ class TcpServer(Server):
                 return False
             return True
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
         line = self._line  # no lock: a sender may hold it, waiting for a reader who is gone
         if line is not None:
@@ -128,7 +128,7 @@ class TcpServer(Server):
 
     def _forget(self) -> None:
         line = self._line
-        self.hang_up()
+        self.disconnect()
         with self.lock:
             self._line = None
             self._connected.clear()
@@ -154,7 +154,7 @@ class PtyServer(Server):
         self.url = f"serial://{os.ttyname(self._far)}"
 
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes, waiting while the reader's buffers are full; False when nobody is there."""
+        """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
         view = memoryview(data)
         with self.lock:
             while len(view) and not (self._ended.is_set() or self._cut):
@@ -167,8 +167,8 @@ class PtyServer(Server):
                         return False
         return not self._cut and not self._ended.is_set()
 
-    def hang_up(self) -> None:
-        """Pull the cable: a serial line has no connection to drop, it just goes silent for good."""
+    def disconnect(self) -> None:
+        """Pull the cable: a serial line has no connection to drop, it just stops sending."""
         self._cut = True
 
     def _run(self) -> None:

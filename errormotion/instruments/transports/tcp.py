@@ -27,7 +27,7 @@ class TcpTransport(Transport):
             line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except TimeoutError:
             line.close()
-            raise InstrumentTimeoutError(f"Nobody answers at {self.url} within {timeout:g} s") from None
+            raise InstrumentTimeoutError(f"No device answers at {self.url} within {timeout:g} s") from None
         except OSError as error:
             line.close()
             raise InstrumentError(
@@ -56,7 +56,7 @@ class TcpTransport(Transport):
             line.settimeout(timeout)
             data = line.recv(max_bytes)
         except (TimeoutError, BlockingIOError):
-            raise InstrumentTimeoutError(f"{self.url} is silent for {timeout:g} s") from None
+            raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s") from None
         except OSError as error:
             raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
         if not data:

@@ -14,6 +14,8 @@ from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from errormotion.kinematics.description import MachineDescription
+
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
 
 
@@ -54,6 +56,29 @@ class CrossbeamScan:
         if settings.procedure == "profiler_pose":
             return pocket.record_pocket(bench, settings, done)
         return acquisition.record_scans(bench, settings, inputs.get("pose"), done)
+
+    def machine_defaults(self, machine: MachineDescription) -> dict[str, Any]:
+        """Return the travel of Y."""
+        return {"travel": machine.travel["Y"]} if "Y" in machine.travel else {}
+
+    def check_machine(self, settings: ScanSettings, machine: MachineDescription) -> dict[str, str]:
+        """Return what contradicts the machine: Y does not carry the tool, or passes outside of its travel."""
+        if "Y" not in machine.tool_axes:
+            return {"": f"expected a machine whose axis Y carries the tool; found the chain '{machine.chain}'"}
+        found = {}
+        low, high = machine.travel["Y"]
+        if settings.travel and (settings.travel[0] < low - 1e-9 or settings.travel[1] > high + 1e-9):
+            found["travel"] = (
+                f"expected ends within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
+                f"found {settings.travel[0] * 1e3:g} mm to {settings.travel[1] * 1e3:g} mm"
+            )
+        positions = settings.positions if settings.procedure == "scan" else (settings.pocket_position,)
+        if outside := [y for y in positions if not low <= y <= high]:
+            found["positions"] = (
+                f"expected positions within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
+                f"found {outside[0] * 1e3:g} mm"
+            )
+        return found
 
     def append_dim(self, settings: ScanSettings) -> str:
         """Return ``scan`` for the profiler's pose, ``line`` for scans."""

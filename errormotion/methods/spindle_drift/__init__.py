@@ -1,9 +1,9 @@
 """Spindle drift by five distance sensors (ISO 230-3): beam detection, drift, ISO 230-3 values.
 
-``method`` is the plugin. Beneath it, from the wire up: ``acquisition`` measures; ``segmentation`` cuts a stepped scan;
-``beams`` finds where a beam starts and goes, ``detection`` makes it a dataset; ``averaging`` brings a record down to
-means, ``bar`` fits the bar, ``uncertainty`` carries what is unknown through, ``drift`` puts them together, and
-``iso230_3`` states what a certificate states. Source: Geiselhart et al. (euspen 2024).
+``method`` is the plugin. ``acquisition`` measures. In ``identification``, ``segmentation`` divides a stepped scan into
+its rests, ``beams`` fits origin and direction of a beam, and ``detection`` returns them as a dataset; ``averaging``
+averages a record, ``bar`` fits the bar, ``uncertainty`` propagates the uncertainties, ``drift`` combines these parts,
+and ``iso230_3`` evaluates the values of ISO 230-3. Source: Geiselhart et al. (euspen 2024).
 """
 
 from errormotion.methods.spindle_drift.method import SpindleDrift

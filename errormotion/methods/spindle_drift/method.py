@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from errormotion.kinematics.description import MachineDescription
+
 
 class SpindleDrift:
-    """How a spindle moves and tilts while it warms up, from five distance sensors on a bar."""
+    """Thermal displacement and tilt of a spindle, from five distance sensors on a bar."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="spindle_drift",
@@ -25,8 +27,8 @@ class SpindleDrift:
         version="1",
         cannot_see=(
             "the rotation about the spindle axis (EC)",
-            "errors within one turn of the spindle: they are averaged away",
-            "what moves the sensors' frame and is not in its temperature",
+            "errors within one turn of the spindle, which are averaged out",
+            "motion of the sensor frame that is not related to its temperature",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)
@@ -46,9 +48,9 @@ class SpindleDrift:
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``scanning``.
+        """Measure; yield raw datasets to be joined along ``append_dim``.
 
-        For a drift ``inputs`` may hold the ``beams`` of a detection, or single ones by the name of their channel.
+        For a drift, ``inputs`` may hold the ``beams`` of a detection, or single beams under their channels' names.
         """
         from errormotion.methods.spindle_drift.acquisition import beams as scanning
         from errormotion.methods.spindle_drift.acquisition import drift as acquisition
@@ -57,6 +59,15 @@ class SpindleDrift:
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, given_beams(inputs), done)
+
+    def check_machine(self, settings: DriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
+        """Return what contradicts the machine: a spindle along another axis than Z of the measuring frame."""
+        if machine.spindle_axis == "Z":
+            return {}
+        return {
+            "": "expected a spindle axis Z, the direction of the channel Z of the measuring frame; the machine's is "
+            f"{machine.spindle_axis}"
+        }
 
     def append_dim(self, settings: DriftSettings) -> str:
         """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""
@@ -71,7 +82,7 @@ class SpindleDrift:
         return settings.duration
 
     def follow(self, settings: DriftSettings) -> Callable[[xr.Dataset], str]:
-        """Return what tells, chunk by chunk while measuring, how far things are."""
+        """Return a function that describes each acquired chunk in a line of text."""
         if settings.procedure == "beam_detection":
             return _beam_text
         from errormotion.methods.spindle_drift.acquisition.live import LiveDrift
@@ -84,15 +95,15 @@ class SpindleDrift:
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.spindle_drift/1``, either variant; stays as it is and may be larger than memory.
+            Schema ``errormotion.raw.spindle_drift/1``, either variant; not modified; it may be larger than memory.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations at once.
+            The raw dataset violates its schema; all violations are reported together.
         MethodError
-            The data do not determine the answer.
+            The data do not determine the result.
         """
         from errormotion.datasets import validate
 
@@ -110,7 +121,7 @@ class SpindleDrift:
         return identify_drift(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
         from errormotion.methods.spindle_drift.planning import plan
 
         return plan(settings or DriftSettings(), self.info.id, self.info.version)

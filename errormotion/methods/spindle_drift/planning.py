@@ -1,4 +1,4 @@
-"""What to expect before anything is measured."""
+"""Expected uncertainty of a planned measurement."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
 _PLANNED = "planned, not measured"
-_TWIST = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])
+_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])
 
 
 def plan(settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return an error dataset of zeros with the covariance to expect, of the procedure that the settings name."""
+    """Return an error dataset of zeros with the expected covariance, for the procedure of the settings."""
     part = _plan_beams if settings.procedure == "beam_detection" else _plan_drift
     return part(settings, method, version)
 
@@ -63,16 +63,16 @@ def _plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
 def _plan_drift(settings: Settings, method: str, version: str) -> xr.Dataset:
     """Plan a drift: the reference state and one later instant.
 
-    A bar of the stated radius stands in a frame as drawn in ISO 230-3, its readings mid-range; the beams come from a
-    detection with the stated steps. The later instant has drifted by a typical amount (5 um sideways, 20 um in Z,
-    0.1 mrad), since what the beams' uncertainty does grows with the drift.
+    A bar of the stated radius is in a frame as drawn in ISO 230-3, its readings at mid-range; the beams are those of a
+    detection with the stated steps. The later instant has a typical drift (5 um in X and Y, 20 um in Z, 0.1 mrad),
+    because the effect of the uncertainty of the beams grows with the drift.
     """
     p = settings.layout
     origin, direction, covariance = _frame(settings)
-    ex, ey, ez, ea, eb = _TWIST
+    ex, ey, ez, ea, eb = _DRIFT
     zs = np.array(p.levels)
     still = np.full(5, p.standoff)
-    # Distances to first order: the bar comes nearer by its displacement along the beam's way back.
+    # Distances to first order: a displacement of the bar towards the sensor reduces the reading.
     moved = still + np.array([*-(ex + eb * zs), *-(ey - ea * zs), ez])
     samples = max(1.0, settings.average * p.rate)
     xyz = list("xyz")

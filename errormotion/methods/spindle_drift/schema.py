@@ -54,7 +54,7 @@ RAW_SCHEMAS = (
                 missing=True,
             ),
             Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "increasing; or the attribute `sample_rate` (Hz)"),
-            Row("beam_origin", ("channel", "direction"), "m", *POSITION, "place where the reading is zero"),
+            Row("beam_origin", ("channel", "direction"), "m", *POSITION, "position at which the reading is zero"),
             Row("beam_direction", ("channel", "direction"), "1", *UNIT_VECTOR, "unit vector from sensor to bar"),
             Row(
                 "beam_covariance",
@@ -78,7 +78,7 @@ RAW_SCHEMAS = (
                 "m/K",
                 -1e-4,
                 1e-4,
-                "how each beam's origin moves as the measuring frame warms",
+                "displacement of the origin of each beam with the temperature of the measuring frame",
                 required=False,
             ),
             Row("nominal_origin", ("channel", "direction"), "m", *POSITION, "from the drawing", required=False),

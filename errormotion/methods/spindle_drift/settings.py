@@ -1,4 +1,4 @@
-"""Settings of the method: what a campaign file or ``--set`` may say."""
+"""Settings of the method, for a campaign file or ``--set``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from errormotion.plugins import PluginSettings
 
 
 class Event(PluginSettings):
-    """Something that happens at a stated time of a drift test: a spindle speed, or a compensation on or off."""
+    """An event of a drift test: a change of the spindle speed, or a compensation switched on or off."""
 
     at: Time = Field(description="time since the start of the test")
     spindle_speed: Speed | None = Field(default=None, ge=0, description="spindle speed from here on, 1/min")
@@ -20,14 +20,14 @@ class Event(PluginSettings):
     )
 
     @model_validator(mode="after")
-    def _says_something(self) -> Event:
+    def _is_not_empty(self) -> Event:
         if self.spindle_speed is None and self.compensation is None:
             raise ValueError("an event needs a spindle_speed or a compensation")
         return self
 
 
 class Layout(PluginSettings):
-    """The set-up that a plan assumes."""
+    """Set-up of a plan."""
 
     bar_radius: Length = Field(default=5e-3, gt=0, description="radius of the bar")
     standoff: Length = Field(default=1e-3, gt=0, description="reading of each sensor at the start")
@@ -45,7 +45,7 @@ class Settings(PluginSettings):
     """Settings of ``spindle_drift``."""
 
     procedure: Literal["drift", "beam_detection"] = Field(
-        default="drift", description="what to acquire; identification sees from the data which of the two they are"
+        default="drift", description="what to acquire; identification takes the procedure from the data"
     )
 
     # Drift: acquisition
@@ -54,7 +54,7 @@ class Settings(PluginSettings):
 
     # Drift: identification
     average: Time = Field(
-        default=0.5, gt=0, description="length of one mean; whole turns of the spindle cancel its run-out"
+        default=0.5, gt=0, description="averaging time of one mean; whole turns of the spindle cancel its run-out"
     )
     min_valid: float = Field(
         default=0.5, ge=0, le=1, description="share of valid samples below which a mean is unknown"
@@ -62,19 +62,20 @@ class Settings(PluginSettings):
     reference_time: Time | None = Field(
         default=None,
         ge=0,
-        description="beginning of the reference state, from the record's start; default the first mean, after spin_up "
-        "where the record begins with the start of the spindle",
+        description="start of the reference state, since the start of the record; default the first mean, or the first "
+        "mean after spin_up where the record starts together with the spindle",
     )
-    spin_up: Time = Field(default=1.0, ge=0, description="time that the spindle takes to come to another speed")
+    spin_up: Time = Field(default=1.0, ge=0, description="time in which the spindle reaches another speed")
     reference_average: Time | None = Field(
         default=None, gt=0, description="length of the reference state; default one mean"
     )
     functional_point: tuple[Length, Length, Length] | None = Field(
-        default=None, description="where the errors are stated; default the bar's end on its axis, to 0.1 mm"
+        default=None,
+        description="functional point of the errors; default the end of the bar on its axis, rounded to 0.1 mm",
     )
     beams: Literal["raw", "nominal"] = Field(
         default="raw",
-        description="the beams of the raw dataset, or the nominal ones, to see what their detection is worth",
+        description="beams of the raw dataset (raw), or nominal beams, which shows the effect of the detection",
     )
     nominal_origin_uncertainty: Length = Field(
         default=1e-4, ge=0, description="standard uncertainty of a nominal origin"
@@ -83,34 +84,34 @@ class Settings(PluginSettings):
         default=5e-3, ge=0, description="standard uncertainty of a nominal direction"
     )
     noise: Literal["auto", "stated"] = Field(
-        default="auto", description="the stated noise of the readings, raised where the record shows more (auto)"
+        default="auto",
+        description="noise of the readings: as stated, or the larger of the stated and the observed noise (auto)",
     )
     bar_radius_uncertainty: Length = Field(default=0.0, ge=0, description="standard uncertainty of the bar's radius")
     compensate_frame: bool = Field(
-        default=True, description="correct the beams for the frame's expansion, where it is known"
+        default=True, description="correct the readings for the expansion of the measuring frame, where it is known"
     )
     frame_temperature: str = Field(default="frame", description="name of the temperature sensor on the measuring frame")
     frame_smoothing: Time = Field(
         default=180.0,
         ge=0,
-        description="length of the moving fit to the frame's temperature, against its noise",
+        description="length of the moving fit that smooths the temperature of the frame",
     )
     frame_expansion_uncertainty: float = Field(
-        default=0.1, ge=0, description="relative standard uncertainty of the frame's expansion"
+        default=0.1, ge=0, description="relative standard uncertainty of the expansion of the frame"
     )
     unseen_rotation: Angle = Field(
         default=2e-5,
         ge=0,
-        description="standard deviation of the rotation about the spindle axis, which no sensor sees",
+        description="standard deviation of the rotation about the spindle axis, which is not measured",
     )
     running_end: Time | None = Field(
-        default=None, gt=0, description="end of running; default where the speed goes to zero"
+        default=None, gt=0, description="end of running; default the time at which the spindle stops"
     )
-    iso_average: Time = Field(
-        default=30.0, gt=0, description="length of the means over which ranges and end values are taken"
-    )
+    iso_average: Time = Field(default=30.0, gt=0, description="averaging time for ranges and end values")
     iso_temperature: str | None = Field(
-        default=None, description="temperature sensor for the change per kelvin; default the one that changes most"
+        default=None,
+        description="temperature sensor for the change per kelvin; default the sensor with the largest change",
     )
 
     # Beam detection
@@ -119,9 +120,9 @@ class Settings(PluginSettings):
         default=(0.2e-3, 1.0e-3, 1.8e-3), min_length=1, description="readings at which to scan"
     )
     scan_length: Length = Field(default=2e-3, gt=0, description="length of one scan")
-    steps: int = Field(default=101, ge=5, description="rests of one scan, both ends included")
+    steps: int = Field(default=101, ge=5, description="number of rests of one scan, both ends included")
     dwell: Time = Field(default=1.0, gt=0, description="rest at each step")
-    step_average: Time = Field(default=0.3, gt=0, description="length of the mean, from the middle of each rest")
+    step_average: Time = Field(default=0.3, gt=0, description="averaging time of a rest, from its middle on")
 
     # Planning
-    layout: Layout = Field(default_factory=Layout, description="the set-up that a plan assumes")
+    layout: Layout = Field(default_factory=Layout, description="set-up of a plan")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.multilateration.identification.drift import estimate_drift, places
+from errormotion.methods.multilateration.identification.drift import estimate_drift, positions
 
 NOISE = 0.5e-6
 TARGETS, RETURNS = 30, 12
@@ -24,12 +24,12 @@ def a_record(seed, rate, repeatability=0.0, stations=2):
     noise = np.full(distance.shape, NOISE)
     moved = repeatability * rng.normal(size=(stations, len(nominal), 3))
     d = distance + true + np.einsum("jta,jta->jt", e, moved) + NOISE * rng.normal(size=distance.shape)
-    return d, time, places(nominal), e, noise, true
+    return d, time, positions(nominal), e, noise, true
 
 
 def test_targets_of_one_place_share_a_number():
     nominal = np.array([(0.1, 0.2, 0.3), (0.0, 0.0, 0.0), (0.1, 0.2, 0.3)])
-    number = places(nominal)
+    number = positions(nominal)
     assert number[0] == number[2] != number[1]
 
 

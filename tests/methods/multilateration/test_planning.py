@@ -8,10 +8,8 @@ from errormotion.errors import MethodError
 from errormotion.methods.multilateration import Multilateration
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.box import Box
 from errormotion.methods.multilateration.planning.plan import boxes_of, plan, reading_noise
-from errormotion.methods.multilateration.planning.sight import Planning
-from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.settings import Box, Planning, Settings
 
 CLOSE = ((-0.3, -0.1, 0.0), (-0.3, 0.0, 0.1), (-0.3, 0.1, 0.0), (0.0, 0.05, 0.6))
 LAYOUT = {

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from errormotion.methods.multilateration.network.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
 
 STATION = np.array(
@@ -37,7 +38,7 @@ def test_one_wrong_distance_is_named(n, by, rough):
     network = solve(d, u, STATION[:n] if rough else None, noise=1e-6)
     assert network.left_out == ((1, 7),)
     assert network.undecided == ()
-    assert any("station 2 of target 8" in note for note in network.notes)
+    assert any("station 2 of target 8" in note for note in notes_of(network))
     # As if that reading had never been.
     d[1, 7] = np.nan
     without = solve(d, u, noise=1e-6)
@@ -68,7 +69,7 @@ def test_a_target_is_given_up_where_nothing_tells_which_reading_is_wrong():
     network = solve(d, u, noise=30e-9)
     assert network.undecided == (9,)
     assert np.isnan(network.target[9]).all()
-    assert any("nothing tells which: 10" in note for note in network.notes)
+    assert any("it is not determined which: 10" in note for note in notes_of(network))
 
 
 def test_many_wrong_distances_of_all_sizes_are_named():

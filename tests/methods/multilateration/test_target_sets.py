@@ -13,11 +13,11 @@ from errormotion.methods.multilateration.network.model import motions
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
-from errormotion.methods.multilateration.planning.choosing import Choosing, positions, refuse_count
+from errormotion.methods.multilateration.planning.choosing import positions, refuse_count
 from errormotion.methods.multilateration.planning.plan import plan
-from errormotion.methods.multilateration.planning.sight import Planning, Sight
+from errormotion.methods.multilateration.planning.sight import Sight
 from errormotion.methods.multilateration.planning.target_sets import Expected, Volume
-from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
 
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
 STATIONS = np.array([(-0.75, -0.6, -0.1), (0.8, -0.55, 0.0), (0.7, 0.65, -0.05), (-0.6, 0.5, 0.8)])

@@ -6,7 +6,7 @@ import pytest
 from errormotion import datasets
 from errormotion.errors import DatasetError
 from errormotion.methods.multilateration import Multilateration, Settings, simulation
-from errormotion.methods.multilateration.identification import assembly, uncertainty
+from errormotion.methods.multilateration.identification import result, uncertainty
 from errormotion.methods.multilateration.identification.uncertainty import Scatter, responses
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.twin import VirtualMachine
@@ -23,7 +23,7 @@ def test_blocks_make_no_difference(raw, monkeypatch):
     settings = Settings(scale_uncertainty="1 um/m", expansion={"coefficient": 11.5e-6, "temperature": 23.0})
     whole = Multilateration().identify(raw, settings)
     monkeypatch.setattr(uncertainty, "BLOCK", 7)
-    monkeypatch.setattr(assembly, "BLOCK", 11)
+    monkeypatch.setattr(result, "BLOCK", 11)
     pieces = Multilateration().identify(raw, settings)
     datasets.validate(pieces)
     assert set(pieces.variables) == set(whole.variables)
@@ -39,11 +39,11 @@ def test_blocks_make_no_difference(raw, monkeypatch):
 
 
 def test_violations_are_found_in_any_block(monkeypatch):
-    monkeypatch.setattr(assembly, "BLOCK", 10)
+    monkeypatch.setattr(result, "BLOCK", 10)
     covariance = np.tile(np.eye(6), (25, 1, 1)) * 1e-12
     covariance[22, 1, 1] = -1e-12
     with pytest.raises(DatasetError, match="variances of 0 or more"):
-        assembly.build(
+        result.build(
             np.zeros((25, 6)), covariance, np.zeros((1, 25, 6)), {}, {}, component="tool", machine="m",
             frame="machine", functional_point=[0, 0, 0], reference="r", method="multilateration", method_version="1",
             provenance={}, sources=["a"], source_groups=["a"],

@@ -9,7 +9,7 @@ import xarray as xr
 
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift import Event, Settings, SpindleDrift
-from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SAMPLES, PATIENCE
+from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_SAMPLES, MAX_FAILED_POLLS
 from errormotion.plugins import Samples
 from errormotion.twin import VirtualMachine
 
@@ -98,13 +98,13 @@ def test_a_thermometer_that_falls_silent_for_a_while_costs_its_own_values_only()
     assert np.isnan(warmth[2000:6000]).all()
     assert np.isfinite(np.delete(warmth, slice(2000, 6000))).all()
     assert np.isfinite(raw["distance"]).all()
-    assert sum(chunk.attrs["invalid"].get("thermometer silent", 0) for chunk in chunks) == 2
+    assert sum(chunk.attrs["invalid"].get("thermometer without answer", 0) for chunk in chunks) == 2
 
 
 def test_a_thermometer_that_is_gone_for_good_ends_the_record():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=range(3, 1000)))
     with pytest.raises(InstrumentError, match="no answer"):
-        record(bench, Settings(duration=2.0 * (PATIENCE + 10)))
+        record(bench, Settings(duration=2.0 * (MAX_FAILED_POLLS + 10)))
 
 
 def interrupted(ago):
@@ -118,7 +118,7 @@ def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
     settings = Settings(duration=900.0)
     chunks, raw = record(bench, settings, interrupted(600.0))
     assert bench.asked == []
-    assert max(chunk.sizes["time"] for chunk in chunks) <= HAND_OVER_SAMPLES + 500
+    assert max(chunk.sizes["time"] for chunk in chunks) <= CHUNK_SAMPLES + 500
     assert raw.sizes["time"] == 900_000 - 1000
     assert chunks[0].attrs["time_start"] == 1.0
     gap = np.isnan(raw["distance"].values[0])
@@ -126,10 +126,10 @@ def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
     np.testing.assert_array_equal(np.isnan(raw["temperature"].sel(sensor="frame").values), gap)
 
 
-def test_a_record_that_does_not_say_when_it_began_is_not_gone_on_with():
+def test_a_record_without_its_start_is_not_continued():
     done = interrupted(10.0)
     del done.attrs["start"]
-    with pytest.raises(MethodError, match="does not say when it began"):
+    with pytest.raises(MethodError, match="cannot be continued"):
         record(Bench(spindle_frame=Frame()), Settings(duration=900.0), done)
 
 

@@ -110,7 +110,7 @@ def test_a_scan_that_went_wrong_is_unknown_and_said(machine, method, recorded):
     spoilt["record"][scan == 8] = 1e-3
     beams = method.identify(spoilt, SETTINGS)
     assert np.isnan(beams["residual"].values[1, 2]).all()
-    assert any(note.startswith("X2, profile 2: No move out and back") for note in beams.attrs["notes"])
+    assert any(note.startswith("X2, profile 2: The record shows no large moves") for note in beams.attrs["notes"])
     assert np.abs(misses(machine, beams)).max() < 4.0
 
 

@@ -6,7 +6,7 @@ import xarray as xr
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
-from errormotion.methods.spindle_drift.acquisition.given_beams import NEEDED, given_beams
+from errormotion.methods.spindle_drift.acquisition.given_beams import REQUIRED, given_beams
 from errormotion.twin import VirtualMachine
 
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
@@ -27,7 +27,7 @@ def test_beams_found_one_by_one_are_those_found_together(detected):
     single = given_beams({name: alone(detected, name) for name in CHANNELS})
     xr.testing.assert_identical(together, single)
     assert list(together["beam"].values) == list(CHANNELS)
-    for name in NEEDED:
+    for name in REQUIRED:
         np.testing.assert_array_equal(together[name].values, detected[name].values)
 
 
@@ -46,13 +46,13 @@ def test_what_is_no_beam_of_the_frame_is_refused(detected):
     one = alone(detected, "X1")
     with pytest.raises(MethodError, match="found X3"):
         given_beams({"X3": one})
-    with pytest.raises(MethodError, match="no beam for X2; given are X1"):
+    with pytest.raises(MethodError, match="no beam for X2; found X1"):
         given_beams({"X1": one})
     with pytest.raises(MethodError, match="expected one beam in 'X1'; found 5"):
         given_beams({"beams": detected, "X1": detected})
-    with pytest.raises(MethodError, match="it has no beam_covariance"):
+    with pytest.raises(MethodError, match="missing: beam_covariance"):
         given_beams({"beams": detected, "X1": one.drop_vars("beam_covariance")})
-    with pytest.raises(MethodError, match="zero point of beam X1 is not known"):
+    with pytest.raises(MethodError, match="zero point of beam X1 is unknown"):
         given_beams({"beams": detected, "X1": one.assign(beam_origin=one["beam_origin"] * np.nan)})
     with pytest.raises(MethodError, match="several frames"):
         given_beams({"beams": detected, "X1": one.assign_attrs(frame="table")})

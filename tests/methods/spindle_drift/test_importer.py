@@ -143,10 +143,9 @@ def test_every_mistake_is_told_with_its_line(complaints) -> None:
         "line 8: expected 7 fields; found 6",
         "line 9: time, field 1: expected a number; found an empty cell",
         "line 10: channels.X2, field 3: expected a number; found 'inf'",
-        "line 10: temperatures.frame: 293 makes a temperature of 293 degC; expected -60..200 degC. "
+        "line 10: temperatures.frame: 293 is a temperature of 293 degC; expected -60..200 degC. "
         "Is the unit 'degC' right? (1 such values)",
-        "line 11: channels.Z: 1000 makes a distance of 1 m; expected -0.1..0.1 m. Is the unit 'mm' right? "
-        "(1 such values)",
+        "line 11: channels.Z: 1000 is a distance of 1 m; expected -0.1..0.1 m. Is the unit 'mm' right? (1 such values)",
     ]
 
 

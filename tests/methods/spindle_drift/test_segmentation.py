@@ -58,7 +58,7 @@ def test_a_step_that_the_sensor_did_not_see_is_unknown():
 
 def test_a_record_without_a_scan_is_refused():
     noise = 1e-3 + np.random.default_rng(0).normal(0, 0.3e-6, int(130 * RATE))
-    with pytest.raises(MethodError, match="No move out and back"):
+    with pytest.raises(MethodError, match="no large moves out and back"):
         segment_steps(noise, RATE, STEPS, 1.0)
 
 
@@ -70,7 +70,7 @@ def test_a_cut_off_record_is_refused():
 
 def test_another_number_of_steps_is_noticed():
     distance, *_ = record(4)
-    with pytest.raises(MethodError, match="number of steps or the rest"):
+    with pytest.raises(MethodError, match="number of steps and the dwell"):
         segment_steps(distance, RATE, 51, 1.0)
 
 

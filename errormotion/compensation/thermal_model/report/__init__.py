@@ -1,4 +1,4 @@
-"""Report chapters: a prediction of a thermal model, and a model compared with a measured campaign."""
+"""Report chapters: prediction of a thermal model, and comparison of a model with a measured campaign."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def write_model_report(
     out : Path
         The file; an older one is replaced in one step.
     predicted : Dataset
-        What the model predicts of that campaign.
+        Prediction of the model for this campaign.
     figures : mapping
-        What the comparison found: ``rms``, ``remaining``, ``removed`` and ``held``, six numbers each.
+        Results of the comparison: ``rms``, ``remaining``, ``removed`` and ``held``, six numbers each.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A thermal model laid against a campaign that it has not seen: what it removes, what is left, what it is made of."""
+"""Chapter of the comparison of a thermal model with a campaign that was not used for its fit."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
 from errormotion.report.text import DASH, fixed, integer, listed, significant
 
-INTERVAL = 1.96
-"""Of a normal distribution: 95 %."""
+COVERAGE_FACTOR = 1.96
+"""For 95 % of a normal distribution."""
 
 _FIGURES = ("rms", "remaining", "removed", "held")
-_UNSEEN = "not seen, by the model or by this campaign"
+_UNKNOWN = "unknown in the model or in this campaign"
 _UNITS = {("temperature", 1): "K", ("spindle_speed", 1): "1000/min", ("spindle_speed", 2): "(1000/min)²"}
 
 
@@ -45,24 +45,24 @@ def part(source: Source, key: str, model: xr.Dataset, measured: xr.Dataset, figu
     Parameters
     ----------
     source : Source
-        Of the prediction.
+        Source of the prediction.
     key : str
-        Keeps its figures' identifiers apart.
+        Makes the identifiers of its figures unique.
     model : Dataset
         Schema ``errormotion.model.thermal/1``.
     measured : Dataset
-        The campaign's errors, at the instants of the prediction.
+        Measured errors, at the instants of the prediction.
     figures : mapping
-        ``rms``, ``remaining``, ``removed`` and ``held``, six each, and ``outside``: what the check found.
+        ``rms``, ``remaining``, ``removed`` and ``held``, six each: results of the check.
     """
     predicted = source.errors
     found = sensors.of_dataset(predicted, source)
     numbers = {name: np.asarray(figures[name], float) for name in _FIGURES}
     panels = thermal_model.inputs(predicted)
-    out = thermal_model.beyond(predicted)
+    out = thermal_model.is_outside(predicted)
     given = _inputs(predicted, panels, out, f"{key}-inputs")
     return Part(
-        "Thermal model against measurement",
+        "Thermal model compared with measurement",
         _key_figures(numbers),
         _summary(numbers, model, out),
         [
@@ -102,20 +102,20 @@ def _key_figures(numbers: Mapping[str, np.ndarray]) -> list[KeyFigure]:
 def _summary(numbers: Mapping[str, np.ndarray], model: xr.Dataset, out: np.ndarray) -> list[str]:
     seen = _seen(numbers)
     if not seen:
-        return ["Nothing was both predicted and measured: there is nothing to compare."]
+        return ["No error was both predicted and measured."]
     removed, held = numbers["removed"], numbers["held"]
     least, fewest = (min(seen, key=lambda i: float(v[i])) for v in (removed, held))
     words = [
-        f"The model takes away at least {_share(removed[least])} % of an error's RMS (least of {FREEDOMS[least]}).",
-        f"Its 95 % intervals hold at least {_share(held[fewest])} % of the instants (least of {FREEDOMS[fewest]}).",
-        f"It was made of {integer(float(model.attrs.get('campaigns', math.nan)))} campaigns, variant "
+        f"The model removes at least {_share(removed[least])} % of the RMS of an error (lowest: {FREEDOMS[least]}).",
+        f"Its 95 % intervals cover at least {_share(held[fewest])} % of the instants (lowest: {FREEDOMS[fewest]}).",
+        f"It was fitted to {integer(float(model.attrs.get('campaigns', math.nan)))} campaigns, variant "
         f"'{model.attrs.get('variant', DASH)}', from {listed(_sources(model)) or 'no sensor'}.",
     ]
     if out.any():
-        words.append(f"{integer(int(out.sum()))} of {integer(out.size)} instants lie beyond what it was trained on.")
+        words.append(f"{integer(int(out.sum()))} of {integer(out.size)} instants lie outside the training range.")
     unseen = [name for i, name in enumerate(FREEDOMS) if i not in seen]
     if unseen:
-        words.append(f"Not compared, because unknown: {listed(unseen)}.")
+        words.append(f"Not compared because unknown: {listed(unseen)}.")
     return words
 
 
@@ -126,7 +126,7 @@ def _sources(model: xr.Dataset) -> list[str]:
 
 
 def _series(predicted: xr.Dataset, measured: xr.Dataset, i: int) -> tuple[np.ndarray, ...]:
-    """Return predicted, its deviation, measured, its deviation, in the field unit."""
+    """Return predicted, its standard uncertainty, measured and its standard uncertainty, in the unit of the page."""
     size, name = unit_at(i)[1], FREEDOMS[i]
     pairs = [(np.asarray(ds[name].values, float), timeline.sigma(ds, i)) for ds in (predicted, measured)]
     return tuple(values / size for pair in pairs for values in pair)
@@ -138,7 +138,7 @@ def _six(predicted: xr.Dataset, paint: Any, key: str) -> Any:
     def draw(figure: Canvas) -> None:
         panels = figure.subplots(3, 2, sharex=True)
         figure.subplots_adjust(left=0.075, right=0.985, top=0.95, bottom=0.09, wspace=0.19, hspace=0.3)
-        out = thermal_model.beyond(predicted)
+        out = thermal_model.is_outside(predicted)
         for i, name in enumerate(FREEDOMS):
             axes: Axes = panels[i % 3, i // 3]
             axes.set_title(f"{name} / {unit_at(i)[0]}")
@@ -157,10 +157,10 @@ def _curves(predicted: xr.Dataset, measured: xr.Dataset, key: str) -> Block:
         p, u, m, v = _series(predicted, measured, i)
         if not (np.isfinite(p).any() and np.isfinite(m).any()):
             return False
-        canvas.curve(axes, time, p, INTERVAL * u, colour=canvas.BLUE)
+        canvas.curve(axes, time, p, COVERAGE_FACTOR * u, colour=canvas.BLUE)
         if m.size <= 4 * timeline.DOTTED:
             axes.errorbar(
-                time, m, INTERVAL * np.nan_to_num(v), fmt="o", markersize=2.4, color=canvas.BLACK, elinewidth=0.6
+                time, m, COVERAGE_FACTOR * np.nan_to_num(v), fmt="o", markersize=2.4, color=canvas.BLACK, elinewidth=0.6
             )
         else:
             canvas.curve(axes, time, m, None, colour=canvas.BLACK, width=0.7)
@@ -168,8 +168,8 @@ def _curves(predicted: xr.Dataset, measured: xr.Dataset, key: str) -> Block:
         return True
 
     caption = (
-        "Predicted (blue, with its band) and measured (black, with bars), since the reference state. Band and "
-        f"bars: 95 % intervals.{_ground(predicted)}"
+        "Predicted (blue, with band) and measured (black, with bars) errors since the reference state. Band and bars: "
+        f"95 % intervals.{_background(predicted)}"
     )
     words = []
     for i, name in enumerate(FREEDOMS):
@@ -181,29 +181,29 @@ def _curves(predicted: xr.Dataset, measured: xr.Dataset, key: str) -> Block:
     return Figure(_six(predicted, paint, key), caption, f"Predicted and measured over time: {'; '.join(words)}.")
 
 
-def _ground(predicted: xr.Dataset) -> str:
-    any_out = thermal_model.beyond(predicted).any()
-    return " Coloured ground: beyond what the model was trained on." if any_out else ""
+def _background(predicted: xr.Dataset) -> str:
+    any_out = thermal_model.is_outside(predicted).any()
+    return " Coloured background: outside the training range." if any_out else ""
 
 
 def _residuals(predicted: xr.Dataset, measured: xr.Dataset, numbers: Mapping[str, np.ndarray], key: str) -> Block:
     def paint(axes: Axes, time: np.ndarray, i: int) -> bool:
         p, u, m, v = _series(predicted, measured, i)
-        rest = m - p
-        if not np.isfinite(rest).any():
+        remaining = m - p
+        if not np.isfinite(remaining).any():
             return False
-        reach = INTERVAL * np.hypot(u, v)
-        canvas.curve(axes, time, np.zeros_like(rest), reach, colour=canvas.SKY, width=0.0)
-        axes.plot(time, rest, "-", color=canvas.BLACK, linewidth=0.6)
-        inside = np.abs(rest) <= reach
+        reach = COVERAGE_FACTOR * np.hypot(u, v)
+        canvas.curve(axes, time, np.zeros_like(remaining), reach, colour=canvas.SKY, width=0.0)
+        axes.plot(time, remaining, "-", color=canvas.BLACK, linewidth=0.6)
+        inside = np.abs(remaining) <= reach
         for where, colour in ((inside, canvas.BLACK), (~inside, timeline.UNKNOWN)):
-            axes.plot(time[where], rest[where], "o", color=colour, markersize=2.6, markeredgewidth=0)
+            axes.plot(time[where], remaining[where], "o", color=colour, markersize=2.6, markeredgewidth=0)
         axes.axhline(0, color="#888888", linewidth=0.6)
         return True
 
     caption = (
-        "Measured minus predicted: what would be left if the prediction were taken off. Band: 95 % interval of the "
-        f"difference; red: outside it.{_ground(predicted)}"
+        "Measured minus predicted: the errors that remain after compensation by the prediction. Band: 95 % interval of "
+        f"the difference; red: outside.{_background(predicted)}"
     )
     words = "; ".join(
         f"{FREEDOMS[i]} {fixed(numbers['remaining'][i] / unit_at(i)[1], 2)} {unit_at(i)[0]}" for i in _seen(numbers)
@@ -219,25 +219,25 @@ def _table(numbers: Mapping[str, np.ndarray], model: xr.Dataset) -> Table:
         unit, size = unit_at(i)
         spans = [fixed(numbers[what][i] / size, 2) for what in ("rms", "remaining")]
         shares = [_share(numbers[what][i]) for what in ("removed", "held")]
-        said = [_share(own[i]), fixed(INTERVAL * misfit[i] / size, 2)]
-        rows.append([name, unit, *(or_dash(text, _UNSEEN) for text in (*spans, *shares, *said))])
+        stated = [_share(own[i]), fixed(COVERAGE_FACTOR * misfit[i] / size, 2)]
+        rows.append([name, unit, *(or_dash(text, _UNKNOWN) for text in (*spans, *shares, *stated))])
     validated = str(model.attrs.get("validated", "campaigns left out"))
     return Table(
-        "Root mean square of what was measured, and of what the prediction leaves of it; share that is "
-        "removed; share of the instants at which the 95 % interval of the difference holds zero. Beside it "
-        f"what the model said of itself, by {validated}.",
-        ["error", "unit", "measured", "left", "removed / %", "held / %", "removed / %", "half interval"],
+        "Root mean square of the measured errors and of measured minus predicted; removed fraction; fraction of the "
+        "instants at which the 95 % interval of the difference contains zero. For comparison the values stated by the "
+        f"model, from {validated}.",
+        ["error", "unit", "measured", "remaining", "removed / %", "covered / %", "removed / %", "half interval"],
         rows,
-        [("", 2), ("root mean square", 2), ("this campaign", 2), ("the model's own", 2)],
+        [("", 2), ("root mean square", 2), ("this campaign", 2), ("stated by the model", 2)],
     )
 
 
 def _inputs(predicted: xr.Dataset, panels: Sequence[timeline.Panel], out: np.ndarray, key: str) -> list[Block]:
     if not panels:
-        return [Text("No input is known.", "warning")]
+        return [Text("All inputs are unknown.", "warning")]
     words = ". ".join(panel.in_words() for panel in panels)
     drawn = timeline.draw(np.asarray(predicted["time"].values, float), panels, key, (), out)
-    caption = f"What the prediction was made from.{_ground(predicted)}"
+    caption = f"Inputs of the prediction.{_background(predicted)}"
     return [Figure(drawn, caption, f"Over time: {words}.")]
 
 
@@ -245,13 +245,13 @@ def _model(model: xr.Dataset, found: Mapping[str, Any]) -> list[Block]:
     blocks: list[Block] = [
         Text(
             f"Variant '{model.attrs.get('variant', DASH)}', from {listed(_sources(model)) or 'no sensor'}. "
-            "Temperatures count in K since the start; there is no constant."
+            "Temperatures are changes since the start in K; there is no constant."
         ),
         *_coefficients(model),
     ]
     tried = _tried(found)
     if tried is None:
-        return [*blocks, Text("The model does not say what else was tried.", "note")]
+        return [*blocks, Text("The model does not state the other candidates.", "note")]
     return [*blocks, tried]
 
 
@@ -267,7 +267,7 @@ def _unit(model: xr.Dataset, k: int) -> str:
 
 def _coefficients(model: xr.Dataset) -> list[Block]:
     if not model.sizes.get("feature", 0):
-        return [Text("The model has no input: it predicts nothing.", "warning")]
+        return [Text("The model has no inputs.", "warning")]
     return [_coefficients_of(model, range(3), "displacements"), _coefficients_of(model, range(3, 6), "rotations")]
 
 
@@ -281,19 +281,19 @@ def _coefficients_of(model: xr.Dataset, freedoms: range, what: str) -> Table:
         for i in freedoms:
             size = unit_at(i)[1]
             sigma = math.sqrt(variance[i, k]) if variance[i, k] >= 0 else math.nan
-            cells.append(estimate(coefficient[i, k] / size, 2 * sigma / size, reason=_UNSEEN))
+            cells.append(estimate(coefficient[i, k] / size, 2 * sigma / size, reason=_UNKNOWN))
         low, high = (significant(float(model[side].values[k]), 3) for side in ("feature_low", "feature_high"))
         rows.append([str(name), _unit(model, k), f"{low} to {high}", *cells])
     return Table(
         f"Coefficients of the {what}: error per unit of each input. After ±: expanded uncertainty, k = 2; the "
-        "coefficients of one error are not independent. Range: what the input covered in training.",
+        "coefficients of one error are correlated. Range: of the input in training.",
         ["input", "unit", "range", *(f"{FREEDOMS[i]} / {unit_at(i)[0]}" for i in freedoms)],
         rows,
     )
 
 
 def _tried(found: Mapping[str, Any]) -> Table | None:
-    """Return the candidates and their scores, from the model's provenance."""
+    """Return the candidates and their scores from the provenance of the model."""
     steps = found.get("steps")
     for step in steps if isinstance(steps, (list, tuple)) else []:
         tried = step.get("tried") if isinstance(step, Mapping) else None
@@ -305,11 +305,11 @@ def _tried(found: Mapping[str, Any]) -> Table | None:
             names = listed([str(name) for name in each.get("sensors", [])]) or "none"
             score = float(each.get("score", math.nan))
             rows.append(
-                [str(each.get("variant", DASH)), minutes, names, significant(score, 3), "" if place else "chosen"]
+                [str(each.get("variant", DASH)), minutes, names, significant(score, 3), "" if place else "selected"]
             )
         return Table(
-            "What was tried, the best of each variant and set of constants. Score: mean square error at campaigns left "
-            "out whole, as a share of that of the errors themselves, summed over the freedoms; the lowest was chosen.",
+            "Candidates: the best of each variant and set of constants. Score: mean square residual at campaigns that "
+            "were left out, relative to the mean square error, summed over the errors; the lowest was selected.",
             ["variant", "lags or time constants / min", "sensors", "score", ""],
             rows,
             numeric=False,

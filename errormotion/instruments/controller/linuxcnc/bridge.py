@@ -1,14 +1,14 @@
 #!/usr/bin/python3
-"""Stands between LinuxCNC and programs beyond its reach: JSON lines on a port of this computer.
+"""Connects LinuxCNC with other programs: JSON lines on a port of this computer.
 
 LinuxCNC's own Python module works only in the Python of the system, beside LinuxCNC. So this file runs there, as the
 ``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs nothing but that Python. A request is
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
-``{"id": 1, "ok": false, "error": "..."}``. While an order lasts, ``{"id": 1, "beat": 7, "time": 3.2}`` says five times
-a second that it does. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge began;
-what is unknown is null. Places are those of the machine (G53), without any offset of work or tool.
+``{"id": 1, "ok": false, "error": "..."}``. While an order lasts, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
+times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
+what is unknown is null. Positions are those of the machine (G53), without any offset of work or tool.
 
-Several clients may be there. One order at a time moves the machine. What a client has begun ends with its connection:
+Several clients may be there. One order at a time moves the machine. What a client has started ends with its connection:
 if that breaks, or the client dies, the bridge has LinuxCNC abort. Nothing that comes in can end the bridge.
 """
 
@@ -30,19 +30,19 @@ from pathlib import Path
 from typing import Any
 
 PORT = 5007
-POLL = 0.01  # s between two looks at an order
-BEAT = 0.2  # s
-SETTLE = 5.0  # s that LinuxCNC may take to accept an order
-START = 30.0  # s
-AT_REST = 0.5  # s that a machine without orders may seem to move
-CHANGE = 1.0  # s that a change of state or mode may take
-TEXTS = 0.3  # s that the text of an error may lag behind the error
-REACHED = 1e-6  # m: an order that ends closer than this has reached its goal
-LONGEST = 1 << 24  # bytes of a request
-UNREAD = 1 << 20  # bytes of answers
+POLL_INTERVAL = 0.01  # s between two looks at an order
+BEAT_INTERVAL = 0.2  # s
+ACCEPT_TIMEOUT = 5.0  # s that LinuxCNC may take to accept an order
+START_TIMEOUT = 30.0  # s
+REST_TIMEOUT = 0.5  # s that a machine without orders may seem to move
+CHANGE_TIMEOUT = 1.0  # s that a change of state or mode may take
+TEXT_TIMEOUT = 0.3  # s that the text of an error may lag behind the error
+POSITION_TOLERANCE = 1e-6  # m: an order that ends closer than this has reached its goal
+MAX_REQUEST_BYTES = 1 << 24  # bytes of a request
+MAX_UNREAD_BYTES = 1 << 20  # bytes of answers
 AXES = "XYZ"
-OTHERS = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
-OURS = "G21 G90 G94"  # mm, absolute, mm/min
+MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
+ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
 
 
 class RefusedError(Exception):
@@ -62,7 +62,7 @@ class Client:
         if self.gone or self.writer.is_closing():
             return
         self.writer.write(json.dumps(message).encode() + b"\n")
-        if self.writer.transport.get_write_buffer_size() > UNREAD:
+        if self.writer.transport.get_write_buffer_size() > MAX_UNREAD_BYTES:
             self.writer.transport.abort()
 
 
@@ -83,9 +83,9 @@ class Bridge:
     linuxcnc, hal : module
         LinuxCNC's two Python modules.
     programs : Path
-        Folder for the programs that clients hand over.
+        Folder for the programs that clients pass on.
     pins : tuple of str
-        What the names of HAL pins begin with that clients may set.
+        Prefix of the HAL pins that clients may set.
     load : str
         HAL pin with the load of the spindle, as a fraction of the rated one; empty where there is none.
     """
@@ -110,9 +110,9 @@ class Bridge:
 
     async def await_linuxcnc(self) -> None:
         """Wait until LinuxCNC has started, for a while: until then its state means nothing."""
-        until = time.monotonic() + START
+        until = time.monotonic() + START_TIMEOUT
         while not self.stat.linear_units > 0 and time.monotonic() < until:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
             self.stat.poll()
 
     # ------------------------------------------------------------------ requests
@@ -125,7 +125,7 @@ class Bridge:
             while line := await reader.readline():
                 await self._take(client, line)
         except ValueError:
-            client.send(self._failure(None, f"a request of more than {LONGEST} bytes"))
+            client.send(self._failure(None, f"a request of more than {MAX_REQUEST_BYTES} bytes"))
         except OSError:
             pass
         finally:
@@ -140,7 +140,7 @@ class Bridge:
             request = json.loads(line)
             number, op = request.pop("id"), request.pop("op")
             work = self._work.get(op)
-        except Exception as error:  # noqa: BLE001 - whatever comes in is no reason to die
+        except Exception as error:  # noqa: BLE001 - a request must not end the bridge
             client.send(self._failure(number, f"this is no request: {error!r}"))
             return
         if work is None:
@@ -186,7 +186,7 @@ class Bridge:
         while True:
             count += 1
             client.send({"id": number, "beat": count, "time": self.time, "running": bool(self.job or self.program)})
-            await asyncio.sleep(BEAT)
+            await asyncio.sleep(BEAT_INTERVAL)
 
     async def _answer(self, number: Any, work: Callable[[], Any]) -> dict[str, Any]:
         try:
@@ -199,11 +199,11 @@ class Bridge:
     def _failure(self, number: Any, text: str) -> dict[str, Any]:
         return {"id": number, "ok": False, "error": text, "time": self.time}
 
-    # ------------------------------------------------------------------ what LinuxCNC says
+    # ------------------------------------------------------------------ state of LinuxCNC
 
     @property
     def time(self) -> float:
-        """Seconds since the bridge began."""
+        """Seconds since the bridge started."""
         return time.monotonic() - self._began
 
     def _look(self) -> None:
@@ -227,7 +227,7 @@ class Bridge:
         return [self._unit * float(x) for x in places[:3]]
 
     async def identify(self) -> dict[str, Any]:
-        """Tell the version of LinuxCNC, the machine's name and its INI file."""
+        """Identify the version of LinuxCNC, the machine's name and its INI file."""
         self._look()
         ini = str(self.stat.ini_filename)
         machine = self.cnc.ini(ini).find("EMC", "MACHINE") if ini else None
@@ -244,7 +244,7 @@ class Bridge:
         return {name: [self._unit * x for x in pair] for name, pair in zip(AXES, limits)}  # noqa: B905
 
     async def state(self) -> dict[str, Any]:
-        """Tell what the machine does."""
+        """Return the state of the machine."""
         self._look()
         s = self.stat
         modes = {self.cnc.MODE_MANUAL: "manual", self.cnc.MODE_MDI: "mdi", self.cnc.MODE_AUTO: "automatic"}
@@ -352,13 +352,13 @@ class Bridge:
         return {"duration": self.time - began}
 
     async def probe(self, target: Any, feed: Any) -> dict[str, Any]:
-        """Move in a straight line until the probe trips; tell where it did, if it did."""
+        """Move in a straight line until the probe trips, and return its position."""
         await self._demand()
         goal, words = self._goal(target), _speed(feed, "G38.3")
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
-        if math.dist(goal, self._metres(self.stat.position)) < REACHED:
-            raise RefusedError("the probe stands at the target already")
+        if math.dist(goal, self._metres(self.stat.position)) < POSITION_TOLERANCE:
+            raise RefusedError("the probe is at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
         await self._mdi(f"{words} {_axis_words(self._in_work_frame(goal))}")
@@ -376,7 +376,7 @@ class Bridge:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
 
     async def run_program(self, text: Any) -> dict[str, Any]:
-        """Run an NC program; return when it has begun."""
+        """Run an NC program; return when it has started."""
         await self._demand()
         if not isinstance(text, str) or not text.strip():
             raise RefusedError("expected the text of a program")
@@ -398,13 +398,13 @@ class Bridge:
         began = self.time
         try:
             while not await self._ended(program):
-                await asyncio.sleep(POLL)
+                await asyncio.sleep(POLL_INTERVAL)
             if self.alarms or self.stat.state == self.cnc.RCS_ERROR:
                 raise RefusedError(f"{program.what} ended early{await self._texts()}")
             self.outcome = {"duration": self.time - began}
         except RefusedError as error:
             self.outcome = error
-        except Exception as error:  # noqa: BLE001 - told to whoever asks how it ended
+        except Exception as error:  # noqa: BLE001 - reported when the result is requested
             self.outcome = RefusedError(f"{type(error).__name__}: {error}")
         finally:
             await self._rest()
@@ -413,9 +413,9 @@ class Bridge:
                 file.unlink()
 
     async def finish(self, client: Client) -> dict[str, Any]:
-        """Wait for the end of the program; tell how long it took."""
+        """Wait for the end of the program, and return its duration."""
         while self.program is not None and not client.gone:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
         if isinstance(self.outcome, RefusedError):
             raise self.outcome
         return self.outcome
@@ -440,7 +440,7 @@ class Bridge:
     async def _demand(self, *, homed: bool = True) -> None:
         """Refuse unless the machine is ready for an order."""
         self._look()
-        await self._rest(AT_REST)
+        await self._rest(REST_TIMEOUT)
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it, and enable it again")
         if self.stat.task_state != self.cnc.STATE_ON:
@@ -452,7 +452,7 @@ class Bridge:
 
     def _goal(self, position: Any) -> list[float]:
         if not isinstance(position, list) or len(position) != 3:
-            raise RefusedError(f"expected a place X, Y, Z in m; found {position!r}")
+            raise RefusedError(f"expected a position X, Y, Z in m; found {position!r}")
         goal = [_number(x, "a coordinate in m") for x in position]
         for (axis, (low, high)), x in zip(self._travel().items(), goal):  # noqa: B905
             if not low <= x <= high:
@@ -460,7 +460,7 @@ class Bridge:
         return goal
 
     def _in_work_frame(self, place: list[float]) -> list[float]:
-        """Return a place of the machine in the coordinates in force: G54, G92 and the tool's offset."""
+        """Return a position of the machine in the coordinates in force: G54, G92 and the tool's offset."""
         s = self.stat
         work, extra, tool = (self._metres(offset) for offset in (s.g5x_offset, s.g92_offset, s.tool_offset))
         x, y, z = (p - w - t for p, w, t in zip(place, work, tool))  # noqa: B905
@@ -478,9 +478,9 @@ class Bridge:
     async def _mdi(self, line: str) -> None:
         """Have one line carried out to its end in mm and mm/min, and the modes be as before."""
         await self._mode(self.cnc.MODE_MDI)
-        before = [word for code, word in OTHERS.items() if code in self.stat.gcodes]
+        before = [word for code, word in MODAL_CODES.items() if code in self.stat.gcodes]
         if before:  # on a line of its own: a feed beside it would be read in the units before
-            await self._line(OURS)
+            await self._line(ORDER_MODES)
         await self._line(line)
         if before and self.stat.state != self.cnc.RCS_ERROR:
             await self._line(" ".join(before))
@@ -489,10 +489,10 @@ class Bridge:
         await self._ended(self.job)  # it may have been broken off already
         self.command.mdi(line)
         while not await self._ended(self.job):
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
 
     async def _ended(self, job: Job | None) -> bool:
-        """Whether LinuxCNC has done what it was told last; RefusedError where it was kept from it."""
+        """Whether LinuxCNC has done the last order; RefusedError where it was kept from it."""
         self._look()
         if job is not None and job.ended_by:
             raise RefusedError(f"{job.what} was broken off: {job.ended_by}")
@@ -503,12 +503,12 @@ class Bridge:
         return taken and self._idle()
 
     async def _go_on(self) -> None:
-        await asyncio.sleep(POLL)
+        await asyncio.sleep(POLL_INTERVAL)
         await self._ended(self.job)
 
     async def _settle(self, what: str, *, running: bool = False) -> None:
         """Wait until LinuxCNC has taken an order, and carried it out unless it is one that runs on."""
-        until = time.monotonic() + SETTLE
+        until = time.monotonic() + ACCEPT_TIMEOUT
         while True:
             self._look()
             done = running or self.stat.state != self.cnc.RCS_EXEC
@@ -516,8 +516,8 @@ class Bridge:
                 return
             if time.monotonic() > until:
                 self.command.abort()  # what is not taken now must not be carried out later
-                raise RefusedError(f"LinuxCNC does not respond: {what} took more than {SETTLE:g} s")
-            await asyncio.sleep(POLL / 2)
+                raise RefusedError(f"LinuxCNC does not respond: {what} took more than {ACCEPT_TIMEOUT:g} s")
+            await asyncio.sleep(POLL_INTERVAL / 2)
 
     def _calm(self) -> None:
         """After an order that failed, whatever the reason, nothing moves on."""
@@ -528,34 +528,34 @@ class Bridge:
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
             self.command.abort()
 
-    async def _rest(self, limit: float = SETTLE) -> None:
+    async def _rest(self, limit: float = ACCEPT_TIMEOUT) -> None:
         """Wait until nothing moves, as it soon does."""
         until = time.monotonic() + limit
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
             while not self._idle() and time.monotonic() < until:
-                await asyncio.sleep(POLL)
+                await asyncio.sleep(POLL_INTERVAL)
                 self._look()
 
     async def _becomes(self, condition: Callable[[], bool]) -> bool:
         """Wait until something is so, for a while; whether it is."""
-        until = time.monotonic() + CHANGE
+        until = time.monotonic() + CHANGE_TIMEOUT
         while True:
             self._look()
             if condition() or time.monotonic() > until:
                 return condition()
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
 
     async def _require_arrival(self, goal: list[float]) -> None:
         place = self._metres(self.stat.position)
-        if math.dist(goal, place) > REACHED:
+        if math.dist(goal, place) > POSITION_TOLERANCE:
             found = ", ".join(f"{1e3 * x:.4f}" for x in place)
             raise RefusedError(f"the machine has stopped at {found} mm before its goal{await self._texts()}")
 
     async def _texts(self) -> str:
-        """Return what LinuxCNC says of an error, to be appended."""
-        until = time.monotonic() + TEXTS
+        """Return what LinuxCNC states of an error, to be appended."""
+        until = time.monotonic() + TEXT_TIMEOUT
         while not self.alarms and time.monotonic() < until:
-            await asyncio.sleep(POLL)
+            await asyncio.sleep(POLL_INTERVAL)
             self._look()
         return f": {'; '.join(self.alarms)}" if self.alarms else ""
 
@@ -589,13 +589,13 @@ def _axis_words(place: list[float]) -> str:
 
 
 async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> None:
-    """Serve until somebody ends this process, or nobody has been there for a while."""
+    """Serve until this process is ended, or no client has been connected for a while."""
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, ended.set)
     await bridge.await_linuxcnc()
-    server = await asyncio.start_server(bridge.serve, "127.0.0.1", port, limit=LONGEST)
+    server = await asyncio.start_server(bridge.serve, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
     port = server.sockets[0].getsockname()[1]
     print(f"errormotion's bridge listens on 127.0.0.1:{port}", flush=True)
     if announce is not None:
@@ -616,9 +616,9 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
     parser.add_argument("-ini", metavar="FILE", help="LinuxCNC gives it to its display; the running one's is taken")
     parser.add_argument("--port", type=int, default=PORT, help="of 127.0.0.1; 0: any that is free")
-    parser.add_argument("--announce", type=Path, help="file that tells the port and the process")
+    parser.add_argument("--announce", type=Path, help="file that states the port and the process")
     parser.add_argument("--idle", type=float, default=math.inf, help="end after so many seconds without a client")
-    parser.add_argument("--pins", default="", help="what the names of HAL pins begin with that clients may set")
+    parser.add_argument("--pins", default="", help="prefix of the HAL pins that clients may set")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
     options = parser.parse_args(words)
     import hal

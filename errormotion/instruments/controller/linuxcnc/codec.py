@@ -41,7 +41,7 @@ def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
 
 
 def decode(line: bytes) -> Answer | Beat:
-    """Return what a line says.
+    """Parse a line.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def decode_touch(result: Any) -> dict[str, Any]:
         tripped = _switch(result, "tripped")
         position = _place(result["position"]) if tripped else None
         if position is not None and not all(math.isfinite(x) for x in position):
-            raise ValueError("a touch at an unknown place")
+            raise ValueError("a touch at an unknown position")
         return {"tripped": tripped, "position": position, "time": _known(result, "time")}
     except (ValueError, KeyError, TypeError) as error:
         raise ProtocolError(f"Expected the result of a touch; found {str(result)[:200]} ({error!r})") from None
@@ -121,7 +121,7 @@ def _known(values: Mapping[str, Any], name: str) -> float:
 
 def _place(value: Any) -> list[float]:
     if not isinstance(value, list) or len(value) != 3:
-        raise TypeError(f"{value!r} is no place")
+        raise TypeError(f"{value!r} is no position")
     return [_number(x) for x in value]
 
 

@@ -19,10 +19,10 @@ from errormotion.plugins import Identity, InstrumentInfo, lazy
 class LinuxCNC(Driver):
     """A machine under LinuxCNC.
 
-    Places are those of the machine's own coordinates (G53) in m, whatever offsets of work and tool are in force.
+    Positions are those of the machine's own coordinates (G53) in m, whatever offsets of work and tool are in force.
 
-    What moves the machine is asked for once. If the connection breaks or falls silent meanwhile, that is an
-    InstrumentError, the bridge has LinuxCNC abort, and nothing is repeated; the next call connects anew. `stop` may be
+    What moves the machine is requested once. If the connection breaks or stops answering meanwhile, that is an
+    InstrumentError, the bridge has LinuxCNC abort, and nothing is repeated; the next call connects again. `stop` may be
     called from another thread.
 
     Parameters
@@ -31,7 +31,7 @@ class LinuxCNC(Driver):
         ``tcp://127.0.0.1:5007``, ``sim://gantry/linuxcnc?seed=3``, ``replay://file``.
     settings : LinuxCNCSettings, optional
     record : Path, optional
-        Recording of the session. A recorded session does not connect anew.
+        Recording of the session. A recorded session does not connect again.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -55,8 +55,8 @@ class LinuxCNC(Driver):
     # ------------------------------------------------------------------ questions
 
     def identify(self) -> Identity:
-        """Ask the bridge which machine this is."""
-        facts = self._ask("identify")
+        """Request the identity of the machine."""
+        facts = self._query("identify")
         try:
             return Identity(
                 manufacturer=str(facts["manufacturer"]),
@@ -80,13 +80,13 @@ class LinuxCNC(Driver):
     def state(self) -> dict[str, Any]:
         """Return what the machine does.
 
-        ``time`` (s since the bridge began; of the virtual world where simulated), ``position`` (X, Y, Z as measured,
+        ``time`` (s since the bridge started; of the virtual world where simulated), ``position`` (X, Y, Z as measured,
         m), ``commanded_position`` (m), ``spindle_speed`` (1/min; as measured, where HAL has an encoder),
-        ``spindle_load`` (1 = rated; NaN unless the bridge was told its HAL pin), ``feed`` (m/s), ``mode``
+        ``spindle_load`` (1 = rated; NaN unless the bridge has its HAL pin), ``feed`` (m/s), ``mode``
         (``manual``, ``mdi``, ``automatic``), ``program`` (name of the file, or empty), ``running``, ``homed``,
         ``enabled``, ``estop``, ``alarms`` (LinuxCNC's error texts since the last order or `reset`).
         """
-        return codec.decode_state(self._ask("state"))
+        return codec.decode_state(self._query("state"))
 
     # ------------------------------------------------------------------ orders
 
@@ -139,7 +139,7 @@ class LinuxCNC(Driver):
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move in a straight line until the probe trips; return when the machine rests.
 
-        LinuxCNC latches the place in the servo cycle in which it sees the probe, so up to a cycle of travel, 1 ms x
+        LinuxCNC latches the position in the servo cycle in which it sees the probe, so up to a cycle of travel, 1 ms x
         feed, behind the contact; and as much later as the probe's signal takes (`LinuxCNCSettings.trip_delay`).
 
         Parameters
@@ -153,7 +153,7 @@ class LinuxCNC(Driver):
         -------
         dict
             ``tripped``; ``position`` where it did, m, or None; ``time`` on the machine's clock, s. Without a trip the
-            machine stands at the target.
+            machine is at the target.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class LinuxCNC(Driver):
         self._order("spindle", speed=float(speed))
 
     def stop(self, spindle: bool = False) -> None:
-        """Abort all motion. LinuxCNC's abort stops the spindle, whatever ``spindle`` says.
+        """Abort all motion. LinuxCNC's abort stops the spindle, whatever the value of ``spindle``.
 
         From another thread it ends the call that waits there, with an InstrumentError.
         """
@@ -187,11 +187,11 @@ class LinuxCNC(Driver):
         self.transport.write(codec.encode_request(self._number, "stop", {"spindle": bool(spindle)}))
 
     def elapse(self, seconds: float) -> None:
-        """Let time pass; `stop` ends it with an InstrumentError. In simulation nobody waits, unless a program runs."""
+        """Let time pass; `stop` ends it with an InstrumentError. A simulation skips it, unless a program runs."""
         self._order("elapse", seconds=float(seconds))
 
     def run_program(self, text: str) -> dict[str, Any]:
-        """Run an NC program; return when it has begun. ``state()["running"]`` tells how long it runs, `finish` waits.
+        """Run an NC program; return when it has started. ``state()["running"]`` states whether it runs, `finish` waits.
 
         The program ends with the connection: LinuxCNC aborts when the driver is closed.
 
@@ -219,8 +219,8 @@ class LinuxCNC(Driver):
 
     # ------------------------------------------------------------------ the wire
 
-    def _ask(self, op: str) -> Any:
-        """Ask a question, and once more over a new connection if it breaks."""
+    def _query(self, op: str) -> Any:
+        """Send a request, and once more over a new connection if it breaks."""
         try:
             return self._order(op)
         except InstrumentTimeoutError:
@@ -247,8 +247,8 @@ class LinuxCNC(Driver):
                 answer = self._await(line, self._number)
             except InstrumentError as error:
                 self._cut(line)
-                raise type(error)(f"{error}. LinuxCNC was asked to {op.replace('_', ' ')} meanwhile") from None
-            except BaseException:  # an interrupted wait: the bridge aborts what nobody waits for
+                raise type(error)(f"{error}. LinuxCNC was ordered to {op.replace('_', ' ')} meanwhile") from None
+            except BaseException:  # an interrupted wait: the bridge aborts an order without a waiting client
                 self._cut(line)
                 raise
         if not answer.ok:
@@ -261,7 +261,7 @@ class LinuxCNC(Driver):
                 message = codec.decode(line.read_until(codec.LINE_END, timeout=self.settings.timeout))
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
-                    f"{self.address}: LinuxCNC's bridge is silent for {self.settings.timeout:g} s"
+                    f"{self.address}: LinuxCNC's bridge did not answer for {self.settings.timeout:g} s"
                 ) from None
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
@@ -272,7 +272,7 @@ class LinuxCNC(Driver):
                 return message
 
     def _cut(self, line: Transport) -> None:
-        """Have the bridge abort, where it still hears that, and give the connection up: the next call opens another."""
+        """Have the bridge abort, if the order still reaches it, and drop the connection; the next call opens one."""
         self._lost = True
         self._number += 1
         with suppress(InstrumentError):
@@ -296,7 +296,7 @@ class LinuxCNC(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._number, self._lost = 0, False
         self._unawaited.clear()
         self.identify()

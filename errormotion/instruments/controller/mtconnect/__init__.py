@@ -1,4 +1,4 @@
-"""Machines that an MTConnect agent tells of, read-only."""
+"""Machines with an MTConnect agent, read-only."""
 
 from errormotion.instruments.controller.mtconnect.driver import MTConnect
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings

@@ -1,4 +1,4 @@
-"""Which of a device's data items tell of positions, spindle, feed, mode, program and emergency stop."""
+"""Data items of a device for positions, spindle, feed, mode, program and emergency stop."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def _any(_: DataItem) -> bool:
 
 
 def choose(device: Device, settings: MTConnectSettings) -> Mapping[str, DataItem]:
-    """Return data items by what they tell: `settings.KEYS`, and whole positions where the axes have none of their own.
+    """Return data items by quantity: `settings.KEYS`, and whole positions where the axes have none of their own.
 
-    What no data item tells is left out. An item that ``settings.items`` names comes first; then type, subtype, the
+    Quantities without a data item are missing. An item in ``settings.items`` comes first; then type, subtype, the
     name of the component, and machine before work coordinates decide.
 
     Raises
@@ -98,7 +98,7 @@ def _add(
             if len(found) > 1:
                 names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found)
                 raise InstrumentError(
-                    f"Several data items tell '{key}': {names}. Say which one in the settings: "
+                    f"Several data items report '{key}': {names}. State which one in the settings: "
                     f'items = {{ "{key}" = "{found[0].id}" }}'
                 )
             if found:

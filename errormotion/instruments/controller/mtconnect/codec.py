@@ -76,7 +76,7 @@ class Header:
 
 @dataclass(frozen=True)
 class DataItem:
-    """Something that a device tells, and the component that it stands in: its element, names and id."""
+    """A data item of a device, and its component: its element, names and id."""
 
     id: str
     category: str
@@ -131,7 +131,7 @@ class Observation:
     time : float
         When, s since 1970 by the agent's clock.
     value : str
-        As the agent tells it, ``UNAVAILABLE`` included; of a condition its text.
+        As the agent reports it, ``UNAVAILABLE`` included; of a condition its text.
     level : str
         Of a condition ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``; else empty.
     type, code : str
@@ -210,7 +210,7 @@ def _tree(data: bytes) -> ElementTree.Element:
     try:
         parser.feed(data)
         root: Any = parser.close()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the others: encodings nobody knows
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the others: unknown encodings
         raise ProtocolError(f"Expected XML; it cannot be read ({error}); it starts {data[:60]!r}") from None
     if not isinstance(root, ElementTree.Element):
         raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
@@ -274,7 +274,7 @@ def _devices(root: ElementTree.Element) -> Iterator[Device]:
         if _local(devices) != "Devices":
             continue
         for device in devices:
-            if _local(device) != "Device":  # an agent tells of itself as well
+            if _local(device) != "Device":  # an agent describes itself as well
                 continue
             told = _child(device, "Description")
             about = {} if told is None else told.attrib

@@ -42,9 +42,9 @@ class Observed:
     next : int
         Sequence number that follows.
     lost : int
-        Observations that the agent had overwritten before they were asked for; of all its devices.
+        Observations that the agent had overwritten before they were requested; of all its devices.
     restarted : bool
-        The agent was started anew: its numbers begin again, and what it held is gone uncounted.
+        The agent was restarted: its numbers start again, and what it held is gone uncounted.
     """
 
     observations: tuple[Observation, ...]
@@ -54,7 +54,7 @@ class Observed:
 
 
 class MTConnect(Driver):
-    """A machine that an MTConnect agent tells of; read-only.
+    """A machine with an MTConnect agent; read-only.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class MTConnect(Driver):
         self._instance: int | None = None
         self._next: int | None = None
         self._began: float | None = None
-        self._restarted = False  # while nobody listened
+        self._restarted = False  # while no client was connected
         self._device = Device("", "")
         self._items: Mapping[str, DataItem] = {}
 
@@ -105,8 +105,8 @@ class MTConnect(Driver):
         return self._device.items
 
     def identify(self) -> Identity:
-        """Tell what the agent says of its device."""
-        document = self._ask("probe")
+        """Return the identity of the device as the agent states it."""
+        document = self._query("probe")
         device = self._one(document)
         return Identity(
             manufacturer=device.manufacturer or "unknown",
@@ -123,7 +123,7 @@ class MTConnect(Driver):
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return the state now, without what the agent cannot tell at all."""
+        """Return the state now, without what the agent never reports."""
         return {name: value for name, value in self.state().items() if value is not None}
 
     def state(self) -> dict[str, Any]:
@@ -135,7 +135,7 @@ class MTConnect(Driver):
             ``time`` (s on the agent's clock since the driver was first opened), ``position`` and
             ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
             clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
-            ``mdi``, ``automatic`` or empty), ``program``, ``running``, ``homed`` (None: no agent tells it),
+            ``mdi``, ``automatic`` or empty), ``program``, ``running``, ``homed`` (None: agents do not report it),
             ``enabled``, ``estop``, ``alarms`` and ``warnings`` (lists of str), and ``unavailable``: names of what is
             unknown. Unknown numbers are NaN.
 
@@ -144,9 +144,9 @@ class MTConnect(Driver):
         ProtocolError
             No answer of an agent, or a value that is none.
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         """
-        document = self._ask("current")
+        document = self._query("current")
         self._notice(document)
         last = {each.item: each for each in document.observations if not each.level}
         now = document.header.created - self._start(document)
@@ -186,17 +186,17 @@ class MTConnect(Driver):
             The agent overwrites its buffer faster than it can be read.
         """
         if self._next is None:
-            document = self._ask("current")
+            document = self._query("current")
             self._notice(document)
             restarted, self._restarted = self._restarted, False
             return self._taken(document, 0, restarted=restarted)
-        document = self._ask("sample", self._from(), refused=False)
+        document = self._query("sample", self._from(), refused=False)
         return self._understood(document) or self._caught_up(document)
 
     def observations(self, interval: float = 0.1) -> Iterator[Observed]:
-        """Yield what is observed as the agent sends it, beginning where `sample` or an earlier stream ended.
+        """Yield what is observed as the agent sends it, starting where `sample` or an earlier stream ended.
 
-        A stream that the agent ends is asked for again. While it runs nothing else can be asked on this connection.
+        A stream that the agent ends is requested again. While it runs nothing else can be queried on this connection.
 
         Parameters
         ----------
@@ -206,7 +206,7 @@ class MTConnect(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            Not even the heartbeat came, which is asked for at half the time limit.
+            Not even the heartbeat came, which is requested at half the time limit.
         ProtocolError, InstrumentError
             As of `sample`.
         """
@@ -238,7 +238,7 @@ class MTConnect(Driver):
         return {"from": str(self._next), "count": str(self.settings.count)}
 
     def _understood(self, document: Document) -> Observed | None:
-        """Return what is in an answer to a request for what follows; None where the numbers have to be found anew."""
+        """Return what is in an answer to a request for what follows; None where the numbers have to be found again."""
         assert self._next is not None
         if document.header.instance != self._instance or OUT_OF_RANGE in document.errors:
             return None
@@ -256,17 +256,17 @@ class MTConnect(Driver):
         """Go on at the first observation that the agent still holds."""
         lost, restarted = 0, False
         for _ in range(_ATTEMPTS):
-            document = self._ask("current")
+            document = self._query("current")
             header = document.header
             assert self._next is not None
             again = self._notice(document)
-            if again or self._next > header.next:  # a restart shows in the numbers too, whatever the instance says
+            if again or self._next > header.next:  # a restart shows in the numbers too, whatever the instance states
                 restarted = True
                 self._next = header.first
             elif header.first > self._next:
                 lost += header.first - self._next
                 self._next = header.first
-            document = self._ask("sample", self._from(), refused=False)
+            document = self._query("sample", self._from(), refused=False)
             if document.header.instance == self._instance and OUT_OF_RANGE not in document.errors:
                 self._refuse(document, "sample")
                 lost += max(0, document.header.first - self._next)
@@ -274,16 +274,16 @@ class MTConnect(Driver):
         self._count(lost)
         raise InstrumentError(
             f"The agent at {self.address} overwrites its {document.header.buffer} observations faster than they can be "
-            "asked for; give it a larger buffer, or ask for fewer data items"
+            "requested; give it a larger buffer, or request fewer data items"
         )
 
     def _count(self, lost: int) -> None:
         if lost:
             self.lost += lost
-            log.warning("%s: %d observations were overwritten before they were asked for", self.address, lost)
+            log.warning("%s: %d observations were overwritten before they were requested", self.address, lost)
 
     def _notice(self, document: Document) -> bool:
-        """Learn the device anew where the agent was restarted; return whether it was."""
+        """Read the description of the device again where the agent was restarted; return whether it was."""
         if document.header.instance == self._instance:
             return False
         self.restarts += 1
@@ -326,7 +326,7 @@ class MTConnect(Driver):
         device = target.path if target.scheme in ("http", "tcp") else ""
         return f"/{device}/{request}" if device else f"/{request}"
 
-    def _ask(self, request: str, query: Mapping[str, str] | None = None, *, refused: bool = True) -> Document:
+    def _query(self, request: str, query: Mapping[str, str] | None = None, *, refused: bool = True) -> Document:
         answer = self._http.get(self._path(request), query, limit=self.settings.most_bytes)
         try:
             document = parse(answer.body)
@@ -352,13 +352,13 @@ class MTConnect(Driver):
         return document.devices[0]
 
     def _examine(self) -> None:
-        document = self._ask("probe")
+        document = self._query("probe")
         self._instance = document.header.instance
         self._device = self._one(document)
         self._items = choose(self._device, self.settings)
         for item in self._items.values():
             if item.category == "SAMPLE":
-                _ = item.scale  # units that nobody knows are told now
+                _ = item.scale  # unknown units are reported now
         self._start(document)
 
     def _connect(self) -> HttpTransport:
@@ -366,7 +366,7 @@ class MTConnect(Driver):
             self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         before = self._instance
         self._examine()
         if before is not None and before != self._instance:
@@ -381,7 +381,7 @@ def _text(observation: Observation | None) -> str:
 
 
 def _conditions(document: Document, level: str) -> list[str]:
-    """Return what conditions of a level say, such as ``SYSTEM 1104: overtravel``."""
+    """Return what conditions of a level state, such as ``SYSTEM 1104: overtravel``."""
     return [
         f"{' '.join(filter(None, (each.type, each.code)))}: {each.value}".rstrip(": ")
         for each in document.observations

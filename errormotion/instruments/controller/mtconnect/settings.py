@@ -25,11 +25,12 @@ class MTConnectSettings(PluginSettings):
         default="", description="name of the rotary axis that is the spindle; empty: the only one that has a speed"
     )
     items: dict[str, str] = Field(
-        default_factory=dict, description="ids of data items, where type and name do not tell: spindle_speed = 'S2rpm'"
+        default_factory=dict,
+        description="ids of data items, where type and name do not suffice: spindle_speed = 'S2rpm'",
     )
-    count: int = Field(default=1000, description="most observations that are asked for at once", ge=1)
+    count: int = Field(default=1000, description="most observations that are requested at once", ge=1)
     most_bytes: int = Field(default=16 << 20, description="largest document that is taken", ge=1024)
-    timeout: Time = Field(default=2.0, description="time limit of silence", gt=0)
+    timeout: Time = Field(default=2.0, description="time limit without data", gt=0)
 
     @field_validator("items")
     @classmethod

@@ -1,8 +1,8 @@
 """Packets of an emScon server: little-endian structures, packed, over TCP port 700.
 
-Every packet begins with its size in bytes (i32, header included) and its type (u32). A command is the header, its
+Every packet starts with its size in bytes (i32, header included) and its type (u32). A command is the header, its
 number, and parameters; the answer repeats the number and adds a status, then values where the status is 0. Between the
-answers come packets that nobody asked for: reflector positions, levels, status changes, errors such as a broken beam.
+answers come packets that nobody requested: reflector positions, levels, status changes, errors such as a broken beam.
 
 The layouts are those of the interface's C definitions, versions 3.6 and 3.8. ``long``, ``int`` and enumerations have
 four bytes; names are 32 characters of UTF-16. Results of measurements have a status behind the header and no number of
@@ -20,13 +20,13 @@ from typing import Any
 from errormotion.errors import ProtocolError
 
 HEADER = struct.Struct("<iI")
-LARGEST = 1 << 20  # bytes; 4 points a millisecond for 7 s
+MAX_PACKET_BYTES = 1 << 20  # bytes; 4 points a millisecond for 7 s
 NAME = "64s"
 
 # ---------------------------------------------------------------------- types of packets
 
 COMMAND, ERROR, SINGLE, MULTI, LEVEL, REFLECTOR, CHANGE, SINGLE2, MULTI2 = 0, 1, 2, 3, 6, 7, 8, 9, 10
-UNUSED_TYPES = frozenset({4, 5, 11})  # of probes with six freedoms: passed over
+UNUSED_TYPES = frozenset({4, 5, 11})  # of probes with six freedoms: ignored
 
 # ---------------------------------------------------------------------- commands
 
@@ -218,7 +218,7 @@ def decode_header(data: bytes | bytearray) -> tuple[int, int]:
     """
     size, kind = HEADER.unpack(data)
     known = kind in RESULTS or kind in (COMMAND, ERROR, CHANGE) or kind in UNUSED_TYPES
-    if not (HEADER.size + 4 <= size <= LARGEST and known):
+    if not (HEADER.size + 4 <= size <= MAX_PACKET_BYTES and known):
         raise ProtocolError(
             f"Expected the header of an emScon packet; found {data.hex(' ')}, that is {size} bytes of type {kind}. Is "
             "it an emScon server that answers here?"

@@ -1,4 +1,4 @@
-"""Asking an emScon server: commands and their answers, with everything that comes unasked in between."""
+"""Asking an emScon server: commands and their answers, with everything that comes unrequested in between."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import (
 )
 from errormotion.instruments.transports import Transport
 
-BUSY_PAUSE = 0.1  # s between two requests to a busy server
-MOST_EVENTS = 1000
-MOST_EARLY = 100
+BUSY_INTERVAL = 0.1  # s between two requests to a busy server
+MAX_EVENTS = 1000
+MAX_EARLY_PACKETS = 100
 
 
 class RefusedError(InstrumentError):
@@ -41,7 +41,7 @@ class RefusedError(InstrumentError):
 
 @dataclass(frozen=True)
 class Event:
-    """What the server said unasked.
+    """Messages of the server that were not requested.
 
     Attributes
     ----------
@@ -68,20 +68,20 @@ class Link:
     ----------
     transport : Transport
     timeout, busy_timeout : float
-        Time limits of an answer, and of a server that says that it is busy, s.
+        Time limits of an answer, and of a server that states that it is busy, s.
 
     Attributes
     ----------
     events : deque of Event
-        The last ones that came unasked.
+        The last messages that were not requested.
     early : deque of Packet
         Points of a continuous measurement that came before the answer to the command that starts it.
     broken : bool
-        Whether the beam has lost its reflector, as far as the server has told.
+        Whether the beam has lost its reflector, as far as the server has reported.
     breaks : int
         How often it has.
     stale_refraction : bool
-        Whether the refraction index may have changed since somebody took note.
+        Whether the refraction index may have changed since it was last read.
     """
 
     def __init__(self, transport: Transport, timeout: float, busy_timeout: float) -> None:
@@ -90,25 +90,25 @@ class Link:
         self._busy_timeout = busy_timeout
         self._lost = ""
         self._waiting = bytearray()
-        self.events: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self.early: deque[Packet] = deque(maxlen=MOST_EARLY)
+        self.events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self.early: deque[Packet] = deque(maxlen=MAX_EARLY_PACKETS)
         self.broken = False
         self.breaks = 0
         self.stale_refraction = True
 
-    def ask(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
-        """Send a command and return its answer; a busy server is asked again.
+    def query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
+        """Send a command and return its answer; a busy server is queried again.
 
         Raises
         ------
         RefusedError
             The server refuses.
         InstrumentTimeoutError, ProtocolError
-            No answer in time, or none that can be read: the connection has to be opened anew.
+            No answer in time, or none that can be read: the connection has to be opened again.
         """
-        return next(self.ask_many(number, limit=limit, **values))
+        return next(self.query_all(number, limit=limit, **values))
 
-    def ask_many(
+    def query_all(
         self,
         number: int,
         /,
@@ -117,7 +117,7 @@ class Link:
         total: Callable[[Packet], int] = lambda _: 1,
         **values: Any,
     ) -> Iterator[Packet]:
-        """Send a command and yield its answers; ``total(first)`` says how many there are, see `ask`."""
+        """Send a command and yield its answers; ``total(first)`` states how many there are, see `ask`."""
         allowed = self._timeout if limit is None else limit
         patience = time.monotonic() + self._busy_timeout
         while True:
@@ -130,7 +130,7 @@ class Link:
                 break
             if time.monotonic() >= patience:
                 raise self._refusal(number, packet.status, f", for {self._busy_timeout:g} s by now")
-            time.sleep(BUSY_PAUSE)
+            time.sleep(BUSY_INTERVAL)
         yield packet
         for _ in range(total(packet) - 1):
             yield self._answer(number, allowed)
@@ -146,7 +146,7 @@ class Link:
         Raises
         ------
         InstrumentTimeoutError
-            It does not come within ``limit`` s. As it may come later, the connection is of no use any more.
+            It does not come within ``limit`` s. As it may come later, the connection can no longer be used.
         """
         end = time.monotonic() + limit
         while True:
@@ -165,7 +165,7 @@ class Link:
         Raises
         ------
         ProtocolError
-            What comes is no packet; the connection is of no use any more.
+            What comes is no packet; the connection can no longer be used.
         """
         self._check()
         end = time.monotonic() + limit

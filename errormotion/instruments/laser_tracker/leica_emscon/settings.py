@@ -44,7 +44,7 @@ class EmSconSettings(PluginSettings):
     timeout: Time = Field(default=3.0, description="time limit of an answer", gt=0)
     motion_timeout: Time = Field(default=30.0, description="time limit of a motion or a search", gt=0)
     initialise_timeout: Time = Field(default=180.0, description="time limit of the initialisation", gt=0)
-    busy_timeout: Time = Field(default=5.0, description="how long a busy tracker is asked again", ge=0)
+    busy_timeout: Time = Field(default=5.0, description="how long a busy tracker is queried again", ge=0)
 
     @property
     def interval(self) -> int:

@@ -71,7 +71,7 @@ RESULTS: Mapping[int, str] = {
 #: There is nothing to measure: no fault of the tracker, but no distance either.
 NO_TARGET = frozenset({NO_DISTANCE, NOT_READY, NO_RESULT, SYSTEM_NOT_READY})
 
-#: What a server says unasked about itself.
+#: Messages of a server about itself that were not requested.
 MEASURE_NOT_READY, MEASURE_BUSY, MEASURE_READY = 25, 26, 27
 REFRACTION_CHANGED, ENVIRONMENT_CHANGED, DISTANCE_SET, UNITS_CHANGED, COORDINATES_CHANGED = 3, 2, 0, 6, 12
 CHANGES: Mapping[int, str] = {

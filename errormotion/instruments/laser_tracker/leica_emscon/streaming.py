@@ -1,4 +1,4 @@
-"""The points of a continuous measurement, put where the tracker's clock says that they belong."""
+"""The points of a continuous measurement, put where the tracker's clock states that they belong."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBroke
 from errormotion.plugins import Samples
 
 BLOCK_SECONDS = 0.5
-LONGEST_GAP = 600.0  # s
+MAX_GAP = 600.0  # s
 LOST, BROKEN = "lost", "beam broken"
 _WARNINGS = frozenset({0, 1})
 
@@ -25,8 +25,8 @@ _WARNINGS = frozenset({0, 1})
 def points(link: Link, settings: EmSconSettings, block: int | None = None) -> Iterator[Samples]:
     """Yield blocks of distances from the packets that come on a link.
 
-    A point's place is its time since the first one over the interval that was set. Places without a point are NaN,
-    ``lost``; or ``beam broken`` where the tracker has told so since the last point.
+    A point's index is its time since the first one over the interval that was set. Indices without a point are NaN,
+    ``lost``; or ``beam broken`` where the tracker has reported so since the last point.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
             clock = 1_000_000 * int(point["seconds"]) + int(point["microseconds"])
             start = clock if start is None else start
             place = round((clock - start) / interval)
-            if not 0 <= place - expected <= LONGEST_GAP * settings.rate:
+            if not 0 <= place - expected <= MAX_GAP * settings.rate:
                 raise ProtocolError(
                     f"The tracker's clock goes from point {expected - 1} to point {place}: expected one after the "
                     f"other, {settings.interval} ms apart. Is another client measuring?"

@@ -1,6 +1,6 @@
-"""What an LJ-X8000A says: requests, replies, and the layout of its high-speed stream. Little-endian throughout.
+"""Protocol of the LJ-X8000A: requests, replies, and the layout of its high-speed stream. Little-endian throughout.
 
-Facts marked (m) are from memory; each is one line to correct. A request is a 16-byte head and a payload that begins
+Facts marked (m) are from memory; each is one line to correct. A request is a 16-byte head and a payload that starts
 with its opcode; a reply has its return code at byte 17, the active program at 24 and its data from 28 on.
 
 A profile of the stream is a header of six words (reserved, trigger count, encoder count, three reserved), the heights
@@ -35,9 +35,9 @@ GET_COUNTS, GET_TEMPERATURE, GET_STATUS = 0x4B, 0x4C, 0x65
 
 REQUEST_HEAD = 16
 REPLY_HEAD = 28
-RETURN_CODE, PROGRAM = 17, 24  # places in a reply
-LARGEST_REPLY = 3 << 20  # (m)
-FROM_NEXT = 2  # argument of PREPARE_STREAM: begin with the next profile
+RETURN_CODE, PROGRAM = 17, 24  # positions in a reply
+MAX_REPLY_BYTES = 3 << 20  # (m)
+FROM_NEXT = 2  # argument of PREPARE_STREAM: start with the next profile
 PROGRAMS = 16
 
 LENGTH = 1e-8  # m: unit of the Z unit, of X start and of the X pitch
@@ -98,9 +98,9 @@ class Reply:
 def reply_length(head: bytes) -> int:
     """Return the length of a reply from its first four bytes; ProtocolError where it cannot be."""
     length: int = struct.unpack("<I", head)[0] + 4
-    if not REPLY_HEAD <= length <= LARGEST_REPLY:
+    if not REPLY_HEAD <= length <= MAX_REPLY_BYTES:
         raise ProtocolError(
-            f"A reply has {REPLY_HEAD} to {LARGEST_REPLY} bytes; found {length} (its first bytes are {head.hex(' ')})"
+            f"A reply has {REPLY_HEAD} to {MAX_REPLY_BYTES} bytes; found {length} (its first bytes are {head.hex(' ')})"
         )
     return length
 
@@ -127,7 +127,7 @@ def refusal(opcode: int, code: int) -> InstrumentError:
     )
 
 
-_UNITS, _UNIT_SIZE, _MODEL_SIZE, _SERIAL_SIZE = 16, 52, 32, 16  # places in the data of DESCRIBE
+_UNITS, _UNIT_SIZE, _MODEL_SIZE, _SERIAL_SIZE = 16, 52, 32, 16  # positions in the data of DESCRIBE
 
 
 def parse_description(reply: Reply) -> list[tuple[str, str]]:
@@ -162,13 +162,13 @@ TRIGGER_WORD, ENCODER_WORD = 1, 2
 INTENSITY = 0x40  # bit of the kind
 HEIGHT_BITS, INTENSITY_BITS, WORD_BITS = 20, 10, 32
 SMALLEST_HEIGHT = -(1 << 19) + 4  # below lie the codes of points without height
-MOST_POINTS = 3200
+MAX_POINTS = 3200
 
 NOTIFY = 0xFFFFFFFF
 NOTIFY_WORDS = 2
-STOPPED = 0xFFFF  # bits of a notice that say the stream has ended
+STOPPED = 0xFFFF  # bits of a notice that state the stream has ended
 
-# Why a point has no height. The place in this list is the code that the compiled functions use; the first four are the
+# Why a point has no height. The index in this list is the code of the compiled functions; the first four are the
 # raw values 0x80000 to 0x80003.
 REASONS: tuple[str, ...] = ("alarm", "invalid", "blind spot", "unprocessed", "lost", "garbled")
 SENTINELS = 4
@@ -177,7 +177,7 @@ LOST, GARBLED = 4, 5
 
 @dataclass(frozen=True)
 class StreamLayout:
-    """What the profiles of a stream look like, as the reply to PREPARE_STREAM says.
+    """What the profiles of a stream look like, as the reply to PREPARE_STREAM states.
 
     Attributes
     ----------
@@ -229,7 +229,7 @@ _LAYOUT = "iIBBHHHii"  # from byte 32 of the reply on: start code, -, kind, -, -
 
 
 def parse_layout(reply: Reply) -> StreamLayout:
-    """Return what a reply to PREPARE_STREAM says.
+    """Return what a reply to PREPARE_STREAM states.
 
     Raises
     ------
@@ -237,9 +237,9 @@ def parse_layout(reply: Reply) -> StreamLayout:
         No points, more than there can be, or a unit of 0.
     """
     code, _, kind, _, _, points, z_unit, x_start, x_pitch = reply.unpack(_LAYOUT, 4)
-    if not 0 < points <= MOST_POINTS or z_unit == 0:
+    if not 0 < points <= MAX_POINTS or z_unit == 0:
         raise ProtocolError(
-            f"Expected profiles of 1 to {MOST_POINTS} points with a Z unit; the profiler announces {points} points "
+            f"Expected profiles of 1 to {MAX_POINTS} points with a Z unit; the profiler announces {points} points "
             f"and the unit {z_unit}"
         )
     return StreamLayout(code, kind, points, z_unit * LENGTH, x_start * LENGTH, x_pitch * LENGTH)

@@ -22,12 +22,12 @@ from errormotion.instruments.streaming import Chunk
 
 Array = np.ndarray[Any, Any]
 WORD = 4
-PATIENCE = 8
+UNSYNCHRONISED_PROFILES = 8
 """Profiles' worth of bytes without a sound one among them after which the stream is given up."""
 
 
 class StreamEndedError(InstrumentError):
-    """The profiler says that it has ended the stream."""
+    """The profiler states that it has ended the stream."""
 
 
 class StreamDecoder:
@@ -55,7 +55,7 @@ class StreamDecoder:
         self.stray_bytes = 0
 
     def __call__(self, data: bytes) -> Chunk:
-        """Return the profiles that the next bytes complete; the chunk's ``end`` says why nothing follows.
+        """Return the profiles that the next bytes complete; the chunk's ``end`` states why nothing follows.
 
         Its ``end`` is a ProtocolError where no profile is found in many bytes, or the trigger count is no
         continuation; a StreamEndedError where the profiler ends the stream.
@@ -66,7 +66,7 @@ class StreamDecoder:
         end: InstrumentError | None = None
         while True:
             if self._searching and not self._found():
-                if len(self._rest) > PATIENCE * self._size * WORD:
+                if len(self._rest) > UNSYNCHRONISED_PROFILES * self._size * WORD:
                     end = ProtocolError(
                         f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: did its "
                         "settings change while it streams? Start the stream again"

@@ -36,7 +36,7 @@ STREAM = "stream"
 BLOCK_SECONDS = 0.1
 QUEUE_SECONDS = 0.5
 SMALLEST_QUEUE = 64
-AT_ONCE = 64
+BATCH_PROFILES = 64
 """Profiles unpacked at once: their packed form stays in the processor's cache."""
 QUIET_INTERVAL = 0.3
 """Silence after which a stopped stream is taken as ended, where no notice has come, s."""
@@ -53,7 +53,7 @@ class Counts:
 class KeyenceLJX(Driver):
     """A Keyence LJ-X8000A line profiler over Ethernet: one connection for commands, one for the stream.
 
-    Heights and places on the line are in m; heights are NaN where the profiler has none.
+    Heights and positions on the line are in m; heights are NaN where the profiler has none.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class KeyenceLJX(Driver):
     # ------------------------------------------------------------------ commands
 
     def identify(self) -> Identity:
-        """Ask the controller for the models and serial numbers of itself and its head."""
+        """Query the controller for the models and serial numbers of itself and its head."""
         units = codec.parse_description(self.command(codec.DESCRIBE))
         if not units:
             raise InstrumentError(f"The controller at {self.address} names no unit, not even itself")
@@ -115,7 +115,7 @@ class KeyenceLJX(Driver):
         self.settings = settings
 
     def program(self) -> int:
-        """Ask for the active program."""
+        """Request the active program."""
         return self.command(codec.GET_STATUS).program
 
     def change_program(self, number: int) -> None:
@@ -125,10 +125,10 @@ class KeyenceLJX(Driver):
             raise InstrumentError(f"The programs have the numbers 0 to {codec.PROGRAMS - 1}; found {number}")
         self.command(codec.CHANGE_PROGRAM, bytes((number, 0, 0, 0)))
         if (active := self.program()) != number:
-            raise InstrumentError(f"Program {number} was asked for, but {active} is active")
+            raise InstrumentError(f"Program {number} was requested, but {active} is active")
 
     def x_pitch(self) -> float:
-        """Ask for the distance of the points on the line, m."""
+        """Request the distance of the points on the line, m."""
         return float(self.command(codec.GET_X_PITCH).unpack("I")[0] * LENGTH)
 
     def set_x_pitch(self, pitch: float) -> None:
@@ -137,16 +137,16 @@ class KeyenceLJX(Driver):
         self.command(codec.SET_X_PITCH, struct.pack("<I", round(pitch / LENGTH)))
 
     def counts(self) -> Counts:
-        """Ask for the trigger and encoder counts; works while profiles are streaming."""
+        """Request the trigger and encoder counts; works while profiles are streaming."""
         return Counts(*self.command(codec.GET_COUNTS).unpack("Ii"))
 
     def temperature(self) -> dict[str, float]:
-        """Ask for the head's temperatures, degC: its sensor, processor and case."""
+        """Request the head's temperatures, degC: its sensor, processor and case."""
         values = self.command(codec.GET_TEMPERATURE).unpack("3h")
         return {name: value * TEMPERATURE for name, value in zip(("sensor", "processor", "case"), values, strict=True)}
 
     def errors(self) -> list[int]:
-        """Ask for the codes of the errors that it shows."""
+        """Request the codes of the errors that it shows."""
         return codec.parse_errors(self.command(codec.GET_ERROR))
 
     def clear_error(self, code: int) -> None:
@@ -194,7 +194,7 @@ class KeyenceLJX(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            No profile within the time limit: it waits for its trigger, or is silent altogether.
+            No profile within the time limit: it waits for its trigger, or does not answer at all.
         """
         refused: list[InstrumentError] = []
         try:
@@ -244,7 +244,7 @@ class KeyenceLJX(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         ProtocolError
             No profile can be found in what comes, or the trigger count makes no sense.
         InstrumentError
@@ -273,7 +273,7 @@ class KeyenceLJX(Driver):
             first = 0
             while True:
                 if self._reader is not reader:
-                    raise InstrumentError(f"{self.name}: this stream is over, it was closed; begin another one")
+                    raise InstrumentError(f"{self.name}: this stream is over, it was closed; start another one")
                 parts = self._block(reader, unpack, layout, size)
                 yield Profiles(
                     first=first,
@@ -292,10 +292,10 @@ class KeyenceLJX(Driver):
         intensity = np.empty((size, layout.points), dtype=np.uint16) if layout.with_intensity else None
         encoder = np.empty(size)
         counts = np.zeros(len(REASONS), dtype=np.int64)
-        packed = np.empty((min(size, AT_ONCE), layout.words), dtype=np.uint32)
+        packed = np.empty((min(size, BATCH_PROFILES), layout.words), dtype=np.uint32)
         reasons = np.empty(len(packed), dtype=np.uint8)
-        for start in range(0, size, AT_ONCE):
-            part = slice(start, min(start + AT_ONCE, size))
+        for start in range(0, size, BATCH_PROFILES):
+            part = slice(start, min(start + BATCH_PROFILES, size))
             n = part.stop - part.start
             reader.fill(packed[:n], reasons[:n], self.settings.timeout)
             unpack.heights(packed[:n], reasons[:n], heights[part], counts)
@@ -342,17 +342,17 @@ class KeyenceLJX(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._lost, self._notice_pending = None, False
         try:
             self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
             self._notice_pending = True
         except InstrumentError:
-            if self._lost is not None:  # else it only says that there was nothing to stop
+            if self._lost is not None:  # else it only states that there was nothing to stop
                 raise
         self.configure(self.settings)
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         self._stop()
 
     def _refuse_while_streaming(self) -> None:

@@ -18,7 +18,7 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
 Array = np.ndarray[Any, Any]
 
 LOWEST = SMALLEST_HEIGHT - SENTINELS
-LARGEST_GAP = 1 << 16
+MAX_GAP_PROFILES = 1 << 16
 """Profiles: a trigger count that leaps further did not come from lost profiles."""
 
 MORE, NOTICE, DAMAGED, LEAP = range(4)  # why `follow` stops
@@ -39,7 +39,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
     Parameters
     ----------
     words : ndarray, uint32
-        Begin with a profile or a notify packet.
+        Start with a profile or a notify packet.
     size : int
         Words of a profile.
     trigger : int
@@ -65,7 +65,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
             return n, DAMAGED
         count = np.int64(words[first + TRIGGER_WORD])
         ahead = (count - trigger) & 0xFFFFFFFF if trigger >= 0 else 0
-        if ahead > LARGEST_GAP:
+        if ahead > MAX_GAP_PROFILES:
             return n, LEAP
         aheads[n] = ahead
         trigger = (count + 1) & 0xFFFFFFFF
@@ -76,14 +76,14 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def search(words: Array, size: int, trigger: int) -> int:
-    """Return where in words the next profile with a right checksum and a fitting trigger count begins; -1: nowhere."""
+    """Return where in words the next profile with a right checksum and a fitting trigger count starts; -1: nowhere."""
     if words.size < size:
         return -1
     total = _sum(words, 0, size - 1)
     for first in range(words.size - size + 1):
         if total == words[first + size - 1] and words[first] != NOTIFY:
             count = np.int64(words[first + TRIGGER_WORD])
-            if trigger < 0 or (count - trigger) & 0xFFFFFFFF <= LARGEST_GAP:
+            if trigger < 0 or (count - trigger) & 0xFFFFFFFF <= MAX_GAP_PROFILES:
                 return first
         total = np.uint32(total + words[first + size - 1] - words[first])
     return -1
@@ -159,7 +159,7 @@ def unpack_intensities(profiles: Array, first: int, reasons: Array, intensities:
     ----------
     profiles : ndarray, uint32, (n, words)
     first : int
-        Word at which they begin.
+        Word at which they start.
     reasons : ndarray, uint8, (n,)
         Not 0 where there is no profile.
     intensities : ndarray, uint16, (n, point)

@@ -19,4 +19,4 @@ class LJXSettings(PluginSettings):
     rate: Frequency = Field(default=1000.0, description="profiles per second that its program is set to", gt=0)
     noise: Length = Field(default=0.5e-6, description="standard deviation of the height of one point", ge=0)
     generation: Literal["LJ-X8000", "LJ-V7000"] = Field(default="LJ-X8000", description="of the controller")
-    timeout: Time = Field(default=1.0, description="time limit of silence", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit without data", gt=0)

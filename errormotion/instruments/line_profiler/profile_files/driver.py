@@ -102,7 +102,7 @@ class ProfileFiles:
         self.close()
 
     def identify(self) -> Identity:
-        """Tell the files by their kind and hash."""
+        """Identify the files by their kind and hash."""
         files = self._opened()
         together = hashlib.sha256("".join(files.values()).encode()).hexdigest()
         return Identity(

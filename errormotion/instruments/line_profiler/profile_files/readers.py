@@ -15,7 +15,7 @@ from errormotion.plugins.readings import Scan
 
 Array = np.ndarray[Any, Any]
 
-LARGEST_HEIGHT = 0.5  # m; a larger one is a mistaken unit
+MAX_HEIGHT = 0.5  # m; a larger one is a mistaken unit
 FULL = 0.25
 """Share of the cells of a height map that a point cloud must fill to be one."""
 
@@ -38,7 +38,7 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
     if not np.isfinite(heights).any():
         raise InstrumentError(f"{path}: not a single height in it; is it the whole file?")
     highest = float(np.nanmax(np.abs(heights)))
-    if highest > LARGEST_HEIGHT:
+    if highest > MAX_HEIGHT:
         raise InstrumentError(f"{path}: a height of {highest:.4g} m; is its unit really '{settings.unit or 'm'}'?")
     for name, places in (("y", y), ("x", x)):
         steps = np.diff(places)
@@ -61,7 +61,7 @@ def _cleared(values: Array, settings: ProfileFileSettings) -> Array:
 
 
 def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
-    """Read rows of heights, a profile each; an empty cell is no height. Lines that begin with # are passed over."""
+    """Read rows of heights, a profile each; an empty cell is no height. Lines that start with # are ignored."""
     unit = _unit(path, settings)
     if settings.x_pitch is None or settings.y_pitch is None:
         raise InstrumentError(
@@ -129,7 +129,7 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
 
 
 def _open3d(path: Path) -> Any:
-    """Return the package; it brings a TBB of its own, too old for numba, which is therefore told to try it last."""
+    """Return the package; it brings a TBB of its own, too old for numba, which is therefore set to try it last."""
     import numba
 
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined, unused-ignore]
@@ -201,7 +201,7 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
     Raises
     ------
     InstrumentError
-        They do not lie on lines of equal x and equal y, or two lie at one place.
+        They do not lie on lines of equal x and equal y, or two lie at one position.
     """
     points = points[np.isfinite(points[:, :2]).all(axis=1)]
     (x, column), (y, row) = (_lines(points[:, axis]) for axis in (0, 1))
@@ -219,7 +219,7 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
 
 
 def _lines(places: Array) -> tuple[Array, Array]:
-    """Return the different places, but for the rounding of the file, and which of them each is."""
+    """Return the different positions, but for the rounding of the file, and which of them each is."""
     order = np.argsort(places, kind="stable")
     ordered = places[order]
     tolerance = 0.01 * np.ptp(ordered) / np.sqrt(ordered.size)  # 1 % of the pitch of a square grid

@@ -1,9 +1,9 @@
-"""What an LK-G or LK-H controller says over RS-232C: lines of ASCII that end with a carriage return.
+"""Protocol of LK-G and LK-H controllers over RS-232C: lines of ASCII that end with a carriage return.
 
-A request is a command and its identifiers, joined by commas; the answer begins with what was asked and goes on with
+A request is a command and its identifiers, joined by commas; the answer starts with the request and goes on with
 the value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,code``. One request at a time. A value
-has eight characters: a sign and seven digits with their point, or one of three texts that stand for no value. The text
-does not say whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
+has eight characters: a sign and seven digits with their point, or one of three texts that mean no value. The text
+does not state whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
 
 Formats, modes and error codes are those of the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6). Facts marked (m) are
 from memory; each is one line to correct.
@@ -25,7 +25,7 @@ ERROR = "ER"
 WIDTH = 8  # characters of a value
 NO_VALUE, OVER, UNDER = "XXXXXXXX", "+FFFFFFF", "-FFFFFFF"
 
-#: Why a reading has no value. The place in this list is its code; 0 = it has one.
+#: Why a reading has no value. The position in this list is its code; 0 = it has one.
 REASONS: tuple[str, ...] = ("", "no value", "over range", "under range", "garbled")
 ABSENT, ABOVE, BELOW, GARBLED = range(1, 5)
 _TEXTS: Mapping[str, int] = {NO_VALUE: ABSENT, OVER: ABOVE, UNDER: BELOW}
@@ -39,14 +39,14 @@ ERRORS: Mapping[str, str] = {
     LENGTH_ERROR: "wrong length of the command",
     COUNT_ERROR: "wrong number of parameters",
     PARAMETER_ERROR: "a parameter out of its range; has it the output that the settings name?",
-    TIMEOUT_ERROR: "it ran into its own time limit; ask again",
+    TIMEOUT_ERROR: "it ran into its own time limit; retry",
     OTHER_ERROR: "another error; see its display",
 }
 
 
 @dataclass(frozen=True)
 class Controller:
-    """A generation of controllers: how a value is asked for, and how its outputs are numbered."""
+    """A generation of controllers: how a value is requested, and how its outputs are numbered."""
 
     measure: str
     output: str
@@ -58,7 +58,7 @@ class Controller:
         return self.measure + self.output.format(output)
 
     def zero_off_request(self, output: int) -> str:
-        """Return the request that takes a zero back which somebody has set on the panel."""
+        """Return the request that takes a zero back that was set on the panel."""
         return self.zero_off + self.output.format(output)
 
 
@@ -99,7 +99,7 @@ DISPLAYS: Mapping[str, Display] = {
     "0.001 um": Display(6, 3, 1e-6),  # LK-G5000 only
 }
 
-DISPLAY_SETTING = "OI"  # (m) by its place in the list of settings
+DISPLAY_SETTING = "OI"  # (m) by its position in the list of settings
 OFFSET_SETTING = "OF"
 NO_OFFSET = "+000000"
 
@@ -143,16 +143,16 @@ def decode(line: bytes) -> str:
 
 
 def parse_answer(request: str, text: str, header: str | None = None) -> str:
-    """Return what an answer says behind its header; empty where it says no more.
+    """Return what an answer states behind its header; empty where it states no more.
 
     Parameters
     ----------
     request : str
-        What was asked.
+        The request.
     text : str
         The answer without its end.
     header : str, optional
-        With what the answer begins; default: the request.
+        Start of the answer; default: the request.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
     if text == expected:
         return ""
     if not text.startswith(f"{expected},"):
-        raise ProtocolError(f"'{request}': expected an answer that begins with '{expected}'; found '{text}'")
+        raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{text}'")
     return text[len(expected) + 1 :]
 
 
@@ -185,7 +185,7 @@ def error_code(request: str, text: str) -> str | None:
 
 
 def parse_value(text: str, display: Display) -> tuple[float, int]:
-    """Return a value in m, and the place in `REASONS` of why it is NaN.
+    """Return a value in m, and the position in `REASONS` of why it is NaN.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def parse_value(text: str, display: Display) -> tuple[float, int]:
         return float("nan"), GARBLED
     if len(number[1]) != display.decimals:
         raise ProtocolError(
-            f"Expected a value with {display.decimals} decimals, as the settings say; found '{text}'. Make the setting "
+            f"Expected a value with {display.decimals} decimals, as in the settings; found '{text}'. Make the setting "
             "'display' and the smallest displayed unit of the controller the same"
         )
     return float(text) * display.unit, 0
@@ -228,6 +228,6 @@ def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
     needed = rate * (request + answer) * BITS_PER_BYTE
     if needed > baudrate:
         raise InstrumentError(
-            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes to ask and {answer} "
+            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes to query and {answer} "
             f"to answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
         )

@@ -1,9 +1,9 @@
-"""What an optoNCDT says: bytes to values and back. Facts marked (m) are from memory; each is one line to correct.
+"""Protocol of the optoNCDT: bytes to values and back. Facts marked (m) are from memory; each is one line to correct.
 
 A value has 18 bits and travels as three bytes, tagged in their upper bits: ``L = 00 D5..D0``, ``M = 01 D11..D6``,
 ``H = 10 D17..D12``. With more than one value a sample, those behind the first have ``H = 11 D17..D12`` (m). Distances
 use 16 bits, error codes lie above. Answers to commands are ASCII text between the values and end with ``->``; no
-character of a text has the top bit that every ``H`` has, so the two can always be told apart.
+character of a text has the top bit that every ``H`` has, so the two can always be distinguished.
 
 The bulk of the work is done by the compiled functions of `kernels`; this module holds the facts and the small cases.
 """
@@ -22,7 +22,7 @@ LINE_END = b"\r\n"
 SCALE = 1.02 / 65520  # x = (raw * SCALE - OFFSET) * range, from the start of the range
 OFFSET = 0.01
 LOWEST, HIGHEST = 643, 64876  # the measuring range
-LARGEST_DISTANCE = 65535
+MAX_DISTANCE_CODE = 65535
 COUNTER_BITS = 18
 BITS_PER_BYTE = 10  # 8N1
 BYTES_PER_VALUE = 3
@@ -41,7 +41,7 @@ ERROR_CODES: Mapping[int, str] = {
 }
 NO_PEAK, BEFORE_RANGE, AFTER_RANGE = 262076, 262077, 262078
 
-# Why a sample has no value. The place in this list is the code that the compiled functions use; 0 = it has one.
+# Why a sample has no value. The position in this list is the code that the compiled functions use; 0 = it has one.
 REASONS: tuple[str, ...] = (
     "",
     "lost",
@@ -95,7 +95,7 @@ def reason(raw: int) -> str:
     """Return why a raw value is no distance inside the measuring range; empty where it is one."""
     if raw in ERROR_CODES:
         return ERROR_CODES[raw]
-    if raw > LARGEST_DISTANCE:
+    if raw > MAX_DISTANCE_CODE:
         return REASONS[UNKNOWN]
     if raw < LOWEST:
         return REASONS[BELOW]

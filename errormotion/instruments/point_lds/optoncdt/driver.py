@@ -98,7 +98,7 @@ class OptoNCDT(Driver):
         return 0 if self._reader is None else self._reader.stray_bytes
 
     def identify(self) -> Identity:
-        """Ask the sensor who it is (GETINFO)."""
+        """Request the identity of the sensor (GETINFO)."""
         facts = self._facts()
         facts.pop(ON_FOR, None)
         return Identity(
@@ -115,7 +115,7 @@ class OptoNCDT(Driver):
         return {key.strip().lower(): value.strip() for key, mark, value in parts if mark}
 
     def on_for(self) -> float:
-        """Return for how long the sensor says that it has been on, s; 0 where it does not say."""
+        """Return for how long the sensor states that it has been on, s; 0 where it does not state."""
         stated = re.match(r"([\d.]+)", self._facts().get(ON_FOR, ""))
         return float(stated[1]) if stated else 0.0
 
@@ -151,7 +151,7 @@ class OptoNCDT(Driver):
         request = text.encode("ascii") + LINE_END
         timeout = self.settings.timeout
         if self._reader is not None:
-            return parse_reply(text, self._reader.ask(request, timeout))
+            return parse_reply(text, self._reader.query(request, timeout))
         self.transport.write(request)
         return parse_reply(text, text_of(self.transport.read_until(PROMPT, limit=1 << 24, timeout=timeout)))
 
@@ -177,7 +177,7 @@ class OptoNCDT(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         ProtocolError
             The counter makes no sense.
         """
@@ -217,7 +217,7 @@ class OptoNCDT(Driver):
             raise
 
     def fill(self, values: Array, reasons: Array) -> None:
-        """Fill both arrays with the next samples: distances in m, and places in `codec.REASONS`."""
+        """Fill both arrays with the next samples: distances in m, and positions in `codec.REASONS`."""
         if self._reader is None:
             raise InstrumentError(f"{self.name}: no stream is running; call start() first")
         self._reader.fill(values, reasons, self.settings.timeout)
@@ -235,7 +235,7 @@ class OptoNCDT(Driver):
     def stop(self, timeout: float | None = None) -> None:
         """Stop the stream and its thread; idempotent.
 
-        A sensor that does not confirm it within ``timeout`` s is no error here (``fill`` has told it, or will tell it
+        A sensor that does not confirm it within ``timeout`` s is no error here (``fill`` reports it, now or
         at the next start), but it has to be opened again.
         """
         reader, self._reader = self._reader, None
@@ -257,12 +257,12 @@ class OptoNCDT(Driver):
             baudrate=baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._lost = None
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
         self.configure(self.settings)
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         self.stop()
 
     def _abandon(self) -> None:
@@ -278,11 +278,11 @@ class OptoNCDT(Driver):
         identity = self.identify()
         if settings.model not in identity.model.replace(" ", ""):
             raise InstrumentError(
-                f"The settings say model {settings.model}; at {self.address} answers a '{identity.model}'"
+                f"The settings state model {settings.model}; at {self.address} answers a '{identity.model}'"
             )
         stated = re.match(r"([\d.]+)\s*mm", str(identity.details.get("range", "")))
         if stated and not np.isclose(float(stated[1]) * 1e-3, settings.range):
             raise InstrumentError(
-                f"The settings say a range of {settings.range * 1e3:g} mm; the sensor at {self.address} "
+                f"The settings state a range of {settings.range * 1e3:g} mm; the sensor at {self.address} "
                 f"has {stated[1]} mm"
             )

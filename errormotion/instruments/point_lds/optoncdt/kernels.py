@@ -17,9 +17,9 @@ from errormotion.instruments.point_lds.optoncdt.codec import (
     FIRST_ERROR_REASON,
     GARBLED,
     HIGHEST,
-    LARGEST_DISTANCE,
     LOST,
     LOWEST,
+    MAX_DISTANCE_CODE,
     NO_PEAK,
     OFFSET,
     SCALE,
@@ -34,7 +34,7 @@ SUSPECT = 1 << 19  # bytes were discarded right before it: its first byte may be
 GARBLED_RAW = -1
 LAST_ERROR_CODE = max(ERROR_CODES)
 
-# Places in the state of `assemble`.
+# Positions in the state of `assemble`.
 NUMBER, PENDING, HAS_PENDING, JUMP_RAW, JUMP_AHEAD, HAS_JUMP, ORPHANS, ANCHORED, BASE, DOUBT = range(10)
 STATE_SIZE = 10
 
@@ -56,7 +56,7 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
     Returns
     -------
     consumed : int
-        Bytes used; up to two at the end may be the begin of a value and have to come again with the next ones.
+        Bytes used; up to two at the end may be the start of a value and have to come again with the next ones.
     n_values, n_text : int
     after_text : bool
         For the next call.
@@ -180,13 +180,13 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
     raws, numbers : ndarray
         From `assemble`.
     first : int
-        Number of the first place of ``distances``.
+        Number of the first position of ``distances``.
     measuring_range : float
         Unit of the result.
     distances : ndarray, float64
         Receives distances from the start of the range, NaN where there is none.
     reasons : ndarray, uint8
-        Receives the place in `codec.REASONS` of why not; 0 where there is a distance.
+        Receives the position in `codec.REASONS` of why not; 0 where there is a distance.
     """
     slope, offset = SCALE * measuring_range, OFFSET * measuring_range
     place = 0
@@ -204,7 +204,7 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
                 reasons[place] = GARBLED
             elif raw < LOWEST:
                 reasons[place] = BELOW
-            elif raw <= LARGEST_DISTANCE:
+            elif raw <= MAX_DISTANCE_CODE:
                 reasons[place] = ABOVE
             elif FIRST_ERROR_CODE <= raw <= LAST_ERROR_CODE:
                 reasons[place] = FIRST_ERROR_REASON + raw - FIRST_ERROR_CODE

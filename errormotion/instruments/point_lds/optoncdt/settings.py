@@ -27,7 +27,7 @@ class SensorSettings(PluginSettings):
         description="of a serial line, also behind a serial server; default: 921600 on a line, none on TCP",
     )
     noise: Length = Field(default=0.3e-6, description="standard deviation of a single sample", ge=0)
-    timeout: Time = Field(default=1.0, description="time limit of silence", gt=0)
+    timeout: Time = Field(default=1.0, description="time limit without data", gt=0)
 
     @model_validator(mode="after")
     def _fits_the_model(self) -> Self:

@@ -1,6 +1,6 @@
 """A virtual machine under the real LinuxCNC: its bridge hears the driver, its probe sees what the twin has.
 
-The device sits between the driver and the bridge. Before each order it tells HAL where the balls are now: where they
+The device sits between the driver and the bridge. Before each order it sets in HAL where the balls are now: where they
 stand less the error of the tip there, so that the machine trips in its servo thread where the twin would have it trip.
 The world's clock goes on with the real time that the machine moves, and jumps with ``elapse``.
 
@@ -30,10 +30,10 @@ from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address, Transport, open_transport
 
 LINGER = 10.0  # s
-WAIT = 90.0  # s
-FIRST = 5.0  # s that LinuxCNC waits for its first driver, at least
+START_TIMEOUT = 90.0  # s
+LEAST_IDLE = 5.0  # s that LinuxCNC waits for its first driver, at least
 OWN = "simulator"
-"""What the numbers of requests begin with that the driver knows nothing of."""
+"""What the numbers of requests start with that the driver knows nothing of."""
 ANSWER = 10.0  # s
 GLANCE = 0.1  # s between two looks whether the device is still wanted
 
@@ -56,7 +56,7 @@ class Control:
 
     def _started(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
-        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, FIRST):g} --pins {PINS}"
+        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, LEAST_IDLE):g} --pins {PINS}"
         ini = ini_text(
             self.world.name,
             machine.travel,
@@ -66,10 +66,10 @@ class Control:
             inch=self.inch,
         )
         files = {"linuxcnc.ini": ini, "balls.hal": hal_text(len(self.world.balls))}
-        return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", WAIT))
+        return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", START_TIMEOUT))
 
     def join(self, world: VirtualWorld) -> None:
-        """Count a device in, and begin anew with another world."""
+        """Count a device in, and start again with another world."""
         with self.lock:
             self.users += 1
             if self.world is not world:
@@ -103,7 +103,7 @@ class Control:
     def balls_for(self, start: list[float], target: list[float] | None, feed: float | None) -> dict[str, float]:
         """Return the pins that put the balls where they are now.
 
-        On the way from the start to the target the probe trips where the twin says, its scatter and the lobes of its
+        On the way from the start to the target the probe trips where the twin states, its scatter and the lobes of its
         pre-travel included; elsewhere with its mean pre-travel.
         """
         world, now = self.world, self.world.time
@@ -167,7 +167,7 @@ def end() -> None:
 
 
 class SimulatedLinuxCNC(SimulatedDevice):
-    """Hands over what the driver and the bridge of a real LinuxCNC say to one another."""
+    """Passes messages between the driver and the bridge of a real LinuxCNC."""
 
     faults = ("silence", "split", "garbage", "drop", "disconnect")
 
@@ -219,7 +219,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
                 request = json.loads(line)
                 number, op = request["id"], request["op"]
             except (ValueError, KeyError, TypeError):
-                self._forward_line(line + b"\n")  # the bridge says what is wrong with it
+                self._forward_line(line + b"\n")  # the bridge states what is wrong with it
                 continue
             self._asked[number] = op
             if op in ("elapse", "move_to", "probe", "run_program"):
@@ -258,7 +258,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             target = request.get("target") if op == "probe" else None
             pins = self._control.balls_for(start, target, request.get("feed"))
         except (ValueError, TypeError, ArithmeticError):
-            return  # no place, no feed: the bridge says so
+            return  # no position, no feed: the bridge states so
         self._forward({"id": OWN, "op": "set_pins", "pins": pins})
 
     def _forward(self, request: Message) -> None:
@@ -271,7 +271,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
     # ------------------------------------------------------------------ from the bridge
 
     def _make_ready(self) -> None:
-        """Leave e-stop, switch on, home, and have the spindle stand, before the driver comes."""
+        """Leave e-stop, switch on, home, and have the spindle at rest, before the driver comes."""
         self._wait_for("reset")
         self._wait_for("enable")
         if not self._wait_for("state")["homed"]:
@@ -296,7 +296,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             except InstrumentTimeoutError:
                 continue
             except InstrumentError:
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             *lines, buffer = buffer.split(b"\n")
             for line in lines:

@@ -126,7 +126,7 @@ def ini_text(
 
 
 def hal_text(balls: int) -> str:
-    """Return a HAL file with a probe that trips on any of so many balls, all of them far away to begin with."""
+    """Return a HAL file with a probe that trips on any of so many balls, all of them far away to start with."""
     names = [f"{PINS}{i}" for i in range(balls)]
     sums = ",".join(f"{name}.{axis}" for name in names for axis in "xyz")
     lines = [

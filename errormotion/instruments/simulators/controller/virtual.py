@@ -1,4 +1,4 @@
-"""The controller of the virtual machine: what it is told, it does to the world."""
+"""The controller of the virtual machine: what executes its commands in the world."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ MACHINE_FAULTS = ("alarm", "estop", "no_trip", "tripped")
 class SimulatedController(SimulatedDevice):
     """Answers requests in JSON lines.
 
-    Further parameters of the address: ``balls`` (how many stand on the table; 4), and of faults, counted in requests:
-    ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or somebody presses the emergency
+    Further parameters of the address: ``balls`` (how many are on the table; 4), and of faults, counted in requests:
+    ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or emergency
     stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or for good, the probe never trips, or
     is stuck).
     """

@@ -18,11 +18,11 @@ from errormotion.instruments.simulators.virtual_world.tracker_scene import Track
 from errormotion.instruments.transports import Address
 
 POINTS_A_PACKET = 20
-CLOCK = 1000  # s, of the tracker when a stream begins
+CLOCK = 1000  # s, of the tracker when a stream starts
 LENGTHS = {0: 1.0, 1: 1e3, 2: 1e6}  # units a metre
 REFLECTORS = (("RRR 1.5in", 5, 19.05e-3), ("RRR 0.5in", 6, 6.35e-3), ("Cat's eye", 2, 0.0))
 MODELS = {"AT901": (14, "AT901-MR", 80.0), "AT4xx": (72, "AT402", 160.0)}
-NEST = (0.0, math.pi / 2, 0.3)  # direction (rad) and distance (m) of the place at the tracker for a reflector
+NEST = (0.0, math.pi / 2, 0.3)  # direction (rad) and distance (m) of the position at the tracker for a reflector
 CARRIED = 5e-3  # m, one sigma: how well people put a tracker where they are asked to
 BEAM_ERROR = 201  # (m): a number of the tracker processor
 
@@ -37,7 +37,7 @@ class SimulatedEmScon(SimulatedDevice):
 
     Between the answers come status changes, levels and reflector positions, as from the real one.
 
-    Faults beyond the menu, from ``fault_at`` on, ``fault_for`` times (for ever): ``busy`` (answers), ``beam_broken``
+    Faults beyond the menu, from ``fault_at`` on, ``fault_for`` times (without end): ``busy`` (answers), ``beam_broken``
     (points, measurements and motions), ``refuse`` and ``error`` (answers; ``code`` is their status).
     """
 
@@ -85,14 +85,14 @@ class SimulatedEmScon(SimulatedDevice):
         super().close()
         self._end_stream()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Let the world's clock follow the reader, unless others drive it."""
         now = self._begin + samples * self._milliseconds / 1000.0
         if not self.world.streaming and now > self.world.time:
             self.world.elapse(now - self.world.time)
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put the tracker near a place in machine coordinates, m, as people do; it counts from a new beginning."""
+        """Put the tracker near a position in machine coordinates, m, as people do; it counts from a new start."""
         self.scene.station = np.array(position, dtype=float) + CARRIED * self._rng.normal(size=3)
         self._broken = self._nested = False
         self.dead_path = self._new_dead_path()
@@ -103,9 +103,9 @@ class SimulatedEmScon(SimulatedDevice):
         self._buffer += data
         while len(self._buffer) >= codec.HEADER.size + 4:
             size, _ = codec.HEADER.unpack_from(self._buffer)
-            if not codec.HEADER.size + 4 <= size <= codec.LARGEST:
+            if not codec.HEADER.size + 4 <= size <= codec.MAX_PACKET_BYTES:
                 self._buffer = b""
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             if len(self._buffer) < size:
                 return
@@ -116,7 +116,7 @@ class SimulatedEmScon(SimulatedDevice):
                 self._start_stream()
 
     def answer(self, request: bytes) -> bytes:
-        """Return the answer to one command, with what comes unasked before and behind it."""
+        """Return the answer to one command, with what comes unrequested before and behind it."""
         try:
             number, values = codec.decode_command(request)
         except ProtocolError:
@@ -249,7 +249,7 @@ class SimulatedEmScon(SimulatedDevice):
         return drawn if math.isnan(self._given_dead_path) else self._given_dead_path
 
     def _try_beam(self) -> bytes:
-        """Count one use of the beam; return what the server says where that breaks it or brings it back."""
+        """Count one use of the beam; return what the server states where that breaks it or brings it back."""
         broken = self.fault.kind == "beam_broken" and self._hits(self._tries)
         self._tries += 1
         if broken and not self._broken:
@@ -302,7 +302,7 @@ class SimulatedEmScon(SimulatedDevice):
         return self._moved(codec.GO_POSITION, before, found=self._near(val1, val2, val3))
 
     def _near(self, azimuth: float, zenith: float, distance: float) -> bool:
-        """Whether the reflector is within the search radius of a place; it is taken out of the nest for that."""
+        """Whether the reflector is within the search radius of a position; it is taken out of the nest for that."""
         self._nested = False
         wanted = cartesian(azimuth, zenith, distance / self._length)
         there = cartesian(*self.scene.seen(np.array([self.world.time]))[0])
@@ -395,7 +395,7 @@ class SimulatedEmScon(SimulatedDevice):
                     if not all(map(self._server.send, self.fault.pieces(packet))):
                         return
             if self.fault.kind == "disconnect" and first + POINTS_A_PACKET > self.fault.at:
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             if self.world.pace:
                 ahead = (first + POINTS_A_PACKET) * self._milliseconds / 1000.0 / self.world.pace

@@ -34,7 +34,7 @@ class GantryProfiles:
 
     A trigger by command takes one profile where the axis is, at the time of the last profile.
 
-    At a pace the world's time goes on while a program that was begun brings no profile, as that of a real machine;
+    At a pace the world's time goes on while a program that was started brings no profile, as that of a real machine;
     who gives up meanwhile and streams again later has missed nothing but the rest.
 
     Parameters
@@ -74,13 +74,13 @@ class GantryProfiles:
         self._rested = 0.0  # time up to which nothing came, at a pace
         self._triggers = threading.Semaphore(0)
         self._by_command = 0  # profiles that were triggered so
-        trial = Profiler(8, 1e-4, disturbances=self._disturbances)  # compiled before anybody waits for it
+        trial = Profiler(8, 1e-4, disturbances=self._disturbances)  # compiled ahead of the first reading
         for target in self._table.targets[:1]:
             self._table.scan(target, trial, np.zeros(2), np.array([[0.0, 0.0, 0.0], [0.0, 1e-4, 0.0]]), (0,))
 
     @property
     def seen(self) -> float:
-        """Time of the last profile that the reader has handed over, s, or up to which none came."""
+        """Time of the last profile that the reader has passed on, s, or up to which none came."""
         return max(self._times[self._taken - 1] if self._taken else self._began, self._rested)
 
     def count(self) -> int:
@@ -95,14 +95,14 @@ class GantryProfiles:
         self._times, self._taken = [], 0
         self._began = self._rested = self._world.time
         self._triggers = threading.Semaphore(0)
-        self._world.begin_triggered(self)
+        self._world.start_triggered(self)
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
         self._taken = min(profiles, len(self._times))
 
     def end(self) -> None:
-        """Let the world's clock stand where the reader is."""
+        """Let the world's clock stop where the reader is."""
         self._world.end_triggered(self)
 
     def trigger(self) -> None:
@@ -110,7 +110,7 @@ class GantryProfiles:
         self._triggers.release()
 
     def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
-        """Yield the profiles of what the machine runs, and of what it will be told to run."""
+        """Yield the profiles of what the machine runs, and of what it will be commanded to run."""
         after = self._began
         path = None
         while True:

@@ -26,9 +26,9 @@ from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import TcpServer
 
 NO_HEIGHT = -(1 << 19) + 1  # raw 0x80001, invalid
-CONNECTING = 0.2  # s
+CONNECTION_TIMEOUT = 0.2  # s
 BATCH = 16  # profiles sent at once when running freely
-IDLE = 0.01  # s from look to look whether a profile is due
+POLL_INTERVAL = 0.01  # s from look to look whether a profile is due
 TEMPERATURES = (3512, 4108, 2967)  # hundredths of a degC
 WRONG_START, NOT_PREPARED, NO_CONNECTION, NOT_NOW = 0xA3, 0xA1, 0xA0, 0x80
 UNKNOWN_REQUEST, WRONG_ARGUMENT = 0x41, 0x42  # (m)
@@ -49,7 +49,7 @@ class SimulatedLJX(SimulatedDevice):
     ----------
     address : Address
     source : ProfileSource, optional
-        The surface, in place of the one that the address names.
+        The surface, instead of the one that the address names.
     """
 
     faults = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect")
@@ -61,7 +61,7 @@ class SimulatedLJX(SimulatedDevice):
         artefact = address.params.get("artefact", "twin" if address.host == "gantry" else "swept")
         if source is None and artefact != "twin":
             source = make_source(artefact, int(address.number("seed", 0)))
-        self._points = int(address.number("points", codec.MOST_POINTS))
+        self._points = int(address.number("points", codec.MAX_POINTS))
         self._kind = INTENSITY if address.number("intensity", 0) else 0
         self._trigger_start = int(address.number("trigger_start", 0))
         self._notice_delay = address.number("notice_delay", 0.0)
@@ -76,7 +76,7 @@ class SimulatedLJX(SimulatedDevice):
         self._starting = threading.Lock()
         self._ended = threading.Event()
         self._mute = False
-        kernels.pack(  # compiled before anybody waits for it
+        kernels.pack(  # compiled ahead of the first reading
             np.zeros(8, dtype=np.int32), np.zeros(0, dtype=np.uint16), 0, 0, np.zeros(12, dtype=np.uint32)
         )
         super().__init__(address, line_end=b"", default_name="profiler", every=20)
@@ -109,15 +109,15 @@ class SimulatedLJX(SimulatedDevice):
     def close(self) -> None:
         """End the device."""
         self._ended.set()
-        self._data.hang_up()
+        self._data.disconnect()
         self._join()
         self._data.close()
         super().close()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take note of how many profiles of the running stream its reader has had."""
         self._taken = samples
-        self._feed.handed_over(samples)
+        self._feed.report_delivered(samples)
 
     # ------------------------------------------------------------------ requests
 
@@ -199,7 +199,7 @@ class SimulatedLJX(SimulatedDevice):
             return NOT_PREPARED
         if start_code != layout.start_code:
             return WRONG_START
-        if not self._data.await_connection(CONNECTING):
+        if not self._data.await_connection(CONNECTION_TIMEOUT):
             return NO_CONNECTION
         self._join()
         self._sent = self._taken = 0
@@ -230,7 +230,7 @@ class SimulatedLJX(SimulatedDevice):
         return (self._trigger_start + number) % (1 << 32)
 
     def _run(self, layout: StreamLayout) -> None:
-        """Send profiles until told to stop, then the notice."""
+        """Send profiles until it is stopped, then the notice."""
         try:
             if self._send_all(layout):
                 time.sleep(self._notice_delay)
@@ -239,10 +239,10 @@ class SimulatedLJX(SimulatedDevice):
             self._feed.end()
 
     def _send_all(self, layout: StreamLayout) -> bool:
-        """Send profiles until told to stop; False where the stream breaks down."""
+        """Send profiles until it is stopped; False where the stream breaks down."""
         for lines in self._feed.lines(layout):
             if lines is None:
-                self._ended.wait(IDLE)
+                self._ended.wait(POLL_INTERVAL)
             if self._ended.is_set():
                 break
             if lines is None:
@@ -260,8 +260,8 @@ class SimulatedLJX(SimulatedDevice):
         if self.fault.kind == "silence":
             self._mute = True
         else:
-            self._data.hang_up()
-            self._server.hang_up()
+            self._data.disconnect()
+            self._server.disconnect()
 
     def _encoded(self, layout: StreamLayout, lines: Lines) -> bytes:
         """Return the next profiles as bytes, with whatever fault is due."""

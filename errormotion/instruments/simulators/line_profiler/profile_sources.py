@@ -1,7 +1,7 @@
 """What lies before a simulated line profiler, and when it takes a profile of it.
 
-A `Feed` tells the profiles of a stream one after another. A `FreeRunning` one takes them at a rate from a surface:
-anything that tells the heights along its line. The feed of a machine's axis is in `gantry_profiles`.
+A `Feed` yields the profiles of a stream one after another. A `FreeRunning` one takes them at a rate from a surface:
+anything that returns the heights along its line. The feed of a machine's axis is in `gantry_profiles`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Feed(Protocol):
         """Return what the encoder shows now."""
 
     def begin(self) -> None:
-        """Begin a stream; InstrumentError where that cannot be now."""
+        """Start a stream; InstrumentError where that cannot be now."""
 
     def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
         """Yield the profiles of a stream when they are due; None where nothing is to come for now."""
@@ -53,7 +53,7 @@ class Feed(Protocol):
     def trigger(self) -> None:
         """Have one profile taken now, where nothing else takes them; called while a stream runs."""
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
 
     def end(self) -> None:
@@ -66,7 +66,7 @@ class Clock:
     Parameters
     ----------
     pace : callable
-        Returns simulated seconds per second; None where nobody waits for real time.
+        Returns simulated seconds per second; None where real time is not waited for.
     begin : float
         Simulated time now, s.
     """
@@ -162,7 +162,7 @@ class FreeRunning:
     def trigger(self) -> None:
         """Do nothing: profiles come anyhow."""
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
         self._taken = profiles
 
@@ -173,7 +173,7 @@ class FreeRunning:
 class SweptSurface:
     """A smooth free-form surface, 1 mm high, that the feed moves through the line.
 
-    The same heights, noise included, whenever it is asked for the same encoder count.
+    The same heights, noise included, whenever the same encoder count is requested.
 
     Parameters
     ----------

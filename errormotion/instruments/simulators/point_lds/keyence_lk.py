@@ -33,7 +33,7 @@ from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.transports import Address
 
 STILL = 1.2345e-3
-"""What a head reads that has no place on the machine, m."""
+"""What a head reads that has no position on the machine, m."""
 
 
 class SimulatedKeyenceLK(SimulatedDevice):

@@ -46,7 +46,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._mute = False
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self._mute = self.fault.from_the_start
-        kernels.quantise(np.zeros(1), 1.0, np.zeros(1, dtype=np.int32))  # compiled before anybody waits for it
+        kernels.quantise(np.zeros(1), 1.0, np.zeros(1, dtype=np.int32))  # compiled ahead of the first reading
         kernels.encode(np.zeros(1, dtype=np.int32), 0, True, np.zeros(6, dtype=np.uint8))
         self._model = address.params.get("model", "ILD2300")
         own_range = self.world.machine.frame.range * 1e3 if self._model == "ILD2300" else 10.0
@@ -57,7 +57,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._stop()
         super().close()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take note of how many samples of the running stream its reader has had."""
         stream = self._stream
         if stream is not None:
@@ -131,20 +131,20 @@ class SimulatedOptoNCDT(SimulatedDevice):
         return ""
 
     def _stop(self) -> None:
-        self._silent()  # a sensor that fell silent does not speak again when it is told to stop
+        self._silent()  # a sensor that stopped answering sends nothing more on the command to stop
         stream, self._stream = self._stream, None
         if stream is not None:
             stream.ended = True
             self.world.end_stream(stream)
 
     def reply(self, data: bytes) -> None:
-        """Send an answer; a stream that was just switched on begins behind it.
+        """Send an answer; a stream that was just switched on starts behind it.
 
         It is known to the world before the answer is out: the next thing to come may be its master's start.
         """
         with self._server.lock:  # no sample passes before the answer
             if self._starting and self._stream is not None:
-                self.world.begin_stream(self._stream)
+                self.world.start_stream(self._stream)
             self._starting = False
             super().reply(data)
 
@@ -214,7 +214,7 @@ class SensorStream:
             self.sent += size
             heard = all(self._server.send(piece) for piece in self._fault.pieces(data))
         if self._fault.kind == "disconnect" and self.sent > self._fault.at:
-            self._server.hang_up()
+            self._server.disconnect()
             self.ended = True
         self.ended = self.ended or not heard
 

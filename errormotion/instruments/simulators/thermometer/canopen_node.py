@@ -93,7 +93,7 @@ class SimulatedCanopen:
             server.close()
         self.world.detach(self)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take no note: a node does not stream."""
 
     def _value(self, index: int, subindex: int) -> Any:
@@ -126,14 +126,14 @@ class SimulatedCanopen:
         return (self._inputs.temperatures(self.world.time, self._rng)[channel] - offset) / scale
 
     def _outgoing(self, data: bytes) -> bytes | None:
-        """Return an SDO answer as it goes out, or None for silence."""
+        """Return an SDO answer as it goes out, None without an answer."""
         number, server = self._answers, self._server
         if server is None:
             return data
         if self._away.begins(number):
             if self.fault.kind == "bus_off":
                 server.send_bus_off()
-            server.fall_silent()
+            server.stop_heartbeat()
         if self._away.now():
             return None
         if self._away.returns():

@@ -17,7 +17,7 @@ from errormotion.instruments.transports.modbus.serving import ModbusServer
 
 FAILURE = 4  # Modbus exception: server device failure
 _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order", "scale", "offset", "open_from")
-_PLACE_OF_UNIT = {"tcp": 6, "rtu": 0}  # place of the unit in a frame
+_UNIT_POSITION = {"tcp": 6, "rtu": 0}  # position of the unit in a frame
 
 
 class SimulatedModbus(SimulatedDevice):
@@ -68,7 +68,7 @@ class SimulatedModbus(SimulatedDevice):
         if self.fault.hits("checksum", self._answers):
             data = data[:-1] + bytes((data[-1] ^ 1,))
         elif self.fault.hits("unit", self._answers):
-            place = _PLACE_OF_UNIT[self._framing]
+            place = _UNIT_POSITION[self._framing]
             data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
             if self._framing == "rtu":
                 data = data[:-2] + crc16(data[:-2])
@@ -80,7 +80,7 @@ class SimulatedModbus(SimulatedDevice):
         if self._unplugging.keeps_from(self._answers, self._server):
             return
         if self._device is not None:
-            self._device.ask(data)
+            self._device.handle_request(data)
 
     def _blocks(self) -> dict[int, int]:
         """Return the registers that the device has: those of its channels, and what lies between."""

@@ -60,13 +60,13 @@ def _numbers(address: Address, key: str, n: int) -> frozenset[int]:
 class Unplugging:
     """``fault=unplugged``: from answer ``fault_at`` on the thermometer is without power for ``unplugged_for`` seconds.
 
-    Meanwhile it is silent; without ``unplugged_for`` it stays away.
+    Meanwhile it does not answer; without ``unplugged_for`` it stays away.
 
     Parameters
     ----------
     address : Address
     kinds : sequence of str
-        Faults that begin and end so.
+        Faults that start and end so.
     """
 
     def __init__(self, address: Address, kinds: Sequence[str] = ("unplugged",)) -> None:
@@ -76,7 +76,7 @@ class Unplugging:
         self._since = math.nan
 
     def begins(self, answers: int) -> bool:
-        """Whether it begins now, when ``answers`` have been given; True only once."""
+        """Whether it starts now, when ``answers`` have been given; True only once."""
         if not self._wanted or answers < self._at:
             return False
         self._wanted, self._since = False, time.monotonic()
@@ -87,7 +87,7 @@ class Unplugging:
         return time.monotonic() < self._since + self._length
 
     def returns(self) -> bool:
-        """Whether it is back since it was asked last; True only once."""
+        """Whether it is back since it was queried last; True only once."""
         if self._since != self._since or self.now():
             return False
         self._since = math.nan
@@ -99,6 +99,6 @@ class Unplugging:
         if self.now():
             return True
         if self.returns() and isinstance(server, TcpServer):
-            server.hang_up()
+            server.disconnect()
             return True
         return False

@@ -14,11 +14,11 @@ from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
 from errormotion.instruments.transports import Address
 
-_LOOK = 0.005  # s of real time between two looks at the clock
+_POLL_INTERVAL = 0.005  # s of real time between two looks at the clock
 
 
 class SimulatedPrinter(SimulatedDevice):
-    """Sends the lines of NC programs; hears nothing."""
+    """Sends the lines of NC programs; receives nothing."""
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", "duplicate")
 
@@ -39,12 +39,12 @@ class SimulatedPrinter(SimulatedDevice):
             self._thread.join()
         super().close()
 
-    def answer(self, request: bytes) -> bytes:  # noqa: ARG002 - a printer hears nothing
+    def answer(self, request: bytes) -> bytes:  # noqa: ARG002 - a printer receives nothing
         """Return nothing."""
         return b""
 
     def _watch(self) -> None:
-        while not self._ended.wait(_LOOK):
+        while not self._ended.wait(_POLL_INTERVAL):
             now = self.world.time
             for each in list(self.world.printed):
                 if each[0] <= now and id(each) not in self._sent:
@@ -57,7 +57,7 @@ class SimulatedPrinter(SimulatedDevice):
         if (fault.kind == "silence" and number >= fault.at) or fault.hits("drop", number):
             return
         if fault.kind == "disconnect" and number >= fault.at:
-            self._server.hang_up()
+            self._server.disconnect()
             return
         line = text.encode("ascii", errors="replace") + b"\r\n"
         if fault.hits("garbage", number):

@@ -1,10 +1,10 @@
 """The clock of a virtual world, and the thread that makes the samples of all channels in lockstep.
 
 The clock advances only while samples stream, evenly spaced or wherever a moving axis triggers them, or when it is set;
-unless it is asked to tick, for those who watch a machine that nobody orders about.
-Nobody waits for real time unless a pace is asked for: a block of samples is made for every streaming channel, then
+unless it is set to tick, for a monitor of a machine that receives no orders.
+Real time is waited for only where a pace is given: a block of samples is made for every streaming channel, then
 sent, and sending waits for the readers. The time of the world is that of the last sample that its readers have handed
-over, so that what else is asked (a temperature) belongs to it, although the samples under way are further on; and when
+over, so that other readings (a temperature) belong to it, although the samples under way are further on; and when
 the streams end, the world goes on from there.
 """
 
@@ -36,7 +36,7 @@ class SampleClock:
     pace : float or None
         Simulated seconds per second; None = as fast as the readers.
     ticking : float or None
-        Simulated seconds per second by which time goes on while nothing streams; None = it stands still.
+        Simulated seconds per second by which time goes on while nothing streams; None = it does not advance.
     """
 
     name: str
@@ -111,8 +111,8 @@ class SampleClock:
 
     # ------------------------------------------------------------------ who streams
 
-    def begin_stream(self, stream: Stream) -> None:
-        """Begin to make samples: at once, for a slave when its master begins, for a master with all its slaves."""
+    def start_stream(self, stream: Stream) -> None:
+        """Start making samples: at once, for a slave when its master starts, for a master with all its slaves."""
         with self._change:
             if stream.sync == "SLAVE":
                 self._armed.append(stream)
@@ -145,7 +145,7 @@ class SampleClock:
                 if not self._streams:
                     self._set_clock(seen)
 
-    def begin_triggered(self, stream: TriggeredStream) -> float:
+    def start_triggered(self, stream: TriggeredStream) -> float:
         """Let a device follow the axes; return the time from which on.
 
         Raises
@@ -161,7 +161,7 @@ class SampleClock:
             return now
 
     def end_triggered(self, stream: TriggeredStream) -> None:
-        """Let the clock stand where the device's reader is. Idempotent."""
+        """Let the clock stop where the device's reader is. Idempotent."""
         with self._change:
             if stream in self._triggered:
                 seen = self.time
@@ -189,7 +189,7 @@ class SampleClock:
                 until = self._making = (fastest.position + size) / fastest.rate
             self._make(streams, until)
             with self._change:
-                if self._settings_of_clock == setting:  # nobody has set the clock meanwhile
+                if self._settings_of_clock == setting:  # the clock has not been set meanwhile
                     self._front = until
             if pace is not None:
                 time.sleep(max(0.0, wall + (until - began) / pace - time.monotonic()))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 
 TOOLS = ("bar", "sphere", "probe")
-LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: nobody outside knows exactly
+LEAD_IN = (0.5, 2.5)  # s between an order and the first motion: unknown to the driver
 _ROUNDING = 1e-9  # m
 
 
@@ -40,7 +40,7 @@ class Motion(SampleClock):
     path : Path
         Of the axes, otherwise.
     program : str
-        Title of the NC program that was begun last; empty when it was something else.
+        Title of the NC program that was started last; empty when it was something else.
     balls : Balls
         On the table. They are in the way of the probe alone.
     alarms : list of str
@@ -69,7 +69,7 @@ class Motion(SampleClock):
         self.printed: list[tuple[float, str]] = []
         self._programs = 0
         self._program_events: list[Event] = []
-        self._warm_up: float | None = None  # time at which it began
+        self._warm_up: float | None = None  # time at which it started
 
     # ------------------------------------------------------------------ orders
 
@@ -85,21 +85,21 @@ class Motion(SampleClock):
     def run_steps(
         self, start: Sequence[float], direction: Sequence[float], step: float, count: int, dwell: float, travel: float
     ) -> StepProgram:
-        """Step the sphere along a line; the motion begins a short and unknown time from now."""
+        """Step the sphere along a line; the motion starts a short and unknown time from now."""
         with self._change:
             if self.tool != "sphere":
                 raise InstrumentError("Only the sphere is stepped; mount it first")
             self._refuse_to_move()
-            begin = self._begin_of_motion()
+            begin = self._start_of_motion()
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
             self.program = ""
             return self.motion
 
     def run_program(self, text: str) -> Path:
-        """Run an NC program, see `nc_program`; the motion begins a short and unknown time from now."""
+        """Run an NC program, see `nc_program`; the motion starts a short and unknown time from now."""
         with self._change:
             self._refuse_to_move()
-            place, begin = self.path.place(self.time), self._begin_of_motion()
+            place, begin = self.path.place(self.time), self._start_of_motion()
             errands = Errands(self, begin)
             try:
                 path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, errands)
@@ -138,14 +138,14 @@ class Motion(SampleClock):
         Parameters
         ----------
         target : (3,)
-            Commanded place of the tip, m.
+            Commanded position of the tip, m.
         feed : float
             m/s.
 
         Returns
         -------
         dict
-            ``tripped``, ``position`` (where it has tripped and stands now, m; None) and ``time`` (s).
+            ``tripped``, ``position`` (where it has tripped and is now, m; None) and ``time`` (s).
 
         Raises
         ------
@@ -185,7 +185,7 @@ class Motion(SampleClock):
         return self.machine.contact(start, goal, time, feed, balls=self.balls, leaving=True)[0]
 
     def stop(self) -> None:
-        """Abort all motion: the axes stand from now on. The spindle stays as it is."""
+        """Abort all motion: the axes rest from now on. The spindle stays as it is."""
         with self._change:
             now = self._next_instant()
             if self.motion is not None and now < self.motion.end:
@@ -199,14 +199,14 @@ class Motion(SampleClock):
             self.program = ""
 
     def raise_alarm(self, text: str) -> None:
-        """Go into alarm: the axes stand, and nothing moves until `reset_alarms`."""
+        """Go into alarm: the axes rest, and nothing moves until `reset_alarms`."""
         with self._change:
             self.stop()
             if text not in self.alarms:
                 self.alarms.append(text)
 
     def reset_alarms(self) -> None:
-        """Leave alarm and emergency stop; nothing begins to move by itself."""
+        """Leave alarm and emergency stop; nothing starts to move by itself."""
         with self._change:
             self.alarms.clear()
             self.estop = False
@@ -260,7 +260,7 @@ class Motion(SampleClock):
                 self._set_clock(self.path.end)
         return duration
 
-    def _begin_of_motion(self) -> float:
+    def _start_of_motion(self) -> float:
         rng = np.random.default_rng([abs(self.seed), self._programs])
         self._programs += 1
         return float(self._next_instant() + rng.uniform(*LEAD_IN))
@@ -282,7 +282,7 @@ class Motion(SampleClock):
         return [float(x) for x in place]
 
     def _sphere(self, time: float) -> Array:
-        """Return the place at which the sphere rests at a time, or has rested last, m."""
+        """Return the position at which the sphere rests at a time, or has rested last, m."""
         if self.motion is None:
             return self.path.place(time)
         place = max(int(np.searchsorted(self.motion.arrivals, time, side="right")) - 1, 0)
@@ -293,7 +293,7 @@ class Motion(SampleClock):
         return float("nan") if self.stepping else self.path.feed(self.time)
 
     def warm_time(self, times: ArrayLike) -> Array:
-        """Return how long the axes have been warming up at times of the world's clock, s; 0 before they began.
+        """Return how long the axes have been warming up at times of the world's clock, s; 0 before they started.
 
         This is the time on which the thermal errors of the gantry's crossbeam depend. It starts with the first move of
         a program that warms up (`Path.warm_up`) and then counts on.

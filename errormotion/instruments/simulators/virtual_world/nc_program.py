@@ -1,4 +1,4 @@
-"""The control's interpreter of NC programs: a part of ISO 6983, every other word refused with the line it stands in.
+"""The control's interpreter of NC programs: a part of ISO 6983, every other word refused with its line.
 
 Beside it understands what macros of widespread controls need to probe: a skip move (G31) and the lines that they print.
 """
@@ -24,11 +24,11 @@ _WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*")
 _COMMENT = re.compile(r"\([^()]*\)")
 _REFUSED = {
     "G20": "inches are not understood; write mm and G21",
-    "G91": "places relative to the last one are not understood; write G90 and places of the axes",
-    "M0": "nobody is there to start the program again; leave the stop out",
-    "M1": "nobody is there to start the program again; leave the stop out",
+    "G91": "positions relative to the last one are not understood; write G90 and positions of the axes",
+    "M0": "a simulated machine has no operator who continues the program; remove the stop",
+    "M1": "a simulated machine has no operator who continues the program; remove the stop",
 }
-_WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only thing there is, in units, places and feeds
+_WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only thing there is, in units, positions and feeds
 _ROUNDING = 1e-9  # m
 
 _PRINT = re.compile(r"(?:N\d+\s*)?DPRNT\s*\[(.*)\]")
@@ -41,7 +41,7 @@ Array = np.ndarray[Any, Any]
 
 
 class Peripherals(Protocol):
-    """What a program orders beside its path, at times (s) since its begin; an order may be refused."""
+    """What a program orders beside its path, at times (s) since its start; an order may be refused."""
 
     def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
         """See whether something is in the way of a straight move (m, m/s)."""
@@ -66,14 +66,14 @@ def interpret(
     rapid: float,
     peripherals: Peripherals | None = None,
 ) -> Path:
-    """Return the path of a program, begun at time 0.
+    """Return the path of a program, started at time 0.
 
     Each move takes its way over its feed: there is no acceleration, and no rounding of corners.
 
     Parameters
     ----------
     text : str
-        The program; G90, G21 and G94 hold from its beginning.
+        The program; G90, G21 and G94 hold from its start.
     start : (float, float, float)
         Where the machine is, m.
     travel : mapping
@@ -86,7 +86,7 @@ def interpret(
     Raises
     ------
     InstrumentError
-        A word that is not understood, a place out of travel, a move without feed, a program without end; with the
+        A word that is not understood, a position out of travel, a move without feed, a program without end; with the
         number of the line.
     """
     control = _Control(start, travel, rapid, peripherals)
@@ -105,7 +105,7 @@ def interpret(
 
 
 def title(text: str) -> str:
-    """Return the first comment of a program, which says what it does; "program" where it has none."""
+    """Return the first comment of a program, which states what it does; "program" where it has none."""
     found = re.search(r"\(([^()\n]*)\)|;(.*)", text)
     return ((found[1] or found[2] or "").strip() if found else "") or "program"
 
@@ -140,7 +140,7 @@ class _Control:
         self._turning = False
         self._travel = travel
         self._rapid = rapid
-        self._move = ""  # G0 or G1, once one of them was said
+        self._move = ""  # G0 or G1, once one of them was given
         self._feed: float | None = None
         self._times = [0.0]
         self._places = [np.array(start, dtype=float)]
@@ -170,7 +170,7 @@ class _Control:
             self._advance(values, skipping="G31" in codes)
 
     def print(self, template: str) -> None:
-        """Print a line: places of the last skip move (mm), the clock (ms), a star as a space, the rest as it stands."""
+        """Print a line: positions of the last skip move (mm), the clock (ms), a star as a space, the rest unchanged."""
         printer = self._needed("a printer")
 
         def value(found: re.Match[str]) -> str:
@@ -223,7 +223,7 @@ class _Control:
         self._append(values["P"], self._places[-1], fast=False)
 
     def _advance(self, values: Mapping[str, float], *, skipping: bool) -> None:
-        """Set the feed, and move where a place is given; a skip move up to where the probe trips."""
+        """Set the feed, and move where a position is given; a skip move up to where the probe trips."""
         if "F" in values:
             self._feed = values["F"] / MM / MINUTE
             if not 0 < self._feed <= self._rapid + _ROUNDING:
@@ -238,10 +238,10 @@ class _Control:
             return
         move = "G31" if skipping else self._move
         if not move:
-            raise InstrumentError("a place, but neither G0 nor G1 has been said")
+            raise InstrumentError("a position, but neither G0 nor G1 has been given")
         feed = self._rapid if move == "G0" else self._feed
         if feed is None:
-            raise InstrumentError(f"a move with {move}, but no feed F has been said")
+            raise InstrumentError(f"a move with {move}, but no feed F has been given")
         now = self._places[-1], goal, feed, self._times[-1]
         if skipping:
             goal = self._skipped = self._needed("a probe").skip(*now)

@@ -12,7 +12,7 @@ class Stream(Protocol):
     """A channel that wants samples.
 
     ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
-    reader has handed over, None where it does not tell. A stream that has ``ended`` wants no more. Its readings count
+    reader has passed on, None where it is unknown. A stream that has ``ended`` wants no more. Its readings count
     from the start of its ``measuring_range`` (m).
     """
 
@@ -35,7 +35,7 @@ class Stream(Protocol):
 class TriggeredStream(Protocol):
     """A device that samples where a moving axis triggers it.
 
-    ``seen`` is the time of the last sample that its reader has handed over, None before the first one.
+    ``seen`` is the time of the last sample that its reader has passed on, None before the first one.
     """
 
     @property
@@ -49,10 +49,10 @@ class TriggeredStream(Protocol):
 
 @runtime_checkable
 class Carried(Protocol):
-    """A simulated device that somebody carries from place to place beside the machine."""
+    """A simulated device that is carried from station to station beside the machine."""
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put it near a place in machine coordinates, m, and have it take up its beam again."""
+        """Put it near a position in machine coordinates, m, and have it take up its beam again."""
 
 
 class Device(Protocol):

@@ -19,7 +19,7 @@ Array = np.ndarray[Any, Any]
 
 
 class TargetStand:
-    """Holds one target, or none, and says what the machine's point sensor reads of it.
+    """Holds one target, or none, and states what the machine's point sensor reads of it.
 
     Every point sensor in the world is then that one on the stage, whatever its name: one that counts from the middle
     of a range of its own, or one that counts from the start.
@@ -32,7 +32,7 @@ class TargetStand:
     ----------
     target : Plane, CheckBar or None
     order : dict or None
-        What was asked for: ``kind``, and of a plane ``inclination`` and ``rotation``, rad.
+        What was requested: ``kind``, and of a plane ``inclination`` and ``rotation``, rad.
     """
 
     def __init__(self, machine: VirtualMachine) -> None:

@@ -1,7 +1,7 @@
 """What a tracker beside a virtual machine sees: a reflector at the tool, through air.
 
 The reflector is at the commanded position plus the machine's true volumetric error there, plus what the tracker's
-address asks for beyond that. All places are in machine coordinates; the tracker stands at ``station`` and is turned
+address requests beyond that. All positions are in machine coordinates; the tracker is at ``station`` and is turned
 about z by ``heading``.
 """
 
@@ -59,8 +59,8 @@ class TrackerScene:
     world : VirtualWorld
     address : Address
         ``station`` (m, m, m), ``heading`` (rad), ``lever`` (m, m, m: from the tool to the reflector), ``thermal`` (1:
-        the spindle's thermal drift moves it as well), ``repeatability`` (m, one sigma per direction, anew at each
-        commanded place), ``air_temperature`` (degC, else the machine's surroundings), ``air_pressure`` (Pa),
+        the spindle's thermal drift moves it as well), ``repeatability`` (m, one sigma per direction, again at each
+        commanded position), ``air_temperature`` (degC, else the machine's surroundings), ``air_pressure`` (Pa),
         ``air_humidity`` (%).
     rng : Generator
         For the repeatability.
@@ -104,7 +104,7 @@ class TrackerScene:
         return np.broadcast_to(moved + self._arrived(commanded[-1]), (len(times), 3))
 
     def _arrived(self, place: Array) -> Array:
-        """Return by how much the machine misses the place at which it has arrived, m."""
+        """Return by how much the machine misses the position at which it has arrived, m."""
         if self._repeatability == 0:
             return np.zeros(3)
         if self._arrival is None or not np.array_equal(self._arrival[0], place):
@@ -117,12 +117,12 @@ class TrackerScene:
 
 
 def spherical(places: Array) -> Array:
-    """Return azimuth, zenith angle (rad) and distance (m) of places (n, 3), m."""
+    """Return azimuth, zenith angle (rad) and distance (m) of positions (n, 3), m."""
     x, y, z = places.T
     return np.stack([np.arctan2(y, x), np.arctan2(np.hypot(x, y), z), np.linalg.norm(places, axis=1)], axis=1)
 
 
 def cartesian(azimuth: float, zenith: float, distance: float) -> Array:
-    """Return the place of a direction (rad) and distance (m)."""
+    """Return the position of a direction (rad) and distance (m)."""
     across = distance * np.sin(zenith)
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), distance * np.cos(zenith)])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.virtual_world.described import described
 from errormotion.instruments.simulators.virtual_world.motion import LEAD_IN, Motion
 from errormotion.instruments.simulators.virtual_world.streams import Carried, Device, Stream
 from errormotion.instruments.simulators.virtual_world.targets import TargetStand
@@ -24,7 +25,7 @@ class VirtualWorld(Motion):
     Parameters
     ----------
     name : str
-        Kind of the machine, ``cframe`` or ``gantry``.
+        Kind of the machine, ``cframe`` or ``gantry``; ``machine`` for the one that the bench describes.
     seed : int
     warm : bool
         Whether the sensors were switched on long ago.
@@ -42,7 +43,7 @@ class VirtualWorld(Motion):
 
         self.name = name
         self.seed = seed
-        self.machine = VirtualMachine(name, seed, warm=warm)
+        self.machine = VirtualMachine(described(name), seed, warm=warm)
         self._compile()
         super().__init__()
         self.stand = TargetStand(self.machine)
@@ -50,7 +51,7 @@ class VirtualWorld(Motion):
         self._devices: set[Device] = set()
 
     def _compile(self) -> None:
-        """Have the twin's loops compiled now, so that nobody waits in vain for the first samples."""
+        """Have the twin's loops compiled now, so that the first samples are not late."""
         resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
         self.machine.distances(0, 1, 1e3, tool="bar")
         self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
@@ -71,7 +72,7 @@ class VirtualWorld(Motion):
             self.end()
 
     def end(self) -> None:
-        """Forget this world, end its devices and its thread; what it knows can still be asked. Idempotent."""
+        """Forget this world, end its devices and its thread; its truth can still be read. Idempotent."""
         with _lock:
             if _worlds.get(self._key) is self:
                 del _worlds[self._key]
@@ -90,7 +91,7 @@ class VirtualWorld(Motion):
     # ------------------------------------------------------------------ heat and time
 
     def start(self, schedule: Sequence[Event]) -> None:
-        """Begin anew at time 0, cold, with a schedule."""
+        """Start again at time 0, cold, with a schedule."""
         with self._change:
             self._refuse_while_streaming("start a schedule")
             self._refuse_in_alarm()
@@ -182,10 +183,10 @@ class VirtualWorld(Motion):
                 self.motion, self.path = None, here
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Have the trackers beside the machine carried to a place in its coordinates, m."""
+        """Have the trackers beside the machine carried to a position in its coordinates, m."""
         trackers = [device for device in self._devices if isinstance(device, Carried)]
         if not trackers:
-            raise InstrumentError("No tracker stands beside this machine; open it first, at the same machine and seed")
+            raise InstrumentError("No tracker is beside this machine; open it first, at the same machine and seed")
         with self._change:
             self._refuse_while_streaming("carry a tracker")
         for tracker in trackers:
@@ -218,6 +219,9 @@ def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualW
     """Return the world of a machine and seed; made when it is not there yet."""
     with _lock:
         key = (name, int(seed), warm)
+        machine = described(name)
+        if key in _worlds and not isinstance(machine, str) and _worlds[key].machine.description != machine:
+            _worlds[key].end()  # of another bench
         if key not in _worlds:
             _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
         return _worlds[key]

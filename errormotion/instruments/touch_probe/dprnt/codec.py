@@ -17,7 +17,7 @@ PATTERN = (
     r"(?:N\s*(?P<number>\d+)\s*|[A-MO-W]\w*\s+)?"
     rf"X\s*(?P<x>{_NUMBER})\s*Y\s*(?P<y>{_NUMBER})\s*Z\s*(?P<z>{_NUMBER})\s*(?:T\s*(?P<time>{_NUMBER}))?"
 )
-"""What a line is, unless told otherwise: the number of the touch or a label, the place, the time."""
+"""What a line is, by default: the number of the touch or a label, the position, the time."""
 
 _CONTROL = bytes(range(32)) + b"\x7f%"  # what POPEN and PCLOS send around the lines
 MM, MILLISECONDS = 1e-3, 1e-3
@@ -25,7 +25,7 @@ MM, MILLISECONDS = 1e-3, 1e-3
 
 @dataclass(frozen=True)
 class Line:
-    """One printed line: place (m), number of the touch (None where not printed), time (s; NaN where not printed)."""
+    """One printed line: position (m), number of the touch (None where not printed), time (s; NaN where not printed)."""
 
     position: tuple[float, float, float]
     number: int | None = None
@@ -47,7 +47,7 @@ def text_of(raw: bytes) -> str:
 
 
 def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time: float = MILLISECONDS) -> Line:
-    """Return what a line says.
+    """Parse a line.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _LINE_END = b"\n"
-_LONGEST = 1024
+_MAX_LINE_BYTES = 1024
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -89,11 +89,11 @@ class Dprnt(Driver):
         return self._map
 
     def identify(self) -> Identity:
-        """Tell what the settings say: a printer is not asked."""
+        """Return the identity as the settings state it: a printer has no identity."""
         return Identity(
             manufacturer=self.settings.control,
             model="DPRNT",
-            serial_number="not told",
+            serial_number="not reported",
             simulated=self.transport.simulated,
             details={"address": self.address, "tip_radius": self.tip_radius},
         )
@@ -123,16 +123,16 @@ class Dprnt(Driver):
         """Yield what the machine prints of each touch, in order, while its program makes them.
 
         A touch whose line is missing, as those after it show, is ``not made``. Lines that came twice, or cannot be
-        read, are passed over and counted. Where the lines of the next cycle begin, the rest of this one is missing.
+        read, are ignored and counted. Where the lines of the next cycle start, the rest of this one is missing.
 
         Raises
         ------
         InstrumentTimeoutError
-            No line for too long; the message says at which touch.
+            No line for too long; the message states at which touch.
         ProtocolError
             Too many lines that cannot be read.
         InstrumentError
-            A place that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
+            A position that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
         """
         touches = list(touches)
         refuse_unmapped(self._map, touches)
@@ -161,7 +161,7 @@ class Dprnt(Driver):
             due = place + 1
 
     def _next(self, timeout: float, unreadable: int) -> Line:
-        """Return the next line that says a place."""
+        """Return the next line that states a position."""
         if self._ahead is not None:
             line, self._ahead = self._ahead, None
             return line
@@ -169,7 +169,9 @@ class Dprnt(Driver):
         pattern = re.compile(self.settings.pattern)
         while True:
             try:
-                raw = self.transport.read_until(_LINE_END, limit=_LONGEST, timeout=max(end - time.monotonic(), 0.0))
+                raw = self.transport.read_until(
+                    _LINE_END, limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
+                )
                 text = text_of(raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
@@ -201,6 +203,6 @@ class Dprnt(Driver):
             baudrate=self.settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._map = self.settings.pretravel_map()
         self._before = self._ahead = None

@@ -1,4 +1,4 @@
-"""Which touch a printed place belongs to, and what it says of it."""
+"""Which touch a printed position belongs to, and what it states of it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ REPEATED = -1
 def place_of(line: Line, touches: list[Touch], due: int, last: Line | None, first: int, margin: float) -> int:
     """Return the number of the touch (from 0) that a line belongs to, or `REPEATED`.
 
-    A printed number decides, and goes on counting or begins anew from cycle to cycle. Without one it is the next touch
-    whose way the place lies on; a number before the one that is due then belongs to the next cycle.
+    A printed number decides, and goes on counting or starts again from cycle to cycle. Without one it is the next touch
+    whose way the position lies on; a number before the one that is due then belongs to the next cycle.
 
     Raises
     ------
     InstrumentError
-        The place lies on the way of no touch, or not on that of its number.
+        The position lies on the way of no touch, or not on that of its number.
     """
     if line.number is not None:
         if last is not None and last.number == line.number and last.position == line.position:
@@ -48,7 +48,7 @@ def place_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
 
 
 def lies_on(line: Line, touch: Touch, margin: float) -> bool:
-    """Whether a place lies on the way of a touch, to a margin (m)."""
+    """Whether a position lies on the way of a touch, to a margin (m)."""
     start, way = np.array(touch.start), np.subtract(touch.target, touch.start)
     offset = np.array(line.position) - start
     along = np.clip(offset @ way / (way @ way), 0.0, 1.0)
@@ -56,7 +56,7 @@ def lies_on(line: Line, touch: Touch, margin: float) -> bool:
 
 
 def contact_of(line: Line, touch: Touch, free: float, at_target: float) -> Contact:
-    """Return what a printed place says of its touch: a skip move that nothing stopped ends at its target."""
+    """Return what a printed position states of its touch: a skip move that nothing stopped ends at its target."""
     way = np.subtract(touch.target, touch.start)
     length = float(np.linalg.norm(way))
     along = float(np.subtract(line.position, touch.start) @ way) / length

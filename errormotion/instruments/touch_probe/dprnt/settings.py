@@ -18,10 +18,12 @@ class DprntSettings(ProbeSettings):
     pattern: str = Field(
         default=PATTERN, description="regular expression of a line, with groups x, y, z, and perhaps number and time"
     )
-    length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed places")
+    length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed positions")
     time_unit: Literal["ms", "s"] = Field(default="ms", description="unit of printed times")
     first_number: int = Field(default=1, description="number of the first touch, where touches are numbered", ge=0)
-    margin: Length = Field(default=1e-3, description="how far off the straight way of its touch a place may be", gt=0)
+    margin: Length = Field(
+        default=1e-3, description="how far off the straight way of its touch a position may be", gt=0
+    )
     free: Length = Field(default=0.2e-3, description="first part of a touch's way, where a trip is a false one", ge=0)
     at_target: Length = Field(
         default=5e-6, description="so near to the target the touch has ended there without a trip", ge=0

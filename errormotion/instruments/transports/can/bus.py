@@ -1,4 +1,4 @@
-"""CAN: one CANopen node on a bus, asked by SDO.
+"""CAN: one CANopen node on a bus, read by SDO.
 
 ``can://socketcan/can0?node=5`` names an interface of python-can, a channel and the node. Further parameters go to
 python-can: ``bitrate=250000``, ``port=43113``. ``can://udp_multicast/239.74.163.2?node=5`` is a bus that crosses
@@ -30,13 +30,13 @@ from errormotion.instruments.transports.base import Transport
 from errormotion.instruments.transports.lost import Reopened
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
-logging.getLogger("canopen").addHandler(logging.NullHandler())  # what it has to say, the errors raised here say
+logging.getLogger("canopen").addHandler(logging.NullHandler())  # its messages are those of the errors raised here
 
 ERROR_FRAME = 0x20000000
 BUS_OFF = 0x40
 """In the identifier of an error frame: the controller has left the bus."""
 _CYCLE = 0.05  # s that closing may wait for the listening thread
-_SILENCE = "No SDO response"  # how canopen says so
+_TIMEOUT_TEXT = "No SDO response"  # canopen's text for a timeout
 
 
 class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
@@ -54,12 +54,12 @@ class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
 
 
 class Network(canopen.Network):
-    """A CANopen network that notices when its controller leaves the bus, and tells of every frame.
+    """A CANopen network that notices when its controller leaves the bus, and reports every frame.
 
     Attributes
     ----------
     failed : str
-        Why the bus is of no use any more; empty while it is.
+        Why the bus can no longer be used; empty while it is.
     """
 
     NOTIFIER_CYCLE = _CYCLE
@@ -105,7 +105,7 @@ class Network(canopen.Network):
 
 
 class _Errors(can.Listener):
-    """Hears what canopen passes over: error frames, and that the bus is gone."""
+    """Receives what canopen ignores: error frames, and that the bus is gone."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
@@ -116,7 +116,7 @@ class _Errors(can.Listener):
 
     def on_error(self, error: Exception) -> None:
         self._network.failed = f"the bus is lost: {error}"
-        time.sleep(_CYCLE)  # the library tries on at once, for as long as nobody closes the bus
+        time.sleep(_CYCLE)  # the library tries on at once, until the bus is closed
 
 
 class ReplayedNetwork(Network):
@@ -206,7 +206,7 @@ class CanNode(Transport):
 
     @property
     def state(self) -> str:
-        """State that the node's last heartbeat told, such as ``OPERATIONAL``; empty before the first one."""
+        """State that the node's last heartbeat reported, such as ``OPERATIONAL``; empty before the first one."""
         nmt = None if self._remote is None else self._remote.nmt
         return str(nmt.state) if nmt is not None and nmt.timestamp is not None else ""
 
@@ -222,7 +222,7 @@ class CanNode(Transport):
         SdoRefusal
             The node aborts.
         InstrumentTimeoutError
-            The node is silent; the message tells its last heartbeat.
+            The node does not answer; the message states its last heartbeat.
         ProtocolError
             An answer to something else.
         InstrumentError
@@ -241,19 +241,19 @@ class CanNode(Transport):
             raise SdoRefusal(error.code, f"{where}, {what}") from None
         except SdoCommunicationError as error:
             self._check(network)
-            if _SILENCE not in str(error):
+            if _TIMEOUT_TEXT not in str(error):
                 raise ProtocolError(f"{where}, {what}: {error}") from None
-            seen = f"its last heartbeat said {self.state}" if self.state else "no heartbeat of it has been seen"
+            seen = f"its last heartbeat stated {self.state}" if self.state else "no heartbeat of it has been seen"
             raise InstrumentTimeoutError(f"{where} gives no answer within {self.timeout:g} s; {seen}") from None
         except struct.error as error:
             raise ProtocolError(f"{where}, {what}: the answer is too short: {error}") from None
         except (can.CanError, OSError) as error:
-            self._lose(f"{self.url}: the bus is lost: {error}")
+            self._drop_bus(f"{self.url}: the bus is lost: {error}")
             raise InstrumentError(self._bus.reason) from None
 
     def _check(self, network: Network) -> None:
         if network.failed:
-            self._lose(f"{self.url}: {network.failed}")
+            self._drop_bus(f"{self.url}: {network.failed}")
             raise InstrumentError(self._bus.reason)
 
     def _opened(self) -> Network:
@@ -264,9 +264,9 @@ class CanNode(Transport):
         network.add_node(self._remote)
         return network
 
-    def _lose(self, reason: str) -> None:
+    def _drop_bus(self, reason: str) -> None:
         self._remote = None
-        _disconnect(self._bus.lose(reason))
+        _disconnect(self._bus.drop(reason))
 
     def _send(self, data: bytes) -> None:  # noqa: ARG002
         raise InstrumentError(f"{self.url} carries frames, no stream of bytes")

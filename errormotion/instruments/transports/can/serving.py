@@ -33,7 +33,7 @@ class Entry:
 
 
 class CanopenServer:
-    """A CANopen node on a bus, asked by SDO.
+    """A CANopen node on a bus, read by SDO.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class CanopenServer:
             self._thread.start()
 
     def boot(self) -> None:
-        """Say hello on the bus, and go to the state OPERATIONAL."""
+        """Announce the node on the bus, and go to the state OPERATIONAL."""
         self._node.nmt.send_command(129)
         self._node.nmt.send_command(1)
         self._quiet = False
@@ -95,7 +95,7 @@ class CanopenServer:
         """Go to the state STOPPED."""
         self._node.nmt.send_command(2)
 
-    def fall_silent(self) -> None:
+    def stop_heartbeat(self) -> None:
         """Send no heartbeat any more, until the next boot."""
         self._quiet = True
 
@@ -129,7 +129,7 @@ class Refused(SdoAbortedError):  # noqa: N818 - that is what it is
 
 
 class _FaultyNetwork(canopen.Network):
-    """A network whose SDO answers pass through somebody's hands."""
+    """A network whose SDO answers pass through a function of the simulator."""
 
     NOTIFIER_CYCLE = 0.05
 

@@ -1,4 +1,4 @@
-"""Modbus: a line on which registers are asked for.
+"""Modbus: a line on which registers are requested.
 
 * ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
 * ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
@@ -6,7 +6,7 @@
 * ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
 
 The frames are our own (`modbus_codec`) and go over the byte transports, so that a session can be recorded and played
-back, and each fault be told from the others. `pymodbus`, whose client owns its socket and waits in silence when a
+back, and each fault be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit when a
 checksum is wrong, is the simulated device, and the other side in tests.
 """
 
@@ -27,11 +27,11 @@ from errormotion.instruments.transports.modbus.codec import (
     encode_request,
     missing,
 )
-from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
-QUIET = 0.05  # s without a byte: what was under way is over
-LONGEST = 512  # bytes of rubbish that are waited for
+QUIET_INTERVAL = 0.05  # s without a byte: what was under way is over
+MAX_STRAY_BYTES = 512  # bytes of rubbish that are waited for
 
 
 class ModbusLine(Transport):
@@ -46,19 +46,19 @@ class ModbusLine(Transport):
     unit : int
         Address of the device.
     retries : int
-        How often a damaged answer is asked for once more.
+        How often a damaged answer is requested once more.
 
     Attributes
     ----------
     framing, unit
         As given.
     repeated : int
-        How many answers had to be asked for again.
+        How many answers had to be requested again.
     """
 
     def __init__(self, line: Transport, framing: Framing, unit: int, retries: int = 0) -> None:
         super().__init__(line.url, line.timeout)
-        self.holds_back, self.simulated = line.holds_back, line.simulated
+        self.flow_control, self.simulated = line.flow_control, line.simulated
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
 
@@ -70,9 +70,9 @@ class ModbusLine(Transport):
         ModbusRefusal
             An exception reply.
         ProtocolError
-            A damaged answer: garbage, a wrong checksum, another unit, too short; also when asked again.
+            A damaged answer: garbage, a wrong checksum, another unit, too short; also when queried again.
         InstrumentTimeoutError
-            Silence.
+            No answer within the time limit.
         InstrumentError
             The connection is lost; the next call connects again.
         """
@@ -86,7 +86,7 @@ class ModbusLine(Transport):
         raise AssertionError  # the loop has ended by itself
 
     def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        forget_input(self._line)
+        discard_input(self._line)
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
         end = time.monotonic() + self.timeout
@@ -103,11 +103,11 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
-            give_up_silent(self._line)
+            disconnect_after_timeout(self._line)
             raise
 
     def _frame(self, end: float) -> bytes:
-        """Return one answer, as long as its beginning says that it is."""
+        """Return one answer, as long as its start states that it is."""
         data = b""
         while lacking := missing(self.framing, data):
             try:
@@ -117,15 +117,17 @@ class ModbusLine(Transport):
                     raise ProtocolError(
                         f"Expected {lacking} bytes more within {self.timeout:g} s; found {data[:24].hex(' ')}"
                     ) from None
-                raise InstrumentTimeoutError(f"{self.url}: unit {self.unit} is silent for {self.timeout:g} s") from None
+                raise InstrumentTimeoutError(
+                    f"{self.url}: unit {self.unit} did not answer within {self.timeout:g} s"
+                ) from None
         return data
 
     def _settle(self) -> None:
         """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
         came = 0
         with suppress(InstrumentError):
-            while came < LONGEST:
-                came += len(self._line.read(LONGEST, timeout=QUIET))
+            while came < MAX_STRAY_BYTES:
+                came += len(self._line.read(MAX_STRAY_BYTES, timeout=QUIET_INTERVAL))
 
     def _send(self, data: bytes) -> None:
         self._line.write(data)
@@ -149,7 +151,7 @@ def open_modbus(
     retries: int = 0,
     baudrate: int | None = None,
 ) -> ModbusLine:
-    """Open the Modbus line that an address names; what the address says of ``unit`` and ``baudrate`` wins.
+    """Open the Modbus line that an address names; what the address states of ``unit`` and ``baudrate`` wins.
 
     Parameters
     ----------
@@ -163,7 +165,7 @@ def open_modbus(
     Raises
     ------
     InstrumentError
-        Nobody there, or no address for Modbus.
+        No device answers, or no address for Modbus.
     """
     address = parse_address(url)
     device = original(address)

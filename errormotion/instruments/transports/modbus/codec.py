@@ -24,7 +24,7 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 _HEAD = 7  # bytes of an MBAP header
-_LONGEST = 254  # bytes behind its length
+_MAX_MBAP_LENGTH = 254  # bytes behind its length
 
 
 def crc16(data: bytes) -> bytes:
@@ -38,7 +38,7 @@ def crc16(data: bytes) -> bytes:
 
 
 def encode_request(framing: Framing, unit: int, function: int, register: int, count: int, number: int = 0) -> bytes:
-    """Return the request for ``count`` registers from ``register`` on; ``number`` tells TCP's transactions apart."""
+    """Return the request for ``count`` registers from ``register`` on; ``number`` distinguishes TCP's transactions."""
     return _frame(framing, unit, struct.pack(">BHH", function, register, count), number)
 
 
@@ -56,14 +56,16 @@ def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
 
 
 def missing(framing: Framing, data: bytes) -> int:
-    """Return how many bytes an answer that begins so still lacks, as far as its beginning tells."""
+    """Return how many bytes an answer that starts so still lacks, as far as its start shows."""
     if framing == "rtu":
         size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
     elif len(data) < _HEAD - 1:
         size = _HEAD + 2
     else:
         protocol, length = struct.unpack(">HH", data[2:6])
-        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: nothing is worth waiting for
+        size = (
+            6 + length if not protocol and length <= _MAX_MBAP_LENGTH else 0
+        )  # else no head: no further bytes are awaited
     return max(size - len(data), 0)
 
 
@@ -85,7 +87,7 @@ def decode_answer(
 
 
 class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
-    """The device answers that it does not do what it was asked for.
+    """The device answers that it does not do what it was requested.
 
     Attributes
     ----------

@@ -21,9 +21,9 @@ CHUNK = 4096
 
 
 class ModbusServer:
-    """A Modbus server that is asked with bytes and answers with bytes, through a connection on loopback.
+    """A Modbus server that takes and returns bytes, through a connection on loopback.
 
-    Between it and whoever asks lies a cable, which is a simulator's to break.
+    Between it and whoever queries lies a cable, which is a simulator's to break.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class ModbusServer:
             self._thread.join()
             raise self._failure
 
-    def ask(self, data: bytes) -> None:
+    def handle_request(self, data: bytes) -> None:
         """Hand a request to the server; what it answers comes to ``on_answer``."""
         unit = data[0] if self._framing == "rtu" else data[6] if len(data) > 6 else self._unit
         if unit == self._unit:

@@ -1,13 +1,13 @@
-"""Places that are visited again: how a set-up drifts, and how well the machine repeats.
+"""Drift of a set-up and repeatability of the machine, from positions that are visited again.
 
 During one set-up the machine moves slowly relative to the tracker, and the tracker's dead path changes. A reading at
 time t is then longer than one at the middle of the set-up by
 
     (t - t_j) (c_j + e_ij . v_j)
 
-with the rate c_j of the dead path and the velocity v_j of the machine. Two visits of a place tell of it, and what their
-difference leaves is noise and repeatability. What drifts rigidly from one set-up to the next needs no correction: the
-place of the station takes it.
+with the rate c_j of the dead path and the velocity v_j of the machine. Two visits of a position show it; the rest of
+their difference is noise and repeatability. A rigid drift from one set-up to the next needs no correction: the position
+of the station contains it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, fdtri
 
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.expansion import Shared
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Array = Array
-
-SAME_PLACE = 1e-9
-"""Commanded places closer than this are one, m."""
+SAME_POSITION = 1e-9
+"""Commanded positions closer than this are one, m."""
 FALSE_ALARM = 1e-3
-DRIFTS = 0.01
-"""Chance at which a set-up that does not drift is said to."""
-_ALIKE = 1e4
+"""Probability of a note on returns that scatter as stated."""
+DRIFT_SIGNIFICANCE = 0.01
+"""Probability of a correction for a set-up that does not drift."""
+_LARGEST_CONDITION = 1e4
+"""Of terms of the drift that are estimated together."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Drift:
     correction : ndarray (station, target)
         To be taken off the readings, m.
     sources : list of Shared
-        What is not known of it.
+        Its uncertainty.
     repeatability : float
-        What the returns scatter beyond the noise of the readings, standard deviation of one coordinate, m; NaN
+        Scatter of the returns without that of the readings' noise, standard deviation of one coordinate, m; NaN
         without returns.
     pairs : int
-        Visits beyond the first of each place.
+        Visits after the first one of each position.
     square, freedom : float, int
-        Sum of squares of what the returns leave, over the noise, and its freedoms.
+        Sum of squares of the residuals of the returns over the noise, and its degrees of freedom.
     """
 
     rate: Array
@@ -67,27 +67,27 @@ class Drift:
     freedom: int = 0
 
 
-def places(nominal: Array) -> NDArray[np.intp]:
-    """Return for every target the number of its place, (m,); targets commanded to one place share a number."""
-    keys = np.round(nominal / SAME_PLACE).astype(np.int64)
+def positions(nominal: Array) -> NDArray[np.intp]:
+    """Return for every target the number of its position, (m,); targets commanded to one position share a number."""
+    keys = np.round(nominal / SAME_POSITION).astype(np.int64)
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def estimate_drift(
-    displacement: Array, time: Array, place: NDArray[np.intp], e: Array, noise: Array, names: Sequence[str],
+    displacement: Array, time: Array, position: NDArray[np.intp], e: Array, noise: Array, names: Sequence[str],
     notes: list[str], *, certain: bool = True,
 ) -> Drift:  # fmt: skip
-    """Return the drift that the returns show.
+    """Return the drift from the returns.
 
-    Each set-up gets no rate, one of its dead path, or one of its dead path and three of the machine: what explains
-    its returns where chance would do so once in a hundred set-ups.
+    Each set-up gets no rate, one of its dead path, or one of its dead path and three of the machine: the model whose
+    improvement is significant (``DRIFT_SIGNIFICANCE``).
 
     Parameters
     ----------
     displacement, time : ndarray (n, m)
         m and s; NaN where there is no reading.
-    place : ndarray (m,)
-        From `places`.
+    position : ndarray (m,)
+        From `positions`.
     e : ndarray (n, m, 3)
         Unit vectors from the stations to the targets.
     noise : ndarray (n, m)
@@ -97,7 +97,7 @@ def estimate_drift(
     notes : list of str
         Added to.
     certain : bool
-        The noise is, unless the returns contradict it; otherwise what they scatter is believed where it is more.
+        The noise is used unless the returns contradict it; otherwise their scatter is used where it is larger.
     """
     n, m = displacement.shape
     rate, correction = np.full((n, 4), np.nan), np.zeros((n, m))
@@ -105,7 +105,7 @@ def estimate_drift(
     returns: dict[int, tuple[Array, Array, Array]] = {}
     for j in range(n):
         known = np.isfinite(displacement[j]) & np.isfinite(time[j])
-        groups = _visits(place, known)
+        groups = _visits(position, known)
         if not groups:
             continue
         middle = float(np.mean(time[j, known]))
@@ -113,7 +113,7 @@ def estimate_drift(
         terms = np.concatenate([np.ones((m, 1)), e[j]], axis=1) * since[:, None]
         returns[j] = (terms, *_within(groups, displacement[j], terms, noise[j]))
     scatter = _scatter([(d, A) for _, d, A in returns.values()])
-    if certain and scatter[0] * scatter[1] <= stats.chi2.ppf(1 - FALSE_ALARM, max(scatter[1], 1)):
+    if certain and scatter[0] * scatter[1] <= chdtri(max(scatter[1], 1), FALSE_ALARM):
         scatter = (1.0, 0)
     square, freedom, pairs = 0.0, 0, 0
     for j, (terms, d, A) in returns.items():
@@ -132,32 +132,33 @@ def estimate_drift(
     mean = float(np.sqrt(np.nanmean(noise**2)))
     ratio = square / freedom if freedom else np.nan
     repeatability = mean * float(np.sqrt(max(ratio - 1, 0.0)))
-    if freedom and square > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if freedom and square > chdtri(freedom, FALSE_ALARM):
         notes.append(
-            f"Places visited again differ {np.sqrt(ratio):.2g} times as much as the noise of the readings says: a "
-            f"repeatability of {repeatability * 1e6:.2g} um, or a drift that is not steady."
+            f"Positions visited again differ {np.sqrt(ratio):.2g} times as much as expected from the noise of the "
+            f"readings: a repeatability of {repeatability * 1e6:.2g} um, or a drift that is not linear."
         )
     if not pairs:
         notes.append(
-            "No place was visited again within a set-up: drift and repeatability are not seen. Return to some targets."
+            "No position was visited again within a set-up: drift and repeatability are not determined. Return to some "
+            "targets."
         )
     return Drift(rate, correction, sources, repeatability, pairs, square, freedom)
 
 
-def _visits(place: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Return the known targets of each place that has several."""
+def _visits(position: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Return the known targets of each position that has several."""
     found = np.flatnonzero(known)
-    found = found[np.argsort(place[found], kind="stable")]
-    groups = np.split(found, np.flatnonzero(np.diff(place[found])) + 1)
+    found = found[np.argsort(position[found], kind="stable")]
+    groups = np.split(found, np.flatnonzero(np.diff(position[found])) + 1)
     return [group for group in groups if len(group) > 1]
 
 
 def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array) -> tuple[Array, Array]:
-    """Return readings and terms of each place without their weighted mean, whitened; one row fewer than visits."""
+    """Return readings and terms of each position without their weighted mean, whitened; one row fewer than visits."""
     left, rows = [], []
     for group in groups:
         w = 1 / noise[group]
-        # Rows orthogonal to the place's own reading: the mean has gone and the rest stays white.
+        # Rows orthogonal to the weights: the mean is removed and the rest stays white.
         Q = np.linalg.qr(w[:, None], mode="complete")[0][:, 1:]
         left.append(Q.T @ (w * d[group]))
         rows.append(Q.T @ (w[:, None] * terms[group]))
@@ -176,7 +177,7 @@ def _scatter(returns: list[tuple[Array, Array]]) -> tuple[float, int]:
 
 def _orders(d: Array, A: Array) -> list[int]:
     """Return how many of the columns of A may be tried: 1, or all four."""
-    return [k for k in (1, A.shape[1]) if len(d) > k and np.linalg.cond(A[:, :k]) <= _ALIKE]
+    return [k for k in (1, A.shape[1]) if len(d) > k and np.linalg.cond(A[:, :k]) <= _LARGEST_CONDITION]
 
 
 def _order(d: Array, A: Array, scatter: tuple[float, int]) -> int:
@@ -189,7 +190,7 @@ def _order(d: Array, A: Array, scatter: tuple[float, int]) -> int:
     for order in _orders(d, A):
         part, more = A[:, :order], order - found
         left = d - part @ np.linalg.lstsq(part, d)[0]
-        limit = more * stats.f.ppf(1 - DRIFTS, more, freedom) if freedom else stats.chi2.ppf(1 - DRIFTS, more)
+        limit = more * fdtri(more, freedom, 1 - DRIFT_SIGNIFICANCE) if freedom else chdtri(more, DRIFT_SIGNIFICANCE)
         if square - float(left @ left) > variance * limit:
             square, found = float(left @ left), order
     return found

@@ -18,8 +18,6 @@ from errormotion.methods.multilateration.network.solver import solve
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    Array = Array
-
 _MOST = 1000  # targets that are looked at
 _CUTS = 9
 _FEWEST = 5  # readings of a part

@@ -3,7 +3,7 @@
 Displacements of the reflector are linear in the errors (`errormotion.kinematics.machines`). Every error motion is a
 series of Legendre polynomials over the measured part of its axis, from the first term that is not another's:
 
-* six motions of the whole are the datum's and belong to no axis: they are estimated beside, and given back;
+* six motions of the whole are the datum's and belong to no axis: they are estimated as well, and returned;
 * constants of error motions and slopes of straightness are motions of the whole or squareness, so error motions have a
   mean of zero, straightness no slope, and squareness is that of the axes' mean lines;
 * what an error does to no reflector, or nothing but what others do, is not seen. With one reflector these are the
@@ -11,7 +11,7 @@ series of Legendre polynomials over the measured part of its axis, from the firs
 
 How many terms an error motion has is decided by the evidence: the coefficient of order k has the prior standard
 deviation tau / k^p, with tau of each error motion and one p for all of largest marginal likelihood (MacKay, Bayesian
-interpolation, Neural Computation 4, 1992). Terms that the targets say nothing about keep their prior, so that what may
+interpolation, Neural Computation 4, 1992). Terms that the targets do not determine keep their prior, so that what may
 be between the targets is in the uncertainty. Squareness and the slope of positioning have no prior.
 """
 
@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
+from scipy.special import chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -31,10 +32,10 @@ from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
 
 AXES = ("X", "Y", "Z")
-ALIKE = "not told from "
-UNSEEN = 1e-6
-"""A term of which less than this share is its own is not told from the others."""
+INDEPENDENT_SHARE = 1e-6
+"""A term with a smaller independent share is not distinguishable from the others."""
 FALSE_ALARM = 1e-3
+"""Probability of a note on axes that explain the targets' errors."""
 FALLOFFS = (1.0, 2.0, 3.0, 4.0)
 """How fast coefficients may fall with their order: p of the prior."""
 _PASSES = 100
@@ -42,6 +43,14 @@ _SETTLED = 0.01
 _POOLED = 1.0
 """Terms' worth of weight that the other error motions of the same kind have in the size of one."""
 _BLOCK = 4096
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """An error that the targets do not determine: the reason, and errors that have the same effect, where these are."""
+
+    reason: str
+    like: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,8 +137,8 @@ class Parametric:
         m, rad; squareness rad.
     determined : ndarray (term,)
         How far the targets determine each, 0 (its prior stands) to 1.
-    unseen : mapping of str to str
-        Error that the targets do not determine, to why.
+    unseen : mapping of str to Unseen
+        Errors that the targets do not determine.
     sigma0 : float
         Root mean square of what is left over what was expected: 1 where the axes explain the errors.
     freedom : float
@@ -144,7 +153,7 @@ class Parametric:
     coefficient: Array
     covariance: Array = field(repr=False)
     determined: Array
-    unseen: dict[str, str]
+    unseen: dict[str, Unseen]
     sigma0: float
     freedom: float
     datum: Array = field(repr=False)
@@ -237,7 +246,7 @@ def fit_machine(
     freedom = 3 * len(position) - 6 - float(found.determined.sum())
     ratio = found.left / max(freedom, 1.0)
     scale, notes = 1.0, []
-    if freedom > 0 and found.left > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if freedom > 0 and found.left > chdtri(freedom, FALSE_ALARM):
         scale = ratio
         notes.append(
             f"Errors of the axes leave {np.sqrt(ratio):.3g} times as much of the targets' errors as their uncertainty "
@@ -284,8 +293,8 @@ def _normal_equations(
     size = len(terms) + 6 + len(influence)
     N, b, square = np.zeros((size, size)), np.zeros(size), 0.0
     GG, GA = np.zeros((6, 6)), np.zeros((6, len(terms)))
-    for begin in range(0, len(position), _BLOCK):
-        part = slice(begin, begin + _BLOCK)
+    for first in range(0, len(position), _BLOCK):
+        part = slice(first, first + _BLOCK)
         q, at = position[part], reflector[part]
         G, shared = model.motions(q + at, centre), influence[:, which[part]].transpose(1, 2, 0)
         A = np.concatenate([model.columns(terms, q, at), G, shared], axis=2)
@@ -303,43 +312,44 @@ def _normal_equations(
     return N, b, square, np.asarray(np.linalg.lstsq(GG, GA)[0])
 
 
-def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, str]:
-    """Return the errors whose first term moves no reflector, or is not told from those before it, with the reason."""
+def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, Unseen]:
+    """Return errors whose first term moves no reflector, or is not distinguishable from earlier ones."""
     size = np.sqrt(np.diag(N))
     reference = size[: len(terms)].max()
     unit = np.where(size > 0, size, 1.0)
     R = N / np.outer(unit, unit)
     taken = list(range(len(terms), len(terms) + min(nuisance, 6)))
-    unseen: dict[str, str] = {}
+    unseen: dict[str, Unseen] = {}
     for k, term in enumerate(terms):
         name = term.error
         axes = {AXES.index(letter) for letter in (name[2], name[3:]) if letter in AXES}
         few = [AXES[i] for i in axes if levels[i] < (2 if term.order < 0 else first_order(name) + 1)]
         if name in unseen or (term.order >= 0 and term.order >= levels[AXES.index(name[2])]):
             if few and name not in unseen:
-                unseen[name] = f"too few positions of {few[0]}"
+                unseen[name] = Unseen(f"too few positions of {few[0]}")
             continue
         if few:
-            unseen[name] = f"too few positions of {few[0]}"
+            unseen[name] = Unseen(f"too few positions of {few[0]}")
         elif size[k] < 1e-9 * reference:
             if term.order <= first_order(name):
-                unseen[name] = "it moves no reflector"
+                unseen[name] = Unseen("it moves no reflector")
         else:
             others = linalg.solve(R[np.ix_(taken, taken)], R[taken, k], assume_a="sym")
-            if 1.0 - float(R[taken, k] @ others) > UNSEEN:
+            if 1.0 - float(R[taken, k] @ others) > INDEPENDENT_SHARE:
                 taken.append(k)
             elif term.order <= first_order(name):
                 unseen[name] = _like(terms, taken, others)
     return unseen
 
 
-def _like(terms: list[Term], taken: list[int], weight: Array) -> str:
-    """Say which errors do what another one does."""
+def _like(terms: list[Term], taken: list[int], weight: Array) -> Unseen:
+    """Return why an error is not determined that is the sum of others with these weights."""
     parts: dict[str, float] = {}
     for i, share in zip(taken, weight, strict=True):
         if i < len(terms):
             parts[terms[i].error] = parts.get(terms[i].error, 0.0) + abs(float(share))
-    return f"{ALIKE}{' and '.join(name for name, part in parts.items() if part > 1e-3) or 'a shift'}"
+    like = tuple(name for name, part in parts.items() if part > 1e-3)
+    return Unseen(f"not distinguishable from {' and '.join(like) or 'a shift'}", like)
 
 
 @dataclass(frozen=True)

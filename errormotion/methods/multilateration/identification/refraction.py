@@ -14,21 +14,15 @@ P. E. Ciddor, Refractive index of air: new equations for the visible and near in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.settings import CO2, HELIUM_NEON
 
-if TYPE_CHECKING:
-    Array = Array
-
-HELIUM_NEON = 632.9912e-9
-"""Wavelength in vacuum of the usual red laser, m."""
-CO2 = 450e-6
-"""Share of carbon dioxide in laboratory air: mole fraction."""
 MODEL_UNCERTAINTY = 2e-8
 """Standard uncertainty of the equations themselves."""
 

@@ -1,4 +1,4 @@
-"""What the targets' uncertainty is made of: their own readings, and what all share.
+"""Parts of the targets' uncertainty: their own readings, and sources that all share.
 
 Sources are kept as one array over source, target and freedom, which is what an error dataset holds. It is filled block
 by block: nothing else is as large.
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from errormotion.methods.multilateration.identification.expansion import Shared
     from errormotion.methods.multilateration.network.network import Network
-
-    Array = Array
 
 BLOCK = 16384
 """Targets at a time."""
@@ -67,27 +65,29 @@ class Parts:
         What one standard uncertainty of each shared source does, m; rotations NaN.
     names, groups : list of str
         Of the sources.
+    stations : int
+        Number of the sources that are parts of the stations' covariance; they come first.
     """
 
     own: Array
     influence: Array
     names: list[str]
     groups: list[str]
+    stations: int
 
     def covariance(self, given: Array, factor: float) -> Array:
         """Return the total covariance (m, 6, 6): ``given`` (m, 3, 3) of the readings times ``factor``, and the rest."""
-        others = [k for k, name in enumerate(self.names) if not name.startswith(READINGS)]
         C = np.full((len(given), 6, 6), np.nan)
         for part in blocks(len(given)):
-            F = self.influence[others, part, :3]
+            F = self.influence[self.stations :, part, :3]
             C[part, :3, :3] = factor * given[part] + np.einsum("sta,stb->tab", F, F)
         return C
 
 
 def blocks(count: int) -> Iterator[slice]:
     """Yield slices of so many targets."""
-    for begin in range(0, count, BLOCK):
-        yield slice(begin, min(begin + BLOCK, count))
+    for first in range(0, count, BLOCK):
+        yield slice(first, min(first + BLOCK, count))
 
 
 def parts(
@@ -98,13 +98,13 @@ def parts(
     stretched: Array,
     shared: Sequence[Shared],
 ) -> Parts:
-    """Return what the targets' uncertainty is made of.
+    """Return the parts of the targets' uncertainty.
 
     Parameters
     ----------
     network : Network
     factor : float
-        By which the standard deviation of its readings is larger than it was told.
+        Standard deviation of a reading over that of the network's weights.
     scatter : Scatter
         What that is made of.
     scales : sequence of (name, group, relative standard uncertainty)
@@ -139,7 +139,7 @@ def parts(
                 influence[first + i, part, :3] = relative * effect[0]
             influence[first + len(scales) :, part, :3] = effect[bool(scales) :]
     influence[:, np.isnan(own[:, 0, 0])] = np.nan
-    return Parts(own, influence, names, groups)
+    return Parts(own, influence, names, groups, first)
 
 
 def _drift_first(network: Network) -> Network:

@@ -10,14 +10,12 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.parameters import ALIKE, AXES, Chain, Parametric, Term
+from errormotion.methods.multilateration.identification.parameters import AXES, Chain, Parametric, Term, Unseen
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
-
-    Array = Array
 
 CURVE_POINTS = 41
 """Positions at which an error motion is tabulated."""
@@ -28,7 +26,7 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as variables of an error dataset.
 
     ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN where not seen, with the reason
-    as attribute ``unseen``; the attribute ``includes`` names errors that are not told from this one; ``EC0Y`` ...
+    as attribute ``unseen``; the attribute ``includes`` names errors with the same effect as this one; ``EC0Y`` ...
     and ``EC0Y_u``: squareness; ``coefficient(term)`` with ``coefficient_covariance``, and what `volumetric_errors`
     needs.
     """
@@ -42,21 +40,21 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
         for error in chain.machine.error_names[6 * k : 6 * k + 6]:
             unit = _unit(error)
             attrs = {
-                "units": unit, "order": axes.orders.get(error, 0), "unseen": axes.unseen.get(error, ""),
+                "units": unit, "order": axes.orders.get(error, 0), "unseen": _reason(axes, error),
                 "includes": includes.get(error, ""),
             }  # fmt: skip
             value, u = axes.curve(error, q)
             extras[error] = xr.DataArray(value, coords, dim, attrs=attrs)
             extras[f"{error}_u"] = xr.DataArray(u, coords, dim, attrs={"units": unit})
     for error, (number, uncertainty) in axes.squareness().items():
-        attrs = {"units": "rad", "unseen": axes.unseen.get(error, ""), "includes": includes.get(error, "")}
+        attrs = {"units": "rad", "unseen": _reason(axes, error), "includes": includes.get(error, "")}
         extras[error] = xr.DataArray(number, attrs=attrs)
         extras[f"{error}_u"] = xr.DataArray(uncertainty, attrs={"units": "rad"})
     terms = {
         "term_error": ("term", [term.error for term in axes.terms]),
         "term_order": ("term", [term.order for term in axes.terms]),
     }
-    about = {"chain": chain.machine.chain, "unseen": [f"{k}: {why}" for k, why in axes.unseen.items()] or [""]}
+    about = {"chain": chain.machine.chain, "unseen": [f"{k}: {each.reason}" for k, each in axes.unseen.items()] or [""]}
     extras["coefficient"] = xr.DataArray(axes.coefficient, terms, "term", attrs=about)
     extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
     extras["determined"] = xr.DataArray(
@@ -76,14 +74,17 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     return extras
 
 
-def _includes(unseen: Mapping[str, str]) -> dict[str, str]:
-    """Return for each error what of others is in it, since at the reflector they do the same."""
+def _reason(axes: Parametric, error: str) -> str:
+    return axes.unseen[error].reason if error in axes.unseen else ""
+
+
+def _includes(unseen: Mapping[str, Unseen]) -> dict[str, str]:
+    """Return for each error which others it includes, since they have the same effect at the reflector."""
     found: dict[str, list[str]] = {}
-    for error, why in unseen.items():
-        if why.startswith(ALIKE):
-            for name in why.removeprefix(ALIKE).split(" and "):
-                found.setdefault(name, []).append(error)
-    return {name: f"what {' and '.join(others)} do at the reflector" for name, others in found.items()}
+    for error, each in unseen.items():
+        for name in each.like:
+            found.setdefault(name, []).append(error)
+    return {name: f"the effect of {' and '.join(others)} at the reflector" for name, others in found.items()}
 
 
 def axes_of(errors: xr.Dataset) -> Parametric:
@@ -104,8 +105,8 @@ def axes_of(errors: xr.Dataset) -> Parametric:
     vector = {name: np.asarray(errors[f"axes_{name}"].values, dtype=float) for name in
               ("centre", "reference", "low", "high")}  # fmt: skip
     model = Chain.of(str(c.attrs["chain"]), np.stack([vector["low"], vector["high"]]), vector["reference"][None])
-    told = [str(text) for text in np.atleast_1d(c.attrs["unseen"])]
-    unseen = dict(text.split(": ", 1) for text in told if ": " in text)
+    reasons = {name: str(errors[name].attrs.get("unseen", "")) for name in model.machine.error_names}
+    unseen = {name: Unseen(reason) for name, reason in reasons.items() if reason}
     covariance, datum = errors["coefficient_covariance"].values, errors["axes_datum"].values
     return Parametric(
         model, terms, c.values, covariance, errors["determined"].values, unseen, float(errors["axes_sigma0"]),
@@ -183,7 +184,7 @@ def grid(low: Sequence[float], high: Sequence[float], count: Sequence[int]) -> A
 
 
 def diagonals(low: Sequence[float], high: Sequence[float], count: int = 11) -> Array:
-    """Return positions along the four body diagonals, (4, count, 3), m; each begins at low Z (ISO 230-6)."""
+    """Return positions along the four body diagonals, (4, count, 3), m; each starts at low Z (ISO 230-6)."""
     a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     starts = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], dtype=float)
     way = np.linspace(0.0, 1.0, count)[None, :, None]
@@ -211,8 +212,8 @@ def _field(axes: Parametric, q: Array, tool: Array) -> Array:
 def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
     """Return whether each freedom is known, (k, 6).
 
-    Displacements where the reflector was are: what is not told apart does the same there. Elsewhere, and for rotations,
-    every error that matters must have been seen.
+    Displacements at the position of the reflector are known: errors that are not distinguishable have the same effect
+    there. Elsewhere, and for rotations, every error with an effect must be determined.
     """
     J = axes.chain.machine.jacobian(q, tool)
     unseen = [axes.chain.machine.error_names.index(name) for name in axes.unseen]

@@ -1,4 +1,4 @@
-"""What a multilateration answers: places, dead paths, and what they are worth.
+"""Result of a multilateration: positions, dead paths, and their covariances.
 
 The datum is a free network: of all rigid motions of the whole, the one that fits the targets to their nominal places
 best. With a_i the part of target i that its own readings decide, covariance D_i, and ds that of the stations,
@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network import determinacy, outliers
 from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
@@ -83,7 +82,7 @@ class Network:
     left_out : tuple of (int, int)
         Readings (station, target) found wrong, from 0.
     undecided : tuple of int
-        Targets with a wrong reading that cannot be told from the right ones; they are NaN.
+        Targets with a wrong reading that is not identified; they are NaN.
     sigma0 : float
         Root mean square of the residuals over their expected size: 1 where the noise is what was stated.
     freedom : int
@@ -155,31 +154,21 @@ class Network:
     def residual(self) -> Array:
         """Reading minus model (n, m), m: of every reading that exists and whose target has a place, left out or not.
 
-        NaN for all others. A reading that was left out has had no say in its target's place, so that its residual
+        NaN for all others. A reading that was left out did not determine its target's position, so that its residual
         shows its whole error.
         """
         s = self.stations
-        return loops(len(self.target)).residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """What a person should know."""
-        return (
-            *outliers.told(self.left_out, self.undecided),
-            *determinacy.without_place(self.weight, self.undecided),
-            *determinacy.without_say(self.carries, self.target),
-            *determinacy.weak_layout(self.target_covariance, self.weight, self.station, self.target),
-            *determinacy.weak_targets(self.target, self.target_covariance, self.station),
-            *determinacy.swapped_stations(self.station, self.rough),
-        )
+        of = loops(len(self.target))
+        return np.asarray(of.residuals(self.reading, s.place, s.dead_path, self.extra, s.value, self.target))
 
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
-        return loops(len(self.target)).examine(
+        covariance, redundancy = loops(len(self.target)).examine(
             self.weight, self.station, self.extra, self.target, self.carries,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip
+        return covariance, redundancy
 
     @property
     def station(self) -> Array:
@@ -226,7 +215,7 @@ class Network:
         return own, factor, G
 
     def influence(self) -> Array:
-        """Return what the stations' uncertainty does to all targets at once, (p, m, 3), m.
+        """Return the effect of the stations' uncertainty on all targets, (p, m, 3), m.
 
         One row for each independent part of the stations' covariance: the sources of ``influence`` of an error
         dataset. What is left of ``target_covariance`` is independent from target to target but for the datum's

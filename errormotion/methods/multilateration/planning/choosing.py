@@ -1,61 +1,15 @@
-"""Which targets to measure: what a choice is to make small, as settings say it."""
+"""Candidates for targets, and limits of their number."""
 
 from __future__ import annotations
 
-from typing import Literal, Self
-
 import numpy as np
-from pydantic import Field, model_validator
 
 from errormotion.arrays import Array
-from errormotion.datasets.units import Angle, Length, Time
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.planning.box import Box, Place
-from errormotion.plugins import PluginSettings
+from errormotion.methods.multilateration.settings import Choosing, Position
 
 
-class Choosing(PluginSettings):
-    """Which targets of a grid of candidates are worth their time."""
-
-    count: int | None = Field(default=None, ge=1, description="targets to choose")
-    time: Time | None = Field(default=None, gt=0, description="what one set-up may take, in place of count")
-    time_per_target: Time = Field(default=15.0, gt=0, description="way to a target, wait and reading")
-    candidates: tuple[int, int, int] = Field(default=(7, 7, 7), description="candidates along X, Y and Z")
-    low: Place | None = Field(
-        default=None, description="corner of the box of candidates, axis positions; without: that of the layout"
-    )
-    high: Place | None = Field(default=None, description="opposite corner")
-    travel: Box | None = Field(default=None, description="travel of the axes, in which the candidates have to lie")
-    uncertainty: Literal["axes", "target"] = Field(
-        default="axes",
-        description="of what, anywhere in the box: the error that follows from the errors of the axes, or that of a "
-        "target measured there",
-    )
-    max_order: int = Field(default=4, ge=1, le=15, description="highest order of error motions that are reckoned with")
-    expected_displacement: Length = Field(
-        default=10e-6, gt=0, description="size of error motions to expect, displacements"
-    )
-    expected_rotation: Angle = Field(default=20e-6, gt=0, description="size of error motions to expect, rotations")
-
-    @model_validator(mode="after")
-    def _one_budget(self) -> Self:
-        if (self.count is None) == (self.time is None):
-            raise ValueError("expected count, a number of targets, or time, what a set-up may take: one of both")
-        if (self.low is None) != (self.high is None):
-            raise ValueError("expected low and high, both corners of the box of candidates; found one of them")
-        if min(self.candidates) < 1:
-            raise ValueError(f"candidates: expected 1 or more along every axis; found {self.candidates}")
-        return self
-
-    @property
-    def wanted(self) -> int:
-        """Targets to choose."""
-        if self.count is not None:
-            return self.count
-        return int((self.time or 0.0) / self.time_per_target)
-
-
-def positions(choosing: Choosing, low: Place, high: Place) -> Array:
+def positions(choosing: Choosing, low: Position, high: Position) -> Array:
     """Return the axis positions of the candidates, (k, 3), m; ``low`` and ``high`` are the layout's corners.
 
     Raises
@@ -99,5 +53,5 @@ def refuse_count(wanted: int, candidates: int, stations: int) -> None:
         )
 
 
-def _mm(place: Array | Place) -> str:
+def _mm(place: Array | Position) -> str:
     return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * float(x) for x in place))

@@ -3,60 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
 
 from errormotion.arrays import Array
-from errormotion.datasets.units import Angle, Length
-from errormotion.methods.multilateration.planning.box import Box
-from errormotion.methods.multilateration.planning.choosing import Choosing
-from errormotion.plugins import PluginSettings
+from errormotion.methods.multilateration.settings import Planning
 
 _MARGIN = 1e-9
-
-
-class Planning(PluginSettings):
-    """What places there are for the tracker, what stands in its way, and what is to become small."""
-
-    boxes: tuple[Box, ...] = Field(
-        default=(),
-        description="where the tracker may stand: one box for each station, or one for all; without: anywhere "
-        "between the stations of the layout",
-    )
-    obstacles: tuple[Box, ...] = Field(default=(), description="what no beam passes")
-    reflector_axis: tuple[float, float, float] | None = Field(
-        default=None,
-        description="where the reflector looks, in machine coordinates; without: turned towards each station, and "
-        "left so for all targets",
-    )
-    acceptance: Angle = Field(
-        default=float(np.radians(60.0)),
-        gt=0,
-        le=float(np.pi),
-        description="largest angle between that direction and the beam",
-    )
-    nearest: Length = Field(default=0.1, ge=0, description="least distance from tracker to reflector")
-    minimise: Literal["largest", "mean"] = Field(
-        default="largest", description="which of the targets' uncertainties: the largest one, or their mean"
-    )
-    targets: Choosing | None = Field(
-        default=None, description="choose the targets as well; without: those of the layout"
-    )
-    write: Path | None = Field(
-        default=None, description="file for the best layout, as settings of a campaign (TOML); none is replaced"
-    )
-
-    @model_validator(mode="after")
-    def _looks_somewhere(self) -> Self:
-        if self.reflector_axis is not None and not any(self.reflector_axis):
-            raise ValueError(
-                "reflector_axis: expected a direction; found (0, 0, 0); leave it out or say where it looks"
-            )
-        return self
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from errormotion.methods.multilateration.settings import Layout
 
-    Array = Array
-
 _ACROSS, _LEVELS = 7, 3
 
 

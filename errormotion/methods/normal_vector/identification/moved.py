@@ -164,9 +164,8 @@ class _Level:
         self.chi2, self.freedom, self.stated = found.chi2, found.freedom, stated
         self.robust = np.inf
         if found.freedom > ENOUGH_FOR_MEDIAN:
-            self.robust = float(np.median(self.square[self.judged])) / (
-                2 * special.gammaincinv(0.5, 0.5)
-            )  # median of chi-square
+            median_of_chi2 = float(2 * special.gammaincinv(0.5, 0.5))
+            self.robust = float(np.median(self.square[self.judged])) / median_of_chi2
 
     def scale(self, gain: Array, unknowns: int) -> Array:
         """Return the remaining variance of a number of weight 1 after a gain."""

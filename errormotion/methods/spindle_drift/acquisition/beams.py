@@ -1,6 +1,6 @@
-"""Measuring where the beams are: the record of a sphere that the machine steps through each of them.
+"""Acquisition of a beam detection: the machine steps a sphere through each beam.
 
-Every sample is kept, before its steps are looked for.
+Every sample is stored; the rests are found in the record by the identification.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.kinematics.beams import across
-from errormotion.methods.spindle_drift.acquisition.drift import HAND_OVER_SECONDS
+from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_DURATION
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
 
-    The machine needs no synchronous reading: it steps by its own clock, and the steps are found in the record. A scan
-    that an interruption cut off is made anew, as another attempt.
+    Sensor and machine need no synchronisation: the rests are found in the record. An interrupted scan is repeated as
+    another attempt.
     """
     frame = bench.of_kind("spindle_frame")
     if not bench.has_kind("controller"):
         raise MethodError(
-            "A beam detection steps a sphere through the beams and needs an instrument of kind 'controller' to move "
-            "it; the bench has none. Give the beams of an earlier detection, or measure with the nominal ones."
+            "A beam detection needs an instrument of kind 'controller' that moves the sphere; the bench has none. Use "
+            "the beams of an earlier detection, or the nominal beams."
         )
     controller = bench.of_kind("controller")
     static = _scan_plan(bench, frame, settings)
@@ -60,7 +60,7 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
 
 
 def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
-    """Return, for each scan, the number of its last attempt and how many samples that one has."""
+    """Return for each scan the number of its last attempt and the number of samples of that attempt."""
     scan, attempt = raw["scan"].values.astype(np.int64), raw["attempt"].values.astype(np.int64)
     last: dict[int, tuple[int, int]] = {}
     for number in np.unique(scan):
@@ -70,7 +70,7 @@ def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
 
 
 def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
-    """Return everything of a beam detection but its samples."""
+    """Return a beam detection without its samples."""
     g = frame.geometry
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
     scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in g.nominal_direction])
@@ -102,7 +102,7 @@ def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
 
 
 def machine_axes(direction: Array) -> Array:
-    """Return the two machine axes across a beam; for a beam far from all axes, two vectors across it."""
+    """Return the two machine axes across a beam; for a beam oblique to all axes, two vectors across it."""
     axis = int(np.argmax(np.abs(direction)))
     if abs(direction[axis]) < 0.9:
         return across(direction)
@@ -132,13 +132,13 @@ def _record_scan(
         for samples in frame.stream([name]):
             waiting.append(samples.values[0, : length - taken])
             taken += waiting[-1].size
-            if taken == length or time.monotonic() - since >= HAND_OVER_SECONDS:
+            if taken == length or time.monotonic() - since >= CHUNK_DURATION:
                 yield chunk()
                 since = time.monotonic()
             if taken == length:
                 return
     except InstrumentError:
-        if waiting:  # what came before it went wrong is not lost
+        if waiting:  # samples before the failure are kept
             yield chunk()
         raise
     raise MethodError(f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.")

@@ -1,6 +1,6 @@
-"""Measuring a drift: the record of five channels on one clock, with what the thermometers say beside it.
+"""Acquisition of a drift: the record of five channels on one clock, and the temperatures.
 
-Everything that a sensor said goes into the raw dataset, sample by sample, before anything is computed from it.
+Every sample of the sensors is stored in the raw dataset before anything is computed from it.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HAND_OVER_SECONDS = 0.4
-"""A chunk is handed over at least this often, so that a crash loses little."""
-HAND_OVER_SAMPLES = 1 << 18
-POLL_SECONDS = 2.0
-"""Temperatures are asked for this often, in seconds of the record."""
-PATIENCE = 30
-"""So many polls in a row may a thermometer fail before the record is given up."""
+CHUNK_DURATION = 0.4
+"""Longest duration of a chunk, s: a crash loses no more than this."""
+CHUNK_SAMPLES = 1 << 18
+"""Largest number of samples of a chunk."""
+POLL_INTERVAL = 2.0
+"""Interval between readings of the thermometer, s of the record."""
+MAX_FAILED_POLLS = 30
+"""Number of consecutive failed readings of the thermometer after which the record is aborted."""
 
 
 def record_drift(
@@ -47,12 +48,12 @@ def record_drift(
     Parameters
     ----------
     bench : Bench
-        With a ``spindle_frame``; a ``controller`` and a ``thermometer`` where there are.
+        With a ``spindle_frame``; ``controller`` and ``thermometer`` are optional.
     settings : Settings
     beams : Dataset, optional
-        Error dataset of a beam detection; without it the nominal beams count.
+        Error dataset of a beam detection; default the nominal beams.
     done : Dataset, optional
-        What an interrupted run holds. On a real machine time went on meanwhile: the gap is filled with NaN.
+        Data of an interrupted run. On a real machine the time of the interruption is filled with NaN.
     """
     frame = bench.of_kind("spindle_frame")
     rate = float(frame.rate)
@@ -67,29 +68,29 @@ def record_drift(
         due = min(_missed(done, rate), total)
         while pending.end < due:
             pending.fill_gap(due)
-            yield pending.hand_over()
+            yield pending.chunk()
     try:
         for samples in frame.stream():
             pending.add(samples, total)
             if pending.due or pending.end >= total:
-                yield pending.hand_over()
+                yield pending.chunk()
             if pending.end >= total:
                 return
     except InstrumentError:
-        if pending.samples:  # what came before it went wrong is not lost
-            yield pending.hand_over()
+        if pending.samples:  # samples before the failure are kept
+            yield pending.chunk()
         raise
     raise MethodError(f"The stream ended at {pending.end / rate:.1f} s of {settings.duration:g} s.")
 
 
 def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
-    """Mount the bar and start the schedule; return whether the machine is a virtual one, whose time can be set."""
+    """Mount the bar and start the schedule; return whether the machine is virtual, so that its time can be set."""
     if not bench.has_kind("controller"):
         speeds = ", ".join(
             f"{e.spindle_speed:g} /min at {e.at:g} s" for e in settings.schedule if e.spindle_speed is not None
         )
         if elapsed == 0.0:
-            bench.ask(f"Mount the bar and start the spindle ({speeds or 'it stands still'}).")
+            bench.ask(f"Mount the bar and start the spindle ({speeds or 'no rotation'}).")
         return False
     controller = bench.of_kind("controller")
     virtual = hasattr(controller, "elapse")
@@ -107,20 +108,20 @@ def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
 
 
 def _missed(done: xr.Dataset, rate: float) -> int:
-    """Return the sample number that is due now, from the record's start in UTC."""
+    """Return the number of the present sample, from the start of the record in UTC."""
     start = str(done.attrs.get("start", ""))
     try:
-        begun = datetime.fromisoformat(start)
+        started = datetime.fromisoformat(start)
     except ValueError as error:
         raise MethodError(
-            f"The interrupted record does not say when it began (attribute start = '{start}'; expected UTC such as "
-            "2025-03-01T08:00:00+00:00), so that it cannot be gone on with. Start a new run."
+            f"The interrupted record cannot be continued: attribute start = '{start}'; expected UTC such as "
+            "2025-03-01T08:00:00+00:00. Start a new run."
         ) from error
-    return round((datetime.now(UTC) - begun).total_seconds() * rate)
+    return round((datetime.now(UTC) - started).total_seconds() * rate)
 
 
 def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | None) -> xr.Dataset:
-    """Return everything of a raw dataset but its samples."""
+    """Return a raw dataset without its samples."""
     g = frame.geometry
     labels = {"channel": list(CHANNELS), "direction": list("xyz"), "height": ["L1", "L2"]}
     origin, direction = g.nominal_origin, g.nominal_direction
@@ -151,7 +152,7 @@ def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | No
 
 @dataclass
 class _Pending:
-    """Samples on their way from the instruments to the next chunk."""
+    """Samples that were read and are not yet in a chunk."""
 
     static: xr.Dataset
     rate: float
@@ -160,7 +161,7 @@ class _Pending:
     thermometer: Any
     encoding: Mapping[str, Any]
     blocks: list[Array] = field(default_factory=list)
-    warmth: list[NDArray[np.float32]] = field(default_factory=list)
+    temperatures: list[NDArray[np.float32]] = field(default_factory=list)
     samples: int = 0
     dropped: int = 0
     invalid: dict[str, int] = field(default_factory=dict)
@@ -170,76 +171,76 @@ class _Pending:
         self._polled = -np.inf
         self._failures = 0
         self._sensors: list[str] = []
-        self._warmth = np.zeros(0, np.float32)
+        self._temperature = np.zeros(0, np.float32)
         if self.thermometer is not None:
-            reading = self.thermometer.read()  # the names; a thermometer that is not there shows before the bar turns
+            reading = self.thermometer.read()  # for the names, and to detect a missing thermometer before the bar turns
             self._sensors = [str(name) for name in reading]
 
     @property
     def due(self) -> bool:
-        """Whether a chunk is large or old enough."""
-        return self.samples >= HAND_OVER_SAMPLES or time.monotonic() - self._since >= HAND_OVER_SECONDS
+        """Whether the chunk has its largest duration or size."""
+        return self.samples >= CHUNK_SAMPLES or time.monotonic() - self._since >= CHUNK_DURATION
 
     def add(self, block: Samples, total: int) -> None:
-        """Take in a block of samples, up to ``total`` of the whole record."""
+        """Add a block of samples, up to ``total`` samples of the record."""
         values = block.values[:, : total - self.end]
         if "start" not in self.static.attrs:
-            begun = datetime.now(UTC) - timedelta(seconds=values.shape[1] / self.rate)
-            self.static.attrs["start"] = begun.isoformat(timespec="milliseconds")
-        if self.thermometer is not None and self.end / self.rate - self._polled >= POLL_SECONDS:
+            started = datetime.now(UTC) - timedelta(seconds=values.shape[1] / self.rate)
+            self.static.attrs["start"] = started.isoformat(timespec="milliseconds")
+        if self.thermometer is not None and self.end / self.rate - self._polled >= POLL_INTERVAL:
             self._poll()
-        self._take(values, self._warmth)
+        self._take(values, self._temperature)
         self.dropped += block.dropped
         for reason, count in block.invalid.items():
             self.invalid[reason] = self.invalid.get(reason, 0) + count
 
     def fill_gap(self, until: int) -> None:
-        """Fill with NaN, a chunk at most, up to a sample number: nobody measured there."""
-        missing = min(until - self.end, HAND_OVER_SAMPLES)
+        """Fill an interruption with NaN up to a sample number, at most one chunk."""
+        missing = min(until - self.end, CHUNK_SAMPLES)
         self._take(np.full((len(CHANNELS), missing), np.nan), np.full(len(self._sensors), np.nan, np.float32))
         self.dropped += missing * len(CHANNELS)
 
-    def _take(self, values: Array, warmth: NDArray[np.float32]) -> None:
+    def _take(self, values: Array, temperature: NDArray[np.float32]) -> None:
         self.blocks.append(values)
-        self.warmth.append(np.tile(warmth, (values.shape[1], 1)))
+        self.temperatures.append(np.tile(temperature, (values.shape[1], 1)))
         self.end += values.shape[1]
         self.samples += values.shape[1]
 
     def _poll(self) -> None:
-        """Ask for the temperatures; a failure is NaN and counted, since hours of readings depend on no thermometer."""
+        """Read the temperatures; a failure is counted and gives NaN, and does not abort the record."""
         self._polled = self.end / self.rate
         try:
             reading = self.thermometer.read()
         except InstrumentError as error:
             self._failures += 1
-            if self._failures > PATIENCE:
+            if self._failures > MAX_FAILED_POLLS:
                 raise
-            log.warning("no temperatures at %.1f s: %s", self._polled, error)
-            self.invalid["thermometer silent"] = self.invalid.get("thermometer silent", 0) + 1
-            self._warmth = np.full(len(self._sensors), np.nan, np.float32)
+            log.warning("temperatures missing at %.1f s: %s", self._polled, error)
+            self.invalid["thermometer without answer"] = self.invalid.get("thermometer without answer", 0) + 1
+            self._temperature = np.full(len(self._sensors), np.nan, np.float32)
             return
         self._failures = 0
-        self._warmth = np.array([reading.get(name, np.nan) for name in self._sensors], np.float32)
+        self._temperature = np.array([reading.get(name, np.nan) for name in self._sensors], np.float32)
 
-    def hand_over(self) -> xr.Dataset:
-        """Return all pending samples as a dataset."""
+    def chunk(self) -> xr.Dataset:
+        """Return all pending samples as a dataset, and remove them."""
         first = self.end - self.samples
         ds = self.static.copy()
         ds["distance"] = (("channel", "time"), np.concatenate(self.blocks, axis=1), {"units": "m"})
         ds["distance"].encoding = dict(self.encoding)
         if self.thermometer is not None:
             ds = ds.assign_coords(sensor=self._sensors)
-            ds["temperature"] = (("time", "sensor"), np.concatenate(self.warmth), {"units": "degC"})
+            ds["temperature"] = (("time", "sensor"), np.concatenate(self.temperatures), {"units": "degC"})
         if any(e.spindle_speed is not None for e in self.settings.schedule):
             ds["spindle_speed"] = ("time", self._speed(first), {"units": "1/min"})
         ds.attrs |= {"time_start": first / self.rate, "dropped": self.dropped, "invalid": dict(self.invalid)}
-        self.blocks, self.warmth, self.samples, self.dropped, self.invalid = [], [], 0, 0, {}
+        self.blocks, self.temperatures, self.samples, self.dropped, self.invalid = [], [], 0, 0, {}
         self._since = time.monotonic()
         return ds
 
     def _speed(self, first: int) -> NDArray[np.float32]:
         """Return the commanded spindle speed of the pending samples, 1/min; zero before the first command."""
-        orders = sorted((e.at, e.spindle_speed) for e in self.settings.schedule if e.spindle_speed is not None)
-        starts = np.array([at for at, _ in orders]) * self.rate
-        speeds = np.array([0.0, *(speed for _, speed in orders)], np.float32)
+        commands = sorted((e.at, e.spindle_speed) for e in self.settings.schedule if e.spindle_speed is not None)
+        starts = np.array([at for at, _ in commands]) * self.rate
+        speeds = np.array([0.0, *(speed for _, speed in commands)], np.float32)
         return speeds[np.searchsorted(starts, np.arange(first, self.end), side="right")]

@@ -1,4 +1,4 @@
-"""Beams that earlier tests have found: those of the whole frame, or one after the other, by the channels' names."""
+"""Beams from earlier tests: of the whole frame, or single beams under the names of their channels."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 WHOLE = "beams"
-NEEDED = ("beam_origin", "beam_direction", "beam_covariance")
+"""Name of an input that holds all beams."""
+REQUIRED = ("beam_origin", "beam_direction", "beam_covariance")
 
 
 def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
-    """Return origin, direction and covariance of the beams over ``beam`` (X1 X2 Y1 Y2 Z), None where none are given.
+    """Return origin, direction and covariance of the beams over ``beam`` (X1 X2 Y1 Y2 Z), None without inputs.
 
     Parameters
     ----------
     inputs : mapping of str to Dataset
-        Error datasets of component ``beam``: ``beams`` holds all five; X1, X2, Y1, Y2, Z hold one each, whatever it is
-        called there, and go before those in ``beams``.
+        Error datasets of component ``beam``: ``beams`` holds all five; X1, X2, Y1, Y2, Z hold one each, under any name,
+        and take precedence over ``beams``.
 
     Raises
     ------
     MethodError
-        An input of another name, not one beam where one is expected, a channel without a beam, or a beam without a
+        An input of another name, several beams where one is expected, a channel without a beam, or a beam without a
         known zero point.
     """
     unknown = sorted(set(inputs) - {WHOLE, *CHANNELS})
@@ -53,27 +54,27 @@ def _beam(inputs: Mapping[str, xr.Dataset], channel: str) -> xr.Dataset:
     key = channel if channel in inputs else WHOLE
     if key not in inputs:
         raise MethodError(
-            f"inputs: no beam for {channel}; given are {', '.join(inputs)}. Give one for each of "
+            f"inputs: no beam for {channel}; found {', '.join(inputs)}. Expected one for each of "
             f"{', '.join(CHANNELS)}, or all of them as '{WHOLE}'."
         )
     ds = inputs[key]
-    missing = [name for name in NEEDED if name not in ds.variables]
+    missing = [name for name in REQUIRED if name not in ds.variables]
     if missing:
         raise MethodError(
-            f"inputs: '{key}' is no result of a beam detection or beam direction: it has no {', '.join(missing)}"
+            f"inputs: '{key}' is not the result of a beam detection or beam direction; missing: {', '.join(missing)}"
         )
     if key == WHOLE:
         if channel not in ds["beam"].values:
             names = ", ".join(str(name) for name in ds["beam"].values)
             raise MethodError(f"inputs: '{key}' holds the beams {names}; expected {channel} as well")
-        one = ds[list(NEEDED)].sel(beam=[channel])
+        one = ds[list(REQUIRED)].sel(beam=[channel])
     else:
         if ds.sizes.get("beam") != 1:
             raise MethodError(f"inputs: expected one beam in '{key}'; found {ds.sizes.get('beam', 0)}")
-        one = ds[list(NEEDED)].assign_coords(beam=[channel])
+        one = ds[list(REQUIRED)].assign_coords(beam=[channel])
     if not np.isfinite(one["beam_origin"].values).all():
         raise MethodError(
-            f"inputs: the zero point of beam {channel} is not known: its planes had no known points. Measure it on "
-            "three planes with known points (layout.pivot), or by a beam detection."
+            f"inputs: the zero point of beam {channel} is unknown, because its planes had no known points. Measure it "
+            "on three planes with known points (layout.pivot), or by a beam detection."
         )
     return one.transpose("beam", ...).reset_coords(drop=True)

@@ -1,4 +1,4 @@
-"""The drift while it is being measured: the last mean against the reference state, chunk by chunk."""
+"""The drift during the measurement: the last mean relative to the reference state."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ _ARCSEC = np.degrees(1.0) * 3600.0
 
 
 class LiveDrift:
-    """Follow a drift record; holds one unfinished mean and the reference state, however long the record is.
+    """Errors of a drift record while it is acquired, in constant memory.
 
-    A view for the person at the machine: without uncertainty and without the frame's expansion. What counts is
-    identified from the whole record afterwards.
+    For the operator: without uncertainty, and not corrected for the expansion of the frame. The result is identified
+    from the whole record afterwards.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
-        self._begin: float | None = None
+        self._start: float | None = None
         self._reference: State | None = None
         self.errors = np.full(6, np.nan)
 
     def update(self, chunk: xr.Dataset) -> str:
-        """Take in a chunk of the raw dataset; return the errors of its last known mean as a line of text."""
+        """Add a chunk of the raw dataset; return the errors of its last known mean as a line of text."""
         for time, part in slices(chunk):
-            if self._begin is None:
-                self._begin = float(time[0])
+            if self._start is None:
+                self._start = float(time[0])
             found = self._averager.update(time, part["distance"].transpose("channel", "time").values)
             known = np.isfinite(found.mean).all(axis=0)
-            wanted = self._settings.reference_time
-            known &= found.time >= self._begin + (self._settings.spin_up if wanted is None else wanted)
+            reference_time = self._settings.reference_time
+            known &= found.time >= self._start + (self._settings.spin_up if reference_time is None else reference_time)
             if known.any():
-                self._take(found.mean[:, known], chunk)
+                self._evaluate(found.mean[:, known], chunk)
         return self.text()
 
-    def _take(self, mean: Array, chunk: xr.Dataset) -> None:
+    def _evaluate(self, mean: Array, chunk: xr.Dataset) -> None:
         origin, direction = chunk["beam_origin"].values, chunk["beam_direction"].values
         levels, radius = chunk["level"].values, float(chunk["bar_radius"])
 
@@ -60,7 +60,7 @@ class LiveDrift:
         self.errors = twist(state(mean[:, -1:]), self._reference, self._reference.E[0])[0]
 
     def text(self) -> str:
-        """Return the last errors in the units of the field; empty before there are any."""
+        """Return the last errors in the units of the field; empty before the first errors."""
         if not np.isfinite(self.errors[:5]).all():
             return ""
         x, y, z = self.errors[:3] * 1e6

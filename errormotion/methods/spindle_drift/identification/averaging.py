@@ -1,7 +1,7 @@
 """Averages of fixed length over records of any length.
 
-A drift record is billions of samples that become one mean every half second. It is read in slices, so that a record
-larger than memory needs constant space. Large slices are added up by `averaging_kernels`, small ones by numpy.
+A drift record of billions of samples is reduced to one mean every half second. It is read in slices, so that it needs
+constant memory. Large slices are added up by `averaging_kernels`, small ones by numpy.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def window_sums(
     Parameters
     ----------
     values : ndarray, float32 or float64, (channel, sample)
-        In either memory order: the transposed view of a (sample, channel) array is read as it lies.
+        In either memory order; the transposed view of a (sample, channel) array is not copied.
     edges : ndarray, int64, (window + 1,)
         Sample indices, not decreasing.
     threads : int, optional
@@ -57,7 +57,7 @@ def window_sums(
 
 def _small_window_sums(values: NDArray[Any], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     valid = ~np.isnan(values)
-    # Numpy adds contiguous rows pairwise, which keeps the rounding error small. Empty windows are not its concern.
+    # Numpy adds contiguous rows pairwise, which keeps the rounding error small; it has no empty windows.
     filled = np.where(valid, values, 0.0).astype(np.float64, order="C")
     full = np.flatnonzero(np.diff(edges) > 0)
     sums, counts = np.zeros((len(values), edges.size - 1)), np.zeros((len(values), edges.size - 1), np.int64)
@@ -92,19 +92,19 @@ class Averages:
 
 
 class Averager:
-    """Average a stream of blocks into windows of fixed length; holds one unfinished window at most.
+    """Averages of a stream of blocks in windows of fixed length; at most one unfinished window is in memory.
 
-    Window k covers the times from ``start + k * length`` to ``start + (k + 1) * length``. Where the samples lie
-    further apart than half a window, every sample is a window of its own.
+    Window k covers the times from ``start + k * length`` to ``start + (k + 1) * length``. Where the interval
+    of the samples is longer than half a window, every sample is its own window.
     """
 
     def __init__(self, channels: int, length: float, minimum: float = 0.5, threads: int | None = None) -> None:
         self._threads = threads
         self._length, self._minimum = length, minimum
         self._start = np.nan
-        self._own: bool | None = None
-        self._lone: tuple[Array, NDArray[np.floating[Any]]] | None = None
-        self._slack = self._full = 0.0
+        self._single: bool | None = None
+        self._first: tuple[Array, NDArray[np.floating[Any]]] | None = None
+        self._tolerance = self._full = 0.0
         self._index = -1
         self._sum = np.zeros(channels)
         self._count = np.zeros(channels, np.int64)
@@ -112,27 +112,27 @@ class Averager:
         self._samples = 0
 
     def update(self, time: Array, values: NDArray[np.floating[Any]]) -> Averages:
-        """Take in ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
+        """Add ``values`` (channel, sample) at ``time`` (sample,); return the windows that are now complete."""
         if time.size == 0:
             return self._averages([], [], [], [])
-        if self._lone is not None:
-            time, values = np.append(self._lone[0], time), np.concatenate([self._lone[1], values], axis=1)
-            self._lone = None
-        if self._own is None:
-            if time.size == 1:  # one sample does not tell how far apart they lie
-                self._lone = time.copy(), values.copy()
+        if self._first is not None:
+            time, values = np.append(self._first[0], time), np.concatenate([self._first[1], values], axis=1)
+            self._first = None
+        if self._single is None:
+            if time.size == 1:  # the interval of the samples is not known yet
+                self._first = time.copy(), values.copy()
                 return self._averages([], [], [], [])
             self._start = float(time[0])
             interval = float(np.median(np.diff(time[:1000])))
-            self._own = interval > 0.5 * self._length
-            self._slack = 0.5 * interval / self._length
+            self._single = interval > 0.5 * self._length
+            self._tolerance = 0.5 * interval / self._length
             self._full = self._length / interval
-        if self._own:
-            return _each(time, values)
-        # Half a sample of slack forgives the rounding of times that were written as decimals.
-        first = int(np.floor((time[0] - self._start) / self._length + self._slack))
-        last = int(np.floor((time[-1] - self._start) / self._length + self._slack))
-        bounds = self._start + (np.arange(first + 1, last + 1) - self._slack) * self._length
+        if self._single:
+            return _samples_as_windows(time, values)
+        # The tolerance of half a sample covers the rounding of times that were written as decimals.
+        first = int(np.floor((time[0] - self._start) / self._length + self._tolerance))
+        last = int(np.floor((time[-1] - self._start) / self._length + self._tolerance))
+        bounds = self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length
         edges = np.concatenate([[0], np.searchsorted(time, bounds), [time.size]]).astype(np.int64)
         sums, counts = window_sums(values, edges, self._threads)
         samples = np.diff(edges)
@@ -158,9 +158,9 @@ class Averager:
         return self._averages(done_sum, done_count, done_time, done_samples)
 
     def finish(self) -> Averages:
-        """Return the last window, if enough of it was there to average the run-out away."""
-        if self._lone is not None:
-            return _each(*self._lone)
+        """Return the last window, if it is long enough to average out the run-out."""
+        if self._first is not None:
+            return _samples_as_windows(*self._first)
         if not self._samples or self._samples < _LEAST_WINDOW * self._full:
             return self._averages([], [], [], [])
         last = self._averages([self._sum], [self._count], [self._time], [self._samples])
@@ -177,8 +177,8 @@ class Averager:
         return Averages(np.array(times) / np.maximum(expected, 1), mean, count, expected)
 
 
-def _each(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
-    """Return every sample as a window of its own."""
+def _samples_as_windows(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
+    """Return every sample as its own window."""
     counts = np.isfinite(values).astype(np.int64)
     return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
 
@@ -205,8 +205,8 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
     if chunk > 1:
         step = max(1, step // chunk) * chunk
     positions = np.arange(min(step, samples), dtype=np.float64)
-    for begin in range(0, samples, step):
-        part = raw.isel(time=slice(begin, begin + step))
+    for first in range(0, samples, step):
+        part = raw.isel(time=slice(first, first + step))
         clock = part.xindexes.get("time")
         if isinstance(clock, RangeIndex):  # its own values, without its integers
             time = positions[: part.sizes["time"]] * clock.step
@@ -214,7 +214,7 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Array, xr.Dataset]]:
         elif "time" in raw.variables:
             time = np.asarray(part["time"].values, np.float64)
         elif "sample_rate" in raw.attrs:
-            index = np.arange(begin, min(begin + step, samples))
+            index = np.arange(first, min(first + step, samples))
             time = float(raw.attrs.get("time_start", 0.0)) + index / float(raw.attrs["sample_rate"])
         else:
             raise MethodError(

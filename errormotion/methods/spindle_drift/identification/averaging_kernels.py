@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 
-# Reassociation lets the compiler add in vectors; NaN keeps its meaning, since the kernels test for it.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 

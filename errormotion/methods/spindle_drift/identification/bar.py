@@ -1,17 +1,17 @@
-"""Where the bar is, from five distances: the axis of a cylinder of known radius, and its end face.
+"""Position of the bar from five distances: the axis of a cylinder of known radius, and its end face.
 
 The axis is the line through A = (x1, y1, L1) and B = (x2, y2, L2); q = (x1, y1, x2, y2) are the four unknowns of the
 four side readings. A beam with origin P, direction u and reading d touches the bar at S = P + u d, and
 
     g_i(q) = |S_i - line(q)| - r = 0,   i = X1, X2, Y1, Y2
 
-is solved by Newton's method for every instant on its own. With n the unit vector from the axis to S and tau the place
-of its foot on AB, the derivative is exact and short:
+is solved by Newton's method for every instant. With n the unit vector from the axis to S and tau the position of its
+foot on AB, the derivative is
 
     dg = n . (dP + u dd + d du) - dr - n . ((1 - tau) dA + tau dB)
 
 The end face is the plane through S_Z at right angles to the axis; E, where the axis meets it, carries the Z motion.
-Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives our own.
+Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives by the authors of this package.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def _fit(distance: Array, origin: Array, direction: Array, radius: float, z1: fl
 
 
 def start_axis(origin: Array, direction: Array, distance: Array, radius: float, levels: Array) -> Array:
-    """Return a starting axis (4,) from one set of readings: every side beam goes on to the bar's middle.
+    """Return a starting axis (4,) from one set of readings, as if every side beam pointed to the middle of the bar.
 
-    Each side beam i gives one equation for the axis at its own height: along its horizontal direction the axis lies a
-    radius behind the surface point. Four such equations are linear in q. Singular (parallel) beams give NaN.
+    Each side beam i gives one equation for the axis at its height: in its horizontal direction the axis is one radius
+    behind the surface point. The four equations are linear in q. Singular (parallel) beams give NaN.
     """
     point = origin[:SIDE] + direction[:SIDE] * distance[:SIDE, None]
     flat = direction[:SIDE].copy()
@@ -85,7 +85,7 @@ def fit_axis(
     Parameters
     ----------
     distance : ndarray (>= 4, instant)
-        Readings of X1, X2, Y1, Y2 in this order, m; further rows are not looked at.
+        Readings of X1, X2, Y1, Y2 in this order, m; further rows are ignored.
     origin, direction : ndarray (>= 4, 3)
         Beams: zero point, m, and unit vector.
     radius : float
@@ -93,7 +93,7 @@ def fit_axis(
     levels : ndarray (2,)
         Heights L1, L2 at which the axis is given, m.
     start : ndarray (4,), optional
-        Where Newton's method starts; default from the first instant without NaN.
+        Start of Newton's method; default from the first instant without NaN.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, leve
 
 
 def state_jacobian(q: Array, distance: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
-    """Return the derivatives of axis direction a and end point E with respect to all that was read and assumed.
+    """Return the derivatives of axis direction a and end point E by readings, beams and bar radius.
 
     Parameters
     ----------

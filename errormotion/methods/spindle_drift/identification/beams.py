@@ -1,13 +1,14 @@
-"""Where a beam starts and where it goes, from readings on a sphere that the machine steps through it.
+"""Origin and direction of a beam, from readings on a sphere that the machine steps through it.
 
-Two estimators see the same readings. The likelihood fit adjusts five unknowns (origin P, direction u of unit length) to
+Two estimators use the same readings. The likelihood fit adjusts five unknowns (origin P, direction u of unit length) to
 every reading through the intersection of ray and sphere,
 
     |P + u d - C| = r  on the near side,   so   dd = -(n . (dP + d du - dC) - dr) / (n . u),
 
-n the outward normal where the beam touches; it is efficient, and its covariance follows from the readings' scatter. The
-construction of the paper takes from each profile only where the reading is least: there the touched point lies on a
-circle of radius r about the sphere's centre, at right angles to the scan; the beam is the line nearest all circles.
+n the outward normal at the point where the beam meets the sphere; it is efficient, and its covariance follows from the
+scatter of the readings. The construction of the paper uses only the smallest reading of each profile: the point is then
+on a circle of radius r about the centre of the sphere, perpendicular to the scan; the beam is the line nearest to all
+circles.
 Source: Geiselhart et al. (euspen 2024), section 2.3.
 """
 
@@ -29,8 +30,9 @@ if TYPE_CHECKING:
 UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""
 _OUTLIER = 6.0
-"""Readings further than this many (robust) standard deviations off are left out and named."""
+"""Robust standard deviations from which on a reading is an outlier; outliers are ignored and reported."""
 _LEAST_USED = 0.7
+"""Smallest share of the readings that must not be outliers."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,11 @@ class Beam:
     covariance : ndarray (6, 6)
         Of (origin, direction), SI; rank 5, since the direction keeps its length.
     noise : float
-        Standard deviation of one reading as the residuals show it, m.
+        Standard deviation of one reading, from the residuals, m.
     residual : ndarray (profile, step)
         Reading minus model, m; NaN where there was no reading.
     left_out : ndarray of int64 (k, 2)
-        (profile, step) of readings that were left out as outliers.
+        (profile, step) of outliers.
     """
 
     origin: Array
@@ -89,24 +91,25 @@ def likelihood_fit(
     radius : float
         Sphere radius, m.
     origin, direction : ndarray (3,)
-        Where to start: the nominal beam.
+        Start of the fit: the nominal beam.
     name : str
-        What to call the beam in messages.
+        Name of the beam in messages.
 
     Raises
     ------
     MethodError
-        Too few readings, readings that leave a freedom of the beam open, or no convergence.
+        Too few readings, readings that do not determine the beam, or no convergence.
     """
     used = np.isfinite(distance) & np.isfinite(centre).all(axis=-1)
     if used.sum() <= UNKNOWNS:
         raise MethodError(
-            f"Beam {name}: {used.sum()} of {used.size} readings are valid; a beam has {UNKNOWNS} unknowns and needs "
-            "more."
+            f"Beam {name}: {used.sum()} of {used.size} readings are valid; expected more than {UNKNOWNS}, the number "
+            "of "
+            "unknowns."
         )
     direction = direction / np.linalg.norm(direction)
     origin, direction = _first_shift(distance, centre, radius, origin, direction, used)
-    everything = used.copy()
+    valid = used.copy()
     while True:
         origin, direction, jacobian = _gauss_newton(distance, centre, radius, origin, direction, used, name)
         residual = distance - sphere_reading(origin, direction, centre, radius)[0]
@@ -115,31 +118,31 @@ def likelihood_fit(
         if not outlier.any():
             break
         used = used & ~outlier
-        if used.sum() < _LEAST_USED * everything.sum():
+        if used.sum() < _LEAST_USED * valid.sum():
             raise MethodError(
-                f"Beam {name}: more than {1 - _LEAST_USED:.0%} of the readings lie far off any beam. Check that the "
-                "sphere centres belong to the readings."
+                f"Beam {name}: more than {1 - _LEAST_USED:.0%} of the readings do not fit any beam. Check that the "
+                "sphere "
+                "centres belong to the readings."
             )
     freedom = int(used.sum()) - UNKNOWNS
     noise = float(np.sqrt(np.sum(residual[used] ** 2) / freedom))
     size = np.linalg.norm(jacobian, axis=0)
     if not size.all() or np.linalg.cond(jacobian / size) > 1e6:
         raise MethodError(
-            f"Beam {name}: the scans leave a freedom of the beam open. Expected profiles at two or more distances, "
+            f"Beam {name}: the scans do not determine the beam. Expected profiles at two or more distances, "
             "each along both directions across the beam."
         )
     small = noise**2 * np.linalg.inv(jacobian.T @ jacobian)
     chart = np.zeros((6, UNKNOWNS))
     chart[:3, :3] = np.eye(3)
     chart[3:, 3:] = across(direction).T
-    lost = everything & ~used
-    return Beam(origin, direction, chart @ small @ chart.T, noise, residual, np.argwhere(lost))
+    return Beam(origin, direction, chart @ small @ chart.T, noise, residual, np.argwhere(valid & ~used))
 
 
 def _first_shift(
     distance: Array, centre: Array, radius: float, origin: Array, direction: Array, used: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Shift the nominal beam so that it meets the spheres: across from the profiles' lowest points, then along."""
+    """Shift the nominal beam to the spheres: across by the smallest readings of the profiles, then along."""
     lowest = np.where(used, distance, np.inf).argmin(axis=1)
     seen = used.any(axis=1)
     nearest = centre[seen, lowest[seen]].mean(axis=0)
@@ -173,7 +176,7 @@ def _gauss_newton(
                 return origin, direction, jacobian[used]
             break
     raise MethodError(
-        f"Beam {name}: the fit does not settle. Check the nominal origin and direction (m, machine coordinates), the "
+        f"Beam {name}: the fit does not converge. Check the nominal origin and direction (m, machine coordinates), the "
         f"sphere radius ({radius * 1e3:g} mm) and that the sphere centres belong to the readings."
     )
 
@@ -197,17 +200,17 @@ def circles_and_line(
         Nominal direction of the beam.
     """
     middles, lowest = [], []
-    for readings, places, v in zip(distance, centre, scan, strict=True):
+    for readings, centres, v in zip(distance, centre, scan, strict=True):
         good = np.isfinite(readings)
         if good.sum() < 4:
             continue
-        s = (places - places[0]) @ v
+        s = (centres - centres[0]) @ v
         arc = _arc(s[good], readings[good], radius)
-        middles.append((places[0] + arc[0] * v, v))
+        middles.append((centres[0] + arc[0] * v, v))
         lowest.append(arc[1])
     if len(middles) < 4:
         return np.full(3, np.nan), np.full(3, np.nan)
-    C = np.array([place for place, _ in middles])
+    C = np.array([middle for middle, _ in middles])
     V = np.array([v for _, v in middles])
     basis = across(direction)
     anchor = C.mean(axis=0)
@@ -217,7 +220,7 @@ def circles_and_line(
         return anchor + (p[:2] * radius) @ basis, u / np.linalg.norm(u)
 
     def crossing(point: Array, u: Array) -> Array:
-        """Parameter along the line where its shadow in each circle's plane enters the circle."""
+        """Return the parameter along the line at which its projection to the plane of each circle enters the circle."""
         w = point - C
         w = w - V * np.sum(w * V, axis=1, keepdims=True)
         flat = u - V * (V @ u)[:, None]

@@ -1,4 +1,4 @@
-"""From the readings of a stepped sphere to an error dataset of the five beams."""
+"""Error dataset of the five beams from the readings of a stepped sphere."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ log = logging.getLogger(__name__)
 
 
 def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return an error dataset of component ``beam``: what each beam is, minus what it was meant to be.
+    """Return an error dataset of component ``beam``: each beam minus its nominal beam.
 
-    Each beam's errors are stated about its own zero point; see `beam_errors` for their meaning.
+    The errors of a beam are stated at its zero point; see `beam_errors` for their definition.
 
     Raises
     ------
     MethodError
-        Readings that do not determine a beam; the beam is named.
+        Readings that do not determine a beam; the message names the beam.
     """
     notes: list[str] = []
     measured = raw
@@ -54,10 +54,10 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         paper_origin[i], paper_direction[i] = circles_and_line(clean, centre[i], scan[i], radius, direction0[i])
         missing = int(np.isnan(distance[i]).sum())
         if missing:
-            notes.append(f"{name}: {missing} of {distance[i].size} readings are unknown (NaN).")
+            notes.append(f"{name}: {missing} of {distance[i].size} readings are missing (NaN).")
         if len(beam.left_out):
-            places = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
-            notes.append(f"{name}: {len(beam.left_out)} readings left out as outliers: {places}.")
+            outliers = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
+            notes.append(f"{name}: {len(beam.left_out)} readings are outliers and were ignored: {outliers}.")
     errors, covariance = beam_errors(
         origin0,
         direction0,
@@ -120,8 +120,7 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
 def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Dataset:
     """Return a beam detection with the mean reading of every step, from one as recorded.
 
-    Of a scan that was cut off and made anew the last attempt counts; one whose steps are not found is NaN, and
-    ``notes`` say why.
+    Of a repeated scan the last attempt is used. A scan whose steps are not found is NaN; ``notes`` state the reason.
     """
     centre = raw["sphere_centre"].transpose("channel", "profile", "step", "direction")
     channels, profiles, steps = centre.shape[:3]
@@ -132,15 +131,15 @@ def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Datas
     means = np.full((channels, profiles, steps), np.nan)
     for number in range(channels * profiles):
         channel, profile = divmod(number, profiles)
-        place = f"{raw['channel'].values[channel]}, profile {profile}"
+        scan_name = f"{raw['channel'].values[channel]}, profile {profile}"
         samples = np.flatnonzero(scan == number)
         if samples.size == 0:
-            notes.append(f"{place}: not recorded.")
+            notes.append(f"{scan_name}: not recorded.")
             continue
         samples = samples[attempt[samples] == attempt[samples].max()][:length]
         record = raw["record"].isel(sample=slice(int(samples[0]), int(samples[-1]) + 1)).values.astype(np.float64)
         try:
             means[channel, profile] = segment_steps(record, rate, steps, dwell, settings.step_average).mean
         except MethodError as error:
-            notes.append(f"{place}: {error}")
+            notes.append(f"{scan_name}: {error}")
     return raw.drop_dims("sample").assign(distance=(("channel", "profile", "step"), means, {"units": "m"}))

@@ -1,4 +1,4 @@
-"""From a drift record to the spindle's error dataset."""
+"""Error dataset of the spindle from a drift record."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _UNSEEN_KNOTS = 8
 
 
 def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return the spindle's error dataset over ``time``; see the method's page for its equations.
+    """Return the error dataset of the spindle over ``time``; the equations are in the documentation of the method.
 
     Raises
     ------
@@ -72,8 +72,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     if averages.time.size < 2:
         span = float(averages.time.size * settings.average)
         raise MethodError(
-            f"The record gives {averages.time.size} mean of {settings.average:g} s; a drift needs at least two. Is the "
-            f"record shorter than {2 * span:g} s, or 'average' too long?"
+            f"The record gives {averages.time.size} mean of {settings.average:g} s; expected at least two. "
+            f"Reduce 'average', or record longer than {2 * span:g} s."
         )
     bar = _bar(raw, settings, notes)
     coming_up = settling(record, settings.spin_up)
@@ -82,7 +82,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     state, then = _fit(mean, bar), _fit(mean[:, reference].mean(axis=1, keepdims=True), bar)
     if not np.isfinite(then.E).all():
         raise MethodError(
-            "No cylinder of the stated radius touches the five readings of the reference state. Check bar_radius "
+            "No cylinder of the stated radius fits the readings of the reference state. Check bar_radius "
             f"({bar.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
         )
     _check_senses(then, bar)
@@ -91,12 +91,12 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     sigma = noise(raw, averages, settings, notes)
     sources = [
         *reading_sources(np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size),
-        *beam_sources(bar.covariance, bar.known_from),
+        *beam_sources(bar.covariance, bar.source),
         *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
     ]
     frame = Frame(bar.origin, bar.direction, bar.levels, point)
     independent, influence = propagate(state, then, frame, sigma, sources, [change for *_, change in effects])
-    # Errors inside the reference state share its noise: what is left of it is 1 - 1/m of each mean.
+    # Errors inside the reference state share its noise: the share 1 - 1/m of each mean remains.
     independent[reference] *= 1.0 - 1.0 / reference.size
     influence[:, reference] = 0.0
     independent[:, 5, :] = independent[:, :, 5] = influence[..., 5] = np.nan
@@ -164,7 +164,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
 
 
 def _check_senses(then: State, bar: Bar) -> None:
-    """Refuse beams that leave the bar where they should meet it: directions given from the bar to the sensor."""
+    """Refuse beams that point from the bar to the sensor."""
     S = bar.origin + bar.direction * then.distance
     level = np.array([*then.q[0, :2], bar.levels[0]])
     w = S - level
@@ -173,18 +173,18 @@ def _check_senses(then: State, bar: Bar) -> None:
     leaving = [c for c, n, u in zip(CHANNELS, outward, bar.direction, strict=True) if n @ u > 0]
     if leaving:
         raise MethodError(
-            f"With these beams, that of {', '.join(leaving)} would leave the bar where it should meet it. "
-            "beam_direction is the unit vector from the sensor to the bar, and a reading grows as the bar goes away: "
-            "is the sign of a direction the other way round?"
+            f"The beam of {', '.join(leaving)} points away from the bar. Expected beam_direction from the sensor to "
+            "the bar, "
+            "and readings that increase with the distance of the bar; check the sign of the direction."
         )
 
 
 def _compensated(
     raw: xr.Dataset, record: Record, bar: Bar, reference: NDArray[np.int64], settings: Settings, notes: list[str]
 ) -> tuple[Array, list[tuple[str, str, Array]]]:
-    """Return the mean readings without the frame's expansion, and what disturbs them as (name, group, change).
+    """Return the mean readings corrected for the expansion of the frame, and disturbances as (name, group, change).
 
-    The frame's expansion moves the readings along the normals that a first fit finds.
+    The correction acts along the surface normals of a first fit.
     """
     mean = record.averages.mean
     effects = run_out_at_rest(record, reference, float(raw["distance_noise"]))
@@ -201,10 +201,10 @@ def _compensated(
 
 
 def _unseen(effect: Array, time: Array, reference: NDArray[np.int64]) -> Array:
-    """Return the influence (source, instant, 6) of the rotation about the axis, zero in the reference state.
+    """Return the influence (source, instant, 6) of the unknown rotation about the axis, zero in the reference state.
 
-    It grows and turns as the head warms: knots over the record, each one draw, so that instants far apart share little
-    of it. EC itself stays unknown.
+    The rotation changes as the head warms. It is modelled by knots over the record, each one draw, so that distant
+    instants are nearly independent. EC remains unknown.
     """
     weights = hats(time, _UNSEEN_KNOTS)
     weights = (weights - weights[:, reference].mean(axis=1, keepdims=True)) / np.sqrt(2.0)
@@ -217,12 +217,12 @@ def _unseen(effect: Array, time: Array, reference: NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True)
 class Bar:
-    """What is known beforehand: beams (5, 3) with their covariance (5, 6, 6), bar radius and levels, SI."""
+    """Known geometry: beams (5, 3) with their covariance (5, 6, 6), bar radius and levels, SI."""
 
     origin: Array
     direction: Array
     covariance: Array
-    known_from: str
+    source: str
     radius: float
     levels: Array
 
@@ -231,7 +231,7 @@ def _bar(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Bar:
     levels = np.asarray(raw["level"].values, np.float64)
     if not abs(levels[1] - levels[0]) > 1e-3:
         raise MethodError(
-            f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights, at "
+            f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights at "
             "least 1 mm apart."
         )
     return Bar(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
@@ -247,24 +247,24 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     nominal = settings.beams == "nominal"
     if nominal and "nominal_origin" not in raw:
         raise MethodError(
-            "beams = 'nominal' needs nominal_origin and nominal_direction(channel, direction) in the raw dataset; they "
-            "are not there. Use beams = 'raw'."
+            "beams = 'nominal' needs nominal_origin and nominal_direction(channel, direction), which the raw dataset "
+            "does not have. Use beams = 'raw'."
         )
     origin = np.asarray(raw["nominal_origin" if nominal else "beam_origin"].values, np.float64)
     direction = np.asarray(raw["nominal_direction" if nominal else "beam_direction"].values, np.float64)
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
         lost = [c for c, o, u in zip(CHANNELS, origin, direction, strict=True) if not np.isfinite([*o, *u]).all()]
-        raise MethodError(
-            f"The beam of {', '.join(lost)} is not known (NaN): expected origin and direction of all five."
-        )
+        raise MethodError(f"The beam of {', '.join(lost)} is unknown (NaN); expected origin and direction of all five.")
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     flat = direction[:SIDE, :2] / np.linalg.norm(direction[:SIDE, :2], axis=1, keepdims=True)
     for i, j in ((0, 2), (0, 3), (1, 2), (1, 3)):
         sine = abs(flat[i, 0] * flat[j, 1] - flat[i, 1] * flat[j, 0])
         if sine < 0.1:
             raise MethodError(
-                f"The beams {CHANNELS[i]} and {CHANNELS[j]} are parallel to {np.degrees(np.arcsin(sine)):.1f} deg: the "
-                "bar could move across both unseen. Expected X beams across Y beams; check beam_direction."
+                f"The beams {CHANNELS[i]} and {CHANNELS[j]} are parallel within {np.degrees(np.arcsin(sine)):.1f} "
+                "deg, so "
+                "that they do not determine the position of the bar. Expected X beams across Y beams; check "
+                "beam_direction."
             )
     if nominal:
         covariance = np.zeros((5, 6, 6))
@@ -276,7 +276,7 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     if "beam_covariance" in raw:
         covariance = np.asarray(raw["beam_covariance"].transpose("channel", "p", "p_").values, np.float64)
         return origin, direction, covariance, "beam calibration"
-    notes.append("The raw dataset states no beam_covariance: the beams count as exact in the uncertainty.")
+    notes.append("The raw dataset states no beam_covariance: the beams are assumed to be exact.")
     return origin, direction, np.zeros((5, 6, 6)), "beam calibration"
 
 
@@ -302,7 +302,7 @@ def _extras(
             values, coords={"channel": channel, "time": time}, dims=("channel", "time"), attrs={"units": unit}
         )
 
-    # What the fitted bar would have shown; zero but for rounding, where the fit is exact.
+    # Distances of the measured points from the fitted bar; zero within rounding where the fit is exact.
     S = bar.origin[:, None] + bar.direction[:, None] * mean[:, :, None]
     w = S - np.column_stack([state.q[:, :2], np.full(len(state.q), bar.levels[0])])
     off = w - np.einsum("cti,ti->ct", w, state.a)[..., None] * state.a

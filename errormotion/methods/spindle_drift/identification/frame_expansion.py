@@ -1,4 +1,4 @@
-"""The measuring frame's own expansion: taken out of the readings by its temperature, with what that is worth."""
+"""Correction of the readings for the thermal expansion of the measuring frame, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ if TYPE_CHECKING:
 
 
 _MOST_KNOTS = 32
+"""Largest number of knots of the unknown temperature."""
 
 
 @dataclass(frozen=True)
 class FrameWarming:
-    """How the frame's temperature moves the beams.
+    """Temperature of the frame, and its effect on the beams.
 
     Attributes
     ----------
     temperature : ndarray (instant,)
         Smoothed temperature of the frame, degC.
     uncertainty : ndarray (instant,)
-        What its resolution and noise leave unknown of it, K.
+        Standard uncertainty from resolution and noise, K.
     per_kelvin : ndarray (5, 3)
         Shift of each beam's origin, m/K.
     """
@@ -41,25 +42,28 @@ class FrameWarming:
 
 
 def frame_warming(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> FrameWarming | None:
-    """Return how the frame warmed, or None where its expansion is not to be or cannot be compensated."""
+    """Return the warming of the frame, None where its expansion is not or cannot be compensated."""
     if not settings.compensate_frame:
         return None
     if "frame_expansion" not in raw:
         notes.append(
-            "The raw dataset states no frame_expansion: the measuring frame's own warming is neither taken out nor in "
-            "the uncertainty (about 2 um a kelvin for a frame of steel)."
+            "The raw dataset states no frame_expansion: the expansion of the measuring frame is neither corrected nor "
+            "part of "
+            "the uncertainty (about 2 um/K for a frame of steel)."
         )
         return None
     if record.temperature is None or settings.frame_temperature not in sensors(raw):
         notes.append(
-            f"The frame's expansion is known but not its temperature (no sensor '{settings.frame_temperature}'): the "
+            "The expansion of the frame is stated but not its temperature (no sensor "
+            f"'{settings.frame_temperature}'): the "
             "errors are not corrected for it."
         )
         return None
     measured = record.temperature[sensors(raw).index(settings.frame_temperature)]
     if np.isnan(measured).any():
         notes.append(
-            f"The frame's temperature is unknown in {int(np.isnan(measured).sum())} means; the errors there are NaN."
+            f"The temperature of the frame is unknown in {int(np.isnan(measured).sum())} means; the errors there are "
+            "NaN."
         )
     smooth, uncertainty = local_line(measured, record.averages.time, settings.frame_smoothing)
     per_kelvin = np.asarray(raw["frame_expansion"].transpose("channel", "direction").values, np.float64)
@@ -69,9 +73,9 @@ def frame_warming(raw: xr.Dataset, record: Record, settings: Settings, notes: li
 def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]:
     """Fit a straight line within half of ``length`` on both sides of each instant; return its value and uncertainty.
 
-    A line and not a mean, so that a steady rise is not bent where one side is missing. The scatter about the lines
-    gives the noise; values that repeat one another (a slow logger) count as one through their autocorrelation.
-    NaN where the value itself is.
+    A line keeps a steady rise unbiased where one side is missing; a mean would not. The noise is the scatter about the
+    lines; repeated values of a slow logger are taken into account through their autocorrelation. NaN where the value
+    is NaN.
     """
     known = np.isfinite(values)
     if known.sum() < 3:
@@ -97,8 +101,8 @@ def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]
             repeats += 2.0 * lag / lags[0]
     variance = float(np.mean(residual**2)) * repeats
     if np.median(np.diff(time[known])) <= length:
-        # Where a window holds too few values to scatter, second differences tell the noise; further apart than that
-        # they would tell the warming itself.
+        # In a window with few values, second differences give the noise; at longer intervals they would include the
+        # warming.
         variance = max(variance, float(np.mean(np.diff(values[known], 2) ** 2)) / 6.0)
     weight = 1.0 / n + np.where(spread > 0, at * at / np.maximum(spread, 1e-30), 0.0)
     uncertainty = np.sqrt(variance * np.minimum(weight, 1.0))
@@ -106,11 +110,11 @@ def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]
 
 
 def smoothing_sources(warming: FrameWarming, time: Array, length: float, reference: NDArray[np.int64]) -> list[Array]:
-    """Return what is unknown of the smoothed temperature as shared sources, each a change over time (instant,), K.
+    """Return the uncertainty of the smoothed temperature as shared sources, each a change over time (instant,), K.
 
-    Instants closer than the smoothing's length share what is unknown of their temperature, those further apart do
-    not: knots at that distance (at most ``_MOST_KNOTS`` of them), each one draw, with weights whose squares add up to
-    one between them. All is relative to the reference state.
+    Instants within the length of the smoothing share the error of their temperature, more distant ones do not. It is
+    modelled by knots at this distance (at most ``_MOST_KNOTS``), each one draw, with weights whose squares add up to
+    one. The changes are relative to the reference state.
     """
     knots = int(np.clip(np.ceil(np.ptp(time) / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
     effects = hats(time, knots) * np.nan_to_num(warming.uncertainty)
@@ -119,14 +123,14 @@ def smoothing_sources(warming: FrameWarming, time: Array, length: float, referen
 
 def hats(time: Array, knots: int) -> Array:
     """Return weights (knot, instant) about evenly spaced knots over a record; their squares add up to one."""
-    place = (time - time[0]) / max(float(np.ptp(time)), 1e-9) * (knots - 1)
-    return np.asarray(np.sqrt(np.maximum(1.0 - np.abs(place - np.arange(knots)[:, None]), 0.0)))
+    position = (time - time[0]) / max(float(np.ptp(time)), 1e-9) * (knots - 1)
+    return np.asarray(np.sqrt(np.maximum(1.0 - np.abs(position - np.arange(knots)[:, None]), 0.0)))
 
 
 def readings_per_kelvin(warming: FrameWarming, state: State, origin: Array, direction: Array, levels: Array) -> Array:
-    """Return what a kelvin of the frame does to the readings of an unmoved bar, (5, instant), m/K, as a correction.
+    """Return the correction of the readings per kelvin of the frame, (5, instant), m/K.
 
-    A beam's origin that goes by s makes its reading wrong by n . s / (n . u), n the surface normal it meets.
+    A displacement s of the origin of a beam changes its reading by -n . s / (n . u), n the surface normal.
     """
     A = np.column_stack([state.q[:, :2], np.full(len(state.q), levels[0])])
     S = origin[:, None] + direction[:, None] * state.distance[:, :, None]

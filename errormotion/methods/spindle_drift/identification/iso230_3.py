@@ -1,10 +1,9 @@
-"""ISO 230-3 values of a spindle drift: what a certificate states, with what is known of each number.
+"""ISO 230-3 values of a spindle drift, with their uncertainties.
 
-Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. Of
-each, the range over a period and the difference between its end and its start; which is which is part of the name,
-since the two differ as soon as a curve turns back. The largest and the smallest of thousands of noisy values lie too
-far apart; so ranges are taken over means of half a minute, and the uncertainty of a range is that of the difference
-between the two means that carry it.
+Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 at L2), Z, and the tilts A and B. For
+each, the range over an interval and the difference between its end and its start; the name states which, because the
+two differ for a curve that is not monotonic. The range of thousands of noisy values is biased. Ranges are therefore
+taken over means of half a minute, and the uncertainty of a range is that of the difference of the two extreme means.
 """
 
 from __future__ import annotations
@@ -40,13 +39,14 @@ MEASURES = (
 )
 HOUR = 3600.0
 _SLOPE_SPAN = 600.0
+"""Interval before the end of running over which the end slope is taken, s."""
 _LEAST_CHANGE = 0.2
-"""K; below this a change per kelvin says nothing."""
+"""Smallest change of temperature for a value per kelvin, K."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Seven quantities over time: value (7, t), influence (source, 7, t), own variance (7, t), all relative."""
+    """Seven quantities over time: value (7, t), influence (source, 7, t) and independent variance (7, t)."""
 
     value: Array
     influence: Array
@@ -68,8 +68,9 @@ class Series:
 def quantities(errors: Array, independent: Array, influence: Array, heights: Array, arm: Array) -> Series:
     """Return the seven quantities of error twists (t, 6), all on the spindle's axis.
 
-    ``heights`` (2,) are those of L1 and L2 above the functional point, ``arm`` (3,) leads from it to the end of the bar
-    on its axis, m. On the axis the unseen rotation about it does nothing: its source is no part of ``influence``.
+    ``heights`` (2,) are those of L1 and L2 above the functional point, ``arm`` (3,) is the vector from it to the end of
+    the bar on its axis, m. The unknown rotation about the axis has no effect on the axis; its source is not in
+    ``influence``.
     """
     G = np.zeros((7, 5))
     for level, z in enumerate(heights):
@@ -95,16 +96,16 @@ class Results:
     series: Series
 
     def as_extras(self, time: Array) -> dict[str, xr.DataArray]:
-        """Return the variables that ride along in the error dataset."""
+        """Return the values as further variables of the error dataset."""
         table = {"quantity": list(QUANTITIES), "measure": list(MEASURES)}
         units = {"units": "SI: m or rad; s for time_constant; per s for end_slope; per K for per_kelvin"}
         shared = np.einsum("skt,skt->kt", self.series.influence, self.series.influence)
         u = np.sqrt(shared + self.series.variance)
-        places = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
+        labels = {"level": ["L1", "L2"], "lateral": ["x", "y"], "time": time}
 
         def by_level(values: Array) -> xr.DataArray:
             by_place = values[[0, 2, 1, 3]].reshape(2, 2, -1)  # X1 Y1 at L1, X2 Y2 at L2
-            return xr.DataArray(by_place, coords=places, dims=("level", "lateral", "time"), attrs={"units": "m"})
+            return xr.DataArray(by_place, coords=labels, dims=("level", "lateral", "time"), attrs={"units": "m"})
 
         return {
             "iso_value": xr.DataArray(self.value, coords=table, dims=("quantity", "measure"), attrs=units),
@@ -128,8 +129,8 @@ def evaluate(
 ) -> Results:
     """Return the ISO 230-3 values of a record; ``time`` (t,) in s since the reference state.
 
-    ``average`` (s) is the length of the means over which ranges and end values are taken. The reference state, the
-    instants ``reference``, counts as one more mean: its value is zero.
+    ``average`` (s) is the averaging time for ranges and end values. The reference state (the instants ``reference``) is
+    one further mean, whose value is zero.
     """
     value = np.full((len(QUANTITIES), len(MEASURES)), np.nan)
     uncertainty = np.full_like(value, np.nan)
@@ -151,7 +152,7 @@ def evaluate(
                 series.difference(k, top, bottom) if top is not bottom else (0.0, 0.0)
             )
             if time[blocks[-1][-1]] >= until - max(1.5 * step, average):
-                # The reference state is where the errors are zero: the end's own value is the difference from it.
+                # The errors are zero in the reference state: the value at the end is the difference.
                 weights = np.full(blocks[-1].size, 1.0 / blocks[-1].size)
                 value[k, column + 1], uncertainty[k, column + 1] = series.weighted(k, blocks[-1], weights)
         running = np.flatnonzero(known & (time <= end))
@@ -168,11 +169,11 @@ def evaluate(
 
 
 def _blocks(index: Index, time: Array, length: float) -> list[Index]:
-    """Cut instants into blocks of ``length`` seconds, counted back from the last one, which is whole."""
+    """Divide instants into blocks of ``length`` seconds, counted back from the last one, which is complete."""
     age = np.floor((time[index[-1]] - time[index]) / length + 1e-9)
     blocks = list(np.split(index, np.flatnonzero(np.diff(age)) + 1))
     if len(blocks) > 1 and np.ptp(time[blocks[0]]) < 0.5 * length < np.ptp(time[blocks[1]]):
-        blocks[:2] = [np.concatenate(blocks[:2])]  # a short rest at the beginning would be a mean of little
+        blocks[:2] = [np.concatenate(blocks[:2])]  # a short remainder at the start would be a mean of few values
     return blocks
 
 
@@ -183,17 +184,17 @@ def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:
 
 
 def _thermometer(
-    temperature: Array | None, sensors: Sequence[str], wanted: str | None, running: NDArray[np.bool_]
+    temperature: Array | None, sensors: Sequence[str], given: str | None, running: NDArray[np.bool_]
 ) -> tuple[str, Array | None]:
-    """Return name and change (t,), K, of the wanted sensor or of the one that changes most while running."""
-    if wanted is not None and wanted not in sensors:
-        raise MethodError(f"iso_temperature = '{wanted}': the record has the sensors {', '.join(sensors) or 'none'}.")
+    """Return name and temperature (t,) of the given sensor, or of the one with the largest change while running."""
+    if given is not None and given not in sensors:
+        raise MethodError(f"iso_temperature = '{given}': expected one of the sensors {', '.join(sensors) or 'none'}.")
     if temperature is None or not running.any():
         return "", None
     part = temperature[:, running]
     seen = np.isfinite(part)
     spread = np.where(seen, part, -np.inf).max(axis=1) - np.where(seen, part, np.inf).min(axis=1)
-    index = list(sensors).index(wanted) if wanted is not None else int(np.argmax(spread))
+    index = list(sensors).index(given) if given is not None else int(np.argmax(spread))
     return sensors[index], temperature[index]
 
 
@@ -204,10 +205,10 @@ def _slope_weights(x: Array) -> Array:
 
 
 def _time_constant(time: Array, y: Array) -> float:
-    """Return tau of y0 + c (1 - exp(-t / tau)), s; NaN where the curve has no such shape.
+    """Return tau of y0 + c (1 - exp(-t / tau)), s; NaN where the curve has another shape.
 
-    For each tau, y0 and c follow by linear least squares; the best tau must lie between a fiftieth of the record and
-    its whole length, and the curve must explain nine tenths of the change.
+    For each tau, y0 and c follow by linear least squares. The best tau must be between a fiftieth of the length of the
+    record and its length, and the curve must explain nine tenths of the variance.
     """
     if time.size < 20 or np.ptp(time) <= 0:
         return np.nan

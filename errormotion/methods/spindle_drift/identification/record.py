@@ -1,4 +1,9 @@
-"""A drift record brought down to means, and what its means are worth."""
+"""A drift record averaged to means: their noise, the reference state, and the run-out.
+
+The run-out vanishes in the mean over whole turns. While the speed changes, a mean holds parts of turns and is unknown.
+While the spindle is at rest, a mean is off by up to the run-out: one unknown shift for the whole rest, as large as the
+scatter of the readings at steady speed beyond their noise.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +25,12 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
 
-# Where the noise seen exceeds the stated one by more than chance allows (about one record in a thousand).
 _CHANCE = 3.3
+"""Standard deviations by which the observed noise must exceed the stated one (about one record in a thousand)."""
 _ENOUGH = 30
+"""Smallest number of values for a standard deviation."""
 _SAME_SPEED = 0.02
-"""Share of the highest speed within which two speeds count as the same: a measured speed is never quite steady."""
+"""Share of the highest speed within which two speeds are equal: a measured speed varies."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +46,8 @@ class Record:
     spindle_speed : ndarray (window,) or None
         1/min.
     scatter : ndarray (5,) or None
-        Standard deviation of single readings within one mean while the spindle turns steadily, m; None where the
-        record came as means, or does not say when the spindle turns.
+        Standard deviation of single readings within one mean at steady speed, m; None where the record consists of
+        means, or has no spindle speed.
     """
 
     averages: Averages
@@ -53,7 +59,7 @@ class Record:
 def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -> Record:
     """Average a record in one pass and constant memory; the hasher of ``raw`` takes part in it."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
-    # Put in order after reading: a lazy selection would read the store sample by sample.
+    # The order is changed after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
     # One thread: the hasher uses the other cores.
     averager = Averager(len(CHANNELS), settings.average, settings.min_valid, threads=1)
@@ -91,28 +97,26 @@ def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, set
     """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
     turning = turns(speed)
     start = int(np.argmax(turning))
-    begin, end = np.searchsorted(time, time[start] + settings.spin_up + np.array([0.0, settings.average]))
-    if not turning[start] or end - begin < _ENOUGH or end >= time.size or not turning[begin:end].all():
+    first, end = np.searchsorted(time, time[start] + settings.spin_up + np.array([0.0, settings.average]))
+    if not turning[start] or end - first < _ENOUGH or end >= time.size or not turning[first:end].all():
         return None
-    part = readings[:, begin:end].astype(np.float64)
+    part = readings[:, first:end].astype(np.float64)
     if np.isnan(part).all(axis=1).any():
         return None
     return np.asarray(np.nanstd(part, axis=1, ddof=1))
 
 
 def count_unknown(averages: Averages, notes: list[str]) -> None:
-    """Note every channel that has unknown means; refuse one that has no other."""
+    """Note every channel with unknown means; MethodError for a channel without any known mean."""
     for channel, row, counts in zip(CHANNELS, averages.mean, averages.count, strict=True):
         unknown = np.isnan(row)
         if unknown.all():
-            raise MethodError(
-                f"Channel {channel} has no valid reading in the whole record: check the sensor and its cable."
-            )
+            raise MethodError(f"Channel {channel} has no valid reading in the record. Check the sensor and its cable.")
         if unknown.any():
             first, last = averages.time[unknown][[0, -1]]
             notes.append(
                 f"{channel}: {unknown.sum()} of {row.size} means are unknown, between {first:.1f} s and {last:.1f} s "
-                f"({averages.expected.sum() - counts.sum()} samples lost in all); the errors there are NaN."
+                f"({averages.expected.sum() - counts.sum()} samples are missing in total); the errors there are NaN."
             )
 
 
@@ -121,50 +125,50 @@ def reference_windows(
 ) -> NDArray[np.int64]:
     """Return the windows of the reference state; MethodError where there is none with all five readings."""
     mean = averages.mean
-    begin = averages.time[0] + (settings.reference_time or 0.0)
+    start = averages.time[0] + (settings.reference_time or 0.0)
     if settings.reference_time is None and coming_up[0]:
-        begin = averages.time[int(np.argmin(coming_up))]
+        start = averages.time[int(np.argmin(coming_up))]
     length = settings.reference_average or 0.0
-    inside = (averages.time >= begin - 1e-6) & (averages.time < begin + max(length - 0.5 * settings.average, 1e-6))
+    inside = (averages.time >= start - 1e-6) & (averages.time < start + max(length - 0.5 * settings.average, 1e-6))
     if not inside.any():
-        later = np.flatnonzero(averages.time >= begin - 1e-6)
+        later = np.flatnonzero(averages.time >= start - 1e-6)
         if later.size == 0:
             raise MethodError(
-                f"The record ends at {averages.time[-1]:.1f} s; the reference state was to begin at "
-                f"{begin:g} s (reference_time)."
+                f"The record ends at {averages.time[-1]:.1f} s, before the start of the reference state at "
+                f"{start:g} s (reference_time)."
             )
         inside[later[0]] = True
     if settings.reference_time is not None and coming_up[inside].any():
-        notes.append("The reference state lies within spin_up of a change of speed: its run-out is in all errors.")
+        notes.append("The reference state is within spin_up of a change of speed: its run-out is part of all errors.")
     known = inside & np.isfinite(mean).all(axis=0)
     if not known.any():
         lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]
         raise MethodError(
-            f"The reference state at {begin:.1f} s has no valid reading of {', '.join(lost) or 'all channels at once'}"
-            ". Choose another one with reference_time and reference_average."
+            f"The reference state at {start:.1f} s has no valid reading of {', '.join(lost) or 'all channels together'}"
+            ". Choose another reference state with reference_time and reference_average."
         )
     return np.flatnonzero(known)
 
 
 def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[str]) -> Array:
-    """Return the standard uncertainty (5, instant) of the means, m: as stated, or as seen where that is more."""
+    """Return the standard uncertainty (5, instant) of the means, m: as stated, or as observed where that is larger."""
     stated = float(raw["distance_noise"])
     sigma = stated / np.sqrt(np.maximum(averages.count, 1))
     if settings.noise == "stated":
         return np.asarray(sigma)
     for i, channel in enumerate(CHANNELS):
-        # Second differences take out the drift itself; the median takes out steps.
+        # Second differences remove the drift, the median removes steps.
         root = np.sqrt(np.maximum(averages.count[i], 1))
         second = np.diff(averages.mean[i] * root, 2) / np.sqrt(6.0)
         second = second[np.isfinite(second)]
         if second.size < _ENOUGH:
             continue
         seen = float(np.median(np.abs(second)) / 0.674490)
-        # Spread of a median-based deviation of overlapping second differences, from simulation: 1.7 / sqrt(2 n).
+        # Standard deviation of this estimate from overlapping second differences, by simulation: 1.7 / sqrt(2 n).
         if seen > stated * (1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size)):
             notes.append(
-                f"{channel}: the means scatter as from a noise of {seen * 1e6:.3g} um a sample, the stated noise is "
-                f"{stated * 1e6:.3g} um; the uncertainty is raised to what is seen."
+                f"{channel}: the noise observed in the means is {seen * 1e6:.3g} um per sample, the stated noise is "
+                f"{stated * 1e6:.3g} um; the uncertainty follows from the observed noise."
             )
             sigma[i] = seen / root
     return np.asarray(sigma)
@@ -180,7 +184,7 @@ def sensors(raw: xr.Dataset) -> list[str]:
 
 
 def turns(speed: Array) -> NDArray[np.bool_]:
-    """Return where a spindle turns, either way round; a speed that is not known (NaN) is the one before it."""
+    """Return where a spindle turns, in either direction; an unknown speed (NaN) is taken from the value before it."""
     known = np.isfinite(speed)
     if not known.any():
         return np.zeros(speed.shape, bool)
@@ -189,19 +193,19 @@ def turns(speed: Array) -> NDArray[np.bool_]:
 
 
 def held(speed: Array) -> Array:
-    """Return speeds with unknown ones replaced by the last known one, at the beginning by the first."""
+    """Return speeds with unknown values replaced by the last known one, at the start by the first known one."""
     known = np.isfinite(speed)
     if not known.any():
         return np.zeros(speed.shape)
-    place = np.maximum.accumulate(np.where(known, np.arange(speed.size), -1))
-    return np.asarray(speed[np.where(place < 0, int(np.argmax(known)), place)])
+    index = np.maximum.accumulate(np.where(known, np.arange(speed.size), -1))
+    return np.asarray(speed[np.where(index < 0, int(np.argmax(known)), index)])
 
 
 def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
-    """Return the means that hold a change of speed, or follow one within ``spin_up`` seconds.
+    """Return the means that include a change of speed, or follow one within ``spin_up`` seconds.
 
-    A record that begins with a turning spindle counts as begun by its start. Readings that came as means already
-    (one sample each) are taken as they are.
+    A record that starts with a turning spindle is assumed to start together with the spindle. A record of means (one
+    sample each) has no such means.
     """
     time, speed = record.averages.time, record.spindle_speed
     found = np.zeros(time.size, bool)
@@ -215,10 +219,10 @@ def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
 
 
 def run_out_at_rest(record: Record, reference: NDArray[np.int64], noise: float) -> list[tuple[str, str, Array]]:
-    """Return, per channel and rest, what stopping anywhere in a turn may do to the errors, as readings (5, instant), m.
+    """Return the effect of the run-out at rest for each channel and rest, as readings (5, instant), m.
 
-    Each rest is one draw. Where the reference state rests, its own draw is in everything outside of that rest. Empty
-    where the spindle always turns, always rests, or its speed is not known.
+    Each rest is one draw. A reference state at rest adds its draw to all errors outside of that rest. Empty where the
+    spindle always turns, always rests, or its speed is unknown.
     """
     if record.scatter is None or record.spindle_speed is None:
         return []
@@ -228,13 +232,13 @@ def run_out_at_rest(record: Record, reference: NDArray[np.int64], noise: float) 
     spread = np.sqrt(np.maximum(record.scatter**2 - noise**2, 0.0))
     found = []
     edges = np.flatnonzero(np.diff(rests, prepend=False, append=False)).reshape(-1, 2)
-    for number, (begin, end) in enumerate(edges, start=1):
-        if begin <= reference[0] < end:
+    for number, (first, end) in enumerate(edges, start=1):
+        if first <= reference[0] < end:
             effect = -np.ones(rests.size)
-            effect[begin:end] = 0.0
+            effect[first:end] = 0.0
         else:
             effect = np.zeros(rests.size)
-            effect[begin:end] = 1.0
+            effect[first:end] = 1.0
         for i in np.flatnonzero(spread > 0):
             change = np.zeros((len(CHANNELS), rests.size))
             change[i] = effect * spread[i]

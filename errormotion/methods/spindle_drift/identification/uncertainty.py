@@ -1,10 +1,10 @@
-"""What is known of the drift's errors: independent noise, and sources that are one draw for the whole record.
+"""Uncertainty of the drift: independent noise, and sources that are one draw for the whole record.
 
-The errors of an instant are a function of its own readings, of the readings of the reference state, and of what both
-share: the beams and the bar's radius. With a the bar's direction, E the middle of its end face, 0 the reference state
+The errors of an instant are a function of its readings, of the readings of the reference state, and of the beams and
+the bar radius, which both share. With a the direction of the bar, E the middle of its end face, 0 the reference state
 and p the functional point,
 
-    w = a0 x a                               rotation; the part about the axis is not seen
+    w = a0 x a                               rotation; the part about the axis is not measured
     T = E - E0 + w x (p - E0)                displacement of p
 
     dw = a0 x da - a x da0
@@ -33,7 +33,7 @@ _BLOCK = 1024
 
 @dataclass(frozen=True)
 class Source:
-    """One standard uncertainty of something that all instants share, as a change of the 36 parameters.
+    """One standard uncertainty of a quantity that all instants share, as a change of the 36 parameters.
 
     ``now`` acts on the state of each instant, ``then`` on the reference state; (36,) in SI.
     """
@@ -46,7 +46,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Frame:
-    """The geometry that all instants share."""
+    """Geometry common to all instants."""
 
     origin: Array
     direction: Array
@@ -86,7 +86,7 @@ def propagate(
     sources: Sequence[Source],
     scaled: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Return what the readings' own noise and the shared sources do to the errors.
+    """Return the covariance from the noise of the readings, and the influence of the shared sources.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def propagate(
     Returns
     -------
     independent : ndarray (instant, 6, 6)
-        Covariance from the readings' own noise.
+        Covariance from the noise of the readings.
     influence : ndarray (source, instant, 6)
         Of ``sources``, then of ``scaled``.
     """
@@ -116,18 +116,18 @@ def propagate(
     changes_then = np.array([s.then for s in sources]).reshape(-1, PARAMETERS).T
     da0, dE0 = da0 @ changes_then, dE0 @ changes_then
     a0, arm = then.a[0], frame.point - then.E[0]
-    for begin in range(0, instants, _BLOCK):
-        part = slice(begin, begin + _BLOCK)
+    for first in range(0, instants, _BLOCK):
+        part = slice(first, first + _BLOCK)
         a = now.a[part]
         w = np.cross(a0, a)
         da, dE = state_jacobian(now.q[part], now.distance[:, part], frame.origin, frame.direction, frame.levels)
-        # The readings' own noise acts on the instant alone.
+        # The noise of the readings acts on the instant alone.
         dw = _cross(a0, da[:, :, :5])
         J = np.concatenate([dE[:, :, :5] + _cross(-arm, dw), dw], axis=1)
         independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J)
         for k, change in enumerate(scaled):
             influence[len(sources) + k, part] = np.einsum("tip,pt->ti", J, change[:, part])
-        # What is shared acts on the instant and on the reference state.
+        # Shared sources act on the instant and on the reference state.
         da, dE = da @ changes_now, dE @ changes_now
         dw = _cross(a0, da) - _cross(a, da0[None])
         dT = dE - dE0 + _cross(-arm, dw) - _cross(w, dE0[None])
@@ -136,7 +136,7 @@ def propagate(
 
 
 def reading_sources(sigma: Array) -> list[Source]:
-    """Return the reference state's readings (5,), m, as sources."""
+    """Return the readings of the reference state as sources; ``sigma`` (5,), m."""
     found = []
     for i, name in enumerate(CHANNELS):
         change = np.zeros(PARAMETERS)
@@ -146,10 +146,10 @@ def reading_sources(sigma: Array) -> list[Source]:
 
 
 def beam_sources(covariance: Array, group: str) -> list[Source]:
-    """Return the beams' uncertainty, covariance (5, 6, 6) over (origin, direction), as columns of its factors."""
+    """Return the covariance (5, 6, 6) of (origin, direction) of the beams as sources: the columns of its factors."""
     found = []
     for i, name in enumerate(CHANNELS):
-        # Scaled, so that metres and radians weigh alike where rank is decided.
+        # Scaled, so that metres and radians have the same weight in the decision on the rank.
         size = np.sqrt(np.diag(covariance[i]))
         unit = np.where(size > 0, size, 1.0)
         values, vectors = np.linalg.eigh(covariance[i] / np.outer(unit, unit))
@@ -161,7 +161,7 @@ def beam_sources(covariance: Array, group: str) -> list[Source]:
 
 
 def radius_source(sigma: float) -> Source:
-    """Return the bar's radius as a source."""
+    """Return the bar radius as a source."""
     change = np.zeros(PARAMETERS)
     change[-1] = sigma
     return Source("bar radius", "bar radius", change, change)

@@ -1,1 +1,1 @@
-"""Logs of a lab become raw datasets of the method: columns of text, described by a map."""
+"""Import of logs of a drift with a map of the schema ``errormotion.map/1``."""

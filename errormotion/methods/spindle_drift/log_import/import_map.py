@@ -1,4 +1,4 @@
-"""The map of a log: which column is what, in which unit, and where the beams are."""
+"""The map of a log: meaning and unit of each column, and the beams."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ def _time_unit(unit: str) -> str:
 
 
 class TimeColumn(LogTable):
-    """The column of the time."""
+    """Column of the time."""
 
     column: Column
     unit: Annotated[str, AfterValidator(_time_unit)] = Field(description="a unit such as 's', or 'iso8601'")
 
 
 class Channel(LogTable):
-    """A column of readings, and the beam that they are along."""
+    """Column of readings, and their beam."""
 
     column: Column
     unit: Annotated[str, _convertible("m")] = Field(description="unit of the readings, such as 'um'")
-    scale: float = Field(1.0, description="factor to the readings; -1 where they grow the other way")
+    scale: float = Field(1.0, description="factor to the readings; -1 where they count in the opposite direction")
     offset: Length = Field(0.0, description="added to the readings after scaling")
-    origin: tuple[Length, Length, Length] = Field(description="place where the reading is zero, three lengths")
+    origin: tuple[Length, Length, Length] = Field(description="position at which the reading is zero, three lengths")
     direction: tuple[float, float, float] = Field(description="from sensor to bar, three numbers")
     origin_uncertainty: Length | None = Field(None, ge=0, description="standard uncertainty of each coordinate")
     direction_uncertainty: Angle | None = Field(None, ge=0, description="standard uncertainty across the beam")
 
     @model_validator(mode="after")
-    def _has_a_direction(self) -> Self:
+    def _has_a_unit_direction(self) -> Self:
         if not np.isfinite(self.direction).all() or not 0.99 <= np.linalg.norm(self.direction) <= 1.01:
             length = float(np.linalg.norm(self.direction))
             raise ValueError(f"direction: expected a vector of length 1; found {self.direction} of length {length:.4g}")
@@ -82,14 +82,14 @@ class Channels(LogTable):
 
 
 class TemperatureColumn(LogTable):
-    """A column of one temperature sensor."""
+    """Column of a temperature sensor."""
 
     column: Column
     unit: Annotated[str, _convertible("degC")] = Field("degC", description="unit, such as 'degC'")
 
 
 class SpeedColumn(LogTable):
-    """The column of the spindle speed."""
+    """Column of the spindle speed."""
 
     column: Column
     unit: Annotated[str, _convertible("1/min")] = Field("/min", description="unit, such as '/min'")
@@ -111,7 +111,7 @@ class ImportMap(LogTable):
 
     @model_validator(mode="after")
     def _knows_all_beams_or_none(self) -> Self:
-        lacking = [name for name in CHANNELS if self.channels[name].origin_uncertainty is None]
-        if 0 < len(lacking) < len(CHANNELS):
-            raise ValueError(f"expected the uncertainty of every beam or of none; missing for {' '.join(lacking)}")
+        missing = [name for name in CHANNELS if self.channels[name].origin_uncertainty is None]
+        if 0 < len(missing) < len(CHANNELS):
+            raise ValueError(f"expected the uncertainty of every beam or of none; missing for {' '.join(missing)}")
         return self

@@ -43,12 +43,12 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all mistakes at once, each with its line.
+        The map or the log is wrong; all mistakes are reported together, each with its line.
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
     complaints = Complaints(log)
     dates = settings.time.unit == TIMESTAMP
-    columns = read_columns(_wanted(settings), "time", settings.format, complaints, dates=dates)
+    columns = read_columns(_columns_of(settings), "time", settings.format, complaints, dates=dates)
     _check_times(columns, complaints)
     _check_magnitudes(columns, settings, complaints)
     complaints.raise_any()
@@ -59,7 +59,7 @@ LOG_READERS = {MAP_SCHEMA: read_log}
 """Formats of maps that the method reads."""
 
 
-def _wanted(settings: ImportMap) -> dict[str, str | int]:
+def _columns_of(settings: ImportMap) -> dict[str, str | int]:
     """Return the column of each key of the map."""
     found: dict[str, str | int] = {"time": settings.time.column}
     found |= {f"channels.{name}": settings.channels[name].column for name in CHANNELS}
@@ -70,7 +70,7 @@ def _wanted(settings: ImportMap) -> dict[str, str | int]:
 
 
 def _check_times(columns: Columns, complaints: Complaints) -> None:
-    """Complain of times that do not increase."""
+    """Report times that do not increase."""
     t, lines = columns.values["time"], columns.lines
     known = np.flatnonzero(~np.isnan(t))
     for step in np.flatnonzero(np.diff(t[known]) <= 0):
@@ -82,7 +82,7 @@ def _check_times(columns: Columns, complaints: Complaints) -> None:
 
 
 def _check_magnitudes(columns: Columns, settings: ImportMap, complaints: Complaints) -> None:
-    """Complain of the first value of each column that cannot be."""
+    """Report the first implausible value of each column."""
     for key, values in columns.values.items():
         row = _ROWS[_VARIABLE[key.partition(".")[0]]]
         inside = _inside(key, values, settings)
@@ -91,13 +91,13 @@ def _check_magnitudes(columns: Columns, settings: ImportMap, complaints: Complai
             first, unit = outside[0], _column(key, settings).unit
             complaints.add(
                 int(columns.lines[first]),
-                f"{key}: {values[first]:.6g} makes a {row.name} of {inside[first]:.6g} {row.unit}; expected "
+                f"{key}: {values[first]:.6g} is a {row.name} of {inside[first]:.6g} {row.unit}; expected "
                 f"{row.low:g}..{row.high:g} {row.unit}. Is the unit '{unit}' right? ({outside.size} such values)",
             )
 
 
 def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | TemperatureColumn | SpeedColumn:
-    """Return what the map says of a column."""
+    """Return the entry of the map for a column."""
     table, _, name = key.partition(".")
     if table == "channels":
         return settings.channels[name]
@@ -107,7 +107,7 @@ def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | Temperature
 
 
 def _inside(key: str, values: Array, settings: ImportMap) -> Array:
-    """Return a column in inside units."""
+    """Return a column in the unit of the schema."""
     column = _column(key, settings)
     if column.unit == TIMESTAMP:
         return values

@@ -28,7 +28,7 @@ ADDRESS = "sim://cframe/linuxcnc?seed=3&linger=30"
 CYCLE = 1e-3  # s, of the servo thread
 TOUCH_FEED = 0.03 / 60  # m/s
 FAST = 0.3  # m/s
-# A place near the first ball, and one 60 mm from it.
+# A position near the first ball, and one 60 mm from it.
 HERE, THERE = [-0.24, -0.2, 0.12], [-0.18, -0.2, 0.12]
 
 if reason := linuxcnc_process.why_not():
@@ -48,7 +48,7 @@ def machine() -> Iterator[LinuxCNC]:
 
 
 def above(ball: int, height: float) -> list[float]:
-    """Return a place so far above the centre of a ball, m."""
+    """Return a position so far above the centre of a ball, m."""
     x, y, z = world("cframe", 3).machine.balls.nominal[ball]
     return [float(x), float(y), float(z) + height]
 
@@ -63,7 +63,7 @@ def run(driver: LinuxCNC, text: str) -> None:
     driver.finish()
 
 
-# ---------------------------------------------------------------------- what it says
+# ---------------------------------------------------------------------- what it states
 
 
 def test_says_who_it_is_and_how_it_stands(machine: LinuxCNC) -> None:
@@ -114,7 +114,7 @@ def test_turns_the_spindle_which_heats_the_twin(machine: LinuxCNC) -> None:
         ([0.4, 0.0, 0.1], None, "X travels from -0.305"),
         ([0.0, 0.0, -0.1], 0.01, "Z travels from"),
         ([0.0, 0.0, 0.1], 0.0, "feed above 0"),
-        ([0.0, 0.0], None, "expected a place X, Y, Z"),
+        ([0.0, 0.0], None, "expected a position X, Y, Z"),
         ([0.0, 0.0, math.nan], None, "finite"),
     ],
 )
@@ -141,7 +141,7 @@ def test_a_touch_is_where_the_twin_trips_and_at_most_a_cycle_of_travel_behind(ma
     assert touch["tripped"]
     assert contact is not None
     late = contact[2] - touch["position"][2]
-    # LinuxCNC latches the position of the cycle in which it sees the probe; 2 nm of rounding in its places.
+    # LinuxCNC latches the position of the cycle in which it sees the probe; 2 nm of rounding in its positions.
     assert -2e-9 <= late <= feed * CYCLE + 2e-9
     np.testing.assert_allclose(touch["position"][:2], goal[:2], atol=1e-9)
     assert touch["time"] == pytest.approx(machine.state()["time"])
@@ -281,7 +281,7 @@ def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
         machine.state()  # after identity and state the wire breaks at the next answer, that of the stop
         ordered = threading.Thread(target=lambda: (wait_until_moving(witness), witness.stop()))
         ordered.start()
-        with pytest.raises(InstrumentError, match="was asked to move to meanwhile"):
+        with pytest.raises(InstrumentError, match="was ordered to move to meanwhile"):
             machine.move_to(THERE, 0.05)
         ordered.join()
         place = witness.state()["position"]
@@ -475,4 +475,4 @@ def test_an_ini_file_in_inches_switched_on_and_homed_by_hand_and_nothing_left_be
     assert not folder.exists()
     running = {name for name, state in linuxcnc_process._processes().values() if state != "Z"}
     assert running.isdisjoint(linuxcnc_process.PROCESSES)
-    assert not linuxcnc_process.THEIR_LOCK.exists()
+    assert not linuxcnc_process.LINUXCNC_LOCK.exists()

@@ -1,19 +1,25 @@
-"""What identification takes out of a raw dataset: arrays in a fixed order, with names."""
+"""State of an identification: the readings of a raw dataset as arrays, and what each step adds to them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.network.model import directions
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    Array = Array
+    from errormotion.methods.multilateration.identification.drift import Drift
+    from errormotion.methods.multilateration.identification.expansion import Shared
+    from errormotion.methods.multilateration.identification.repeatability import Repeatability
+    from errormotion.methods.multilateration.identification.uncertainty import Scatter
+    from errormotion.methods.multilateration.network.network import Network
+    from errormotion.methods.multilateration.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -29,11 +35,11 @@ class Readings:
     nominal : ndarray (m, 3)
         Commanded places of the reflector, m.
     reflector : ndarray (m, 3)
-        Where it is with all axes at zero, m; 0 where the data do not say.
+        Where it is with all axes at zero, m; 0 where the data do not state it.
     station : ndarray (n, 3) or None
         Rough places, m.
     time : ndarray (n, m)
-        Of each reading, s; its number where the data do not say.
+        Of each reading, s; its number where the data do not state it.
     timed : bool
         Whether they do.
     stations, targets : list of str
@@ -54,6 +60,67 @@ class Readings:
     def position(self) -> Array:
         """Commanded axis positions (m, 3), m."""
         return self.nominal - self.reflector
+
+
+@dataclass
+class State:
+    """An identification in progress; see `identify` for the steps.
+
+    Attributes
+    ----------
+    raw, settings
+        What is identified.
+    data : Readings
+    notes : list of str
+        Notes for the operator, in the order of the steps.
+    displacement : ndarray (n, m)
+        Readings at the refractive index of the air, less corrections, m; NaN where missing or excluded.
+    scale : dict of str to float
+        Relative standard uncertainty of all lengths, by cause.
+    machine : Repeatability
+        Of the machine, as far as it is known.
+    drift : Drift or None
+        None where drift is not looked for.
+    sources : list of Shared
+        Uncertain corrections that many readings share, those of the drift excepted.
+    network : Network
+        The present solution.
+    factor : float
+        Standard deviation of a reading over that of the network's weights.
+    scatter : Scatter
+        The parts of it.
+    """
+
+    raw: xr.Dataset
+    settings: Settings
+    data: Readings
+    notes: list[str]
+    displacement: Array
+    scale: dict[str, float]
+    machine: Repeatability
+    drift: Drift | None = None
+    sources: list[Shared] = field(default_factory=list)
+    network: Network = field(init=False)
+    factor: float = field(init=False, default=1.0)
+    scatter: Scatter = field(init=False)
+
+    @property
+    def stations(self) -> Array | None:
+        """Approximate positions of the stations (n, 3), m, where they are to be used."""
+        return self.data.station if self.settings.start == "nominal" else None
+
+    def noise(self, machine: Repeatability | None = None) -> Array:
+        """Return the standard deviation of every reading, (n, m), m: one number, broadcast.
+
+        It contains the repeatability (default: the present one), unless all stations are read at the same time.
+        """
+        variance = 0.0 if self.settings.together else (machine or self.machine).variance
+        return np.broadcast_to(np.sqrt(self.data.noise**2 + variance), self.displacement.shape)
+
+    def beams(self) -> Array:
+        """Return unit vectors (n, m, 3) from the stations to the targets, nominal ones where no others are known."""
+        target = self.network.target
+        return directions(np.where(np.isnan(target), self.data.nominal, target), self.network.stations)
 
 
 def read(raw: xr.Dataset, notes: list[str]) -> Readings:
@@ -85,7 +152,9 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
         station = _array(raw, "station_nominal", "station", "direction")
         if np.isnan(station).any():
             station = None
-            notes.append("Not every station has a rough place (station_nominal): all are looked for anywhere.")
+            notes.append(
+                "Not every station has an approximate position (station_nominal): the distances determine all of them."
+            )
     if "reflector" in raw:
         reflector = _array(raw, "reflector", "target", "direction")
         if np.isnan(reflector).any():

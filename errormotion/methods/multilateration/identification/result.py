@@ -1,0 +1,261 @@
+"""The error dataset of an identification: uncertainties, errors of the axes, and further results.
+
+Datasets of very many targets are built and checked block by block, since a check needs several copies.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.identification import uncertainty
+from errormotion.methods.multilateration.identification.parameters import fit_machine
+from errormotion.methods.multilateration.identification.state import State
+from errormotion.methods.multilateration.identification.volume import parametric_extras
+from errormotion.methods.multilateration.network.alternating import alternate
+from errormotion.methods.multilateration.network.notes import notes_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from errormotion.methods.multilateration.identification.uncertainty import Parts
+
+log = logging.getLogger(__name__)
+
+LEAST = 10
+"""Targets that four stations need."""
+DATUM = (
+    "best rigid fit of all targets to their commanded places; six motions of the whole, three shifts and three "
+    "rotations, are not seen"
+)
+BLOCK = 50_000
+"""Targets that are checked at a time."""
+
+
+def result(state: State, method: str, version: str) -> xr.Dataset:
+    """Return the error dataset over ``target``; notes are logged as well."""
+    data, network, notes = state.data, state.network, state.notes
+    notes.extend(notes_of(network))
+    made = _uncertainty(state)
+    error = network.target - data.nominal
+    values = np.full((len(error), 6), np.nan)
+    values[:, :3] = error
+    extras = _extras(state) | _alternated(state) | _axes(state, error, made)
+    covariance = made.covariance(network.target_covariance, state.factor**2)
+    if state.settings.together and state.machine.variance > 0:
+        covariance[:, :3, :3] += state.machine.variance * np.eye(3)
+    for note in notes:
+        log.warning(note)
+    position, reflector = data.position, data.reflector
+    ds = build(
+        values,
+        covariance,
+        made.influence,
+        {
+            "target": ("target", np.array(data.targets), {}),
+            "direction": ("direction", list("xyz"), {}),
+            **{name: ("target", position[:, k], {"units": "m"}) for k, name in enumerate("xyz")},
+        },
+        extras,
+        component="tool",
+        machine=str(state.raw.attrs.get("machine", "unknown")),
+        frame=str(state.raw.attrs.get("frame", "machine")),
+        functional_point=reflector[0] if np.ptp(reflector, axis=0).max() == 0 else reflector.mean(axis=0),
+        reference=DATUM,
+        method=method,
+        method_version=version,
+        provenance=provenance.make(state.settings, state.raw, None, steps=_steps(state)),
+        sources=made.names,
+        source_groups=made.groups,
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+def _uncertainty(state: State) -> Parts:
+    """Return the parts of the targets' uncertainty."""
+    scales = [
+        (name, "scale of the tracker" if name == "tracker scale" else "refraction", relative)
+        for name, relative in state.scale.items()
+        if relative > 0
+    ]
+    made = uncertainty.parts(
+        state.network, state.factor, state.scatter, scales, state.displacement if scales else np.empty(0), state.sources
+    )
+    if state.settings.together and state.machine.variance > 0:
+        made.own[:] += state.machine.variance * np.eye(3)
+    return made
+
+
+def _axes(state: State, error: Array, made: Parts) -> dict[str, xr.DataArray]:
+    """Return the errors of the axes as further results; where there are none, a note gives the reason."""
+    data, settings, notes = state.data, state.settings, state.notes
+    if not settings.parametric:
+        return {}
+    chain = settings.chain or state.raw.attrs.get("chain")
+    if not isinstance(chain, str):
+        notes.append("No errors of the axes: the chain of the machine is not known (setting or attribute 'chain').")
+        return {}
+    try:
+        axes = fit_machine(
+            chain,
+            data.position,
+            error,
+            made.own,
+            made.influence[..., :3],
+            reflector=data.reflector,
+            max_order=settings.max_order,
+        )
+    except MethodError as refusal:
+        notes.append(f"No errors of the axes. {refusal}")
+        return {}
+    notes.extend(axes.notes)
+    if axes.unseen:
+        unseen = "; ".join(f"{name}: {each.reason}" for name, each in axes.unseen.items())
+        notes.append(f"Errors of the axes that these targets do not determine: {unseen}.")
+    return parametric_extras(axes)
+
+
+def _alternated(state: State) -> dict[str, xr.DataArray]:
+    """Return the results of the published scheme from the targets with all readings, where they are wanted."""
+    data, network, notes = state.data, state.network, state.notes
+    if not state.settings.alternating:
+        return {}
+    whole = np.isfinite(state.displacement).all(axis=0)
+    if np.count_nonzero(whole) < LEAST:
+        notes.append(f"The alternating scheme was left out: fewer than {LEAST} targets have all readings.")
+        return {}
+    start = network.station if data.station is None else data.station
+    other = alternate(state.displacement[:, whole], data.nominal[whole], start)
+    place = np.full(data.nominal.shape, np.nan)
+    place[whole] = other.target
+    notes.append(
+        f"The alternating scheme {'stopped' if other.converged else 'ended'} after {other.iterations} iterations "
+        f"(joint solution: {network.iterations}); a target may still be about {other.left * 1e6:.2g} um off."
+    )
+    return {
+        "alternating_place": xr.DataArray(place, dims=("target", "direction"), attrs={"units": "m"}),
+        "alternating_iterations": xr.DataArray(other.iterations),
+        "alternating_left": xr.DataArray(other.left, attrs={"units": "m"}),
+    }
+
+
+def _steps(state: State) -> list[str]:
+    steps = ["Gauss-Newton of targets, stations and dead paths, targets eliminated"]
+    if state.network.left_out:
+        steps.append(f"{len(state.network.left_out)} readings excluded")
+    if state.drift is not None and state.drift.correction.any():
+        steps.append("drift taken off the readings")
+    if state.settings.expansion is not None:
+        steps.append(f"scales corrected to {state.settings.expansion.reference:g} degC")
+    return [*steps, "free network on the commanded positions"]
+
+
+def _extras(state: State) -> dict[str, xr.DataArray]:
+    data, network, f2 = state.data, state.network, state.factor**2
+    n = len(data.stations)
+    coords: dict[str, Any] = {
+        "station": data.stations,
+        "target": data.targets,
+        "direction": list("xyz"),
+        "direction_": list("xyz"),
+        "drift_term": ["dead path", "x", "y", "z"],
+    }
+
+    def array(values: Any, dims: tuple[str, ...], unit: str, meaning: str = "") -> xr.DataArray:
+        attrs = ({"units": unit} if unit else {}) | ({"long_name": meaning} if meaning else {})
+        return xr.DataArray(values, {d: coords[d] for d in dims if d in coords}, dims, attrs=attrs)
+
+    left_out = np.zeros(data.displacement.shape, np.int8)
+    for j, i in network.left_out:
+        left_out[j, i] = 1
+    left_out[:, list(network.undecided)] = 2
+    dead_path_variance = np.diag(network.joint_covariance)[3 : 4 * n : 4]
+    by_reading, vector = ("station", "target"), ("station", "direction")
+    extras = {
+        "target_nominal": array(data.nominal, ("target", "direction"), "m", "commanded position of the reflector"),
+        "target_place": array(network.target, ("target", "direction"), "m", "estimated position of the reflector"),
+        "station_place": array(network.station, vector, "m", "estimated position of the tracker"),
+        "station_covariance": array(f2 * network.station_covariance, (*vector, "direction_"), "m^2"),
+        "dead_path": array(network.dead_path, ("station",), "m"),
+        "dead_path_u": array(np.sqrt(f2 * dead_path_variance), ("station",), "m"),
+        "residual": array(network.residual, by_reading, "m", "reading minus model"),
+        "redundancy": array(network.redundancy, by_reading, "1", "share of a reading's error that is in its residual"),
+        "left_out": array(left_out, by_reading, "", "1: wrong; 2: target given up, wrong reading not identified"),
+        "iterations": array(network.iterations, (), ""),
+        "condition": array(network.condition, (), "1", "of the stations' information, without motions of the whole"),
+        "sigma0": array(network.sigma0, (), "1", "scatter of the readings over the stated one"),
+        "freedom": array(network.freedom, (), "", "readings less unknowns"),
+        "noise": array(state.factor / np.max(network.weight), (), "m", "of a reading, repeatability included"),
+    }
+    if data.station is not None:
+        extras["station_nominal"] = array(data.station, vector, "m", "approximate position of the tracker")
+    if state.drift is not None and state.drift.pairs:
+        extras["drift_rate"] = array(state.drift.rate, ("station", "drift_term"), "m/s", "during each set-up")
+    if state.machine.sources:
+        extras["repeatability"] = array(state.machine.value, (), "m", "of the machine, each coordinate of each visit")
+        extras["repeatability"].attrs["source"] = state.machine.source
+        extras["repeatability_u"] = array(state.machine.uncertainty, (), "m")
+    shares = state.scatter.shares
+    extras["scatter_share"] = xr.DataArray(
+        list(shares.values()), {"cause": list(shares)}, "cause",
+        attrs={"units": "1", "long_name": "of each cause in the variance of a reading"},
+    )  # fmt: skip
+    return extras
+
+
+def build(
+    values: Array, covariance: Array, influence: Array, coords: Mapping[str, Any], extras: Mapping[str, xr.DataArray],
+    **further: Any,
+) -> xr.Dataset:  # fmt: skip
+    """Return the error dataset over ``target``; see `errormotion.datasets.build_errors`.
+
+    Parameters
+    ----------
+    values, covariance, influence : ndarray (m, 6), (m, 6, 6), (source, m, 6)
+        Become part of the dataset where there are many; unknown ones are set NaN in place.
+    coords : mapping
+        Name to (dims, array, attrs).
+    extras : mapping of str to DataArray
+    **further
+        Further arguments of `build_errors`.
+
+    Raises
+    ------
+    DatasetError
+        Any violation of the schema.
+    """
+    m = len(values)
+    if m <= BLOCK:
+        return build_errors(
+            values, covariance, influence=influence, dims=("target",), coords=coords, extras=extras, **further
+        )
+    pieces: list[xr.Dataset] = []
+    for first in range(0, m, BLOCK):
+        part = slice(first, min(first + BLOCK, m))
+        piece = build_errors(
+            values[part], covariance[part], influence=influence[:, part], dims=("target",),
+            coords={name: (dims, array[part] if "target" in dims else array, attrs)
+                    for name, (dims, array, attrs) in coords.items()},
+            extras={name: array.isel(target=part) if "target" in array.dims else array
+                    for name, array in extras.items()} if not pieces else None,
+            **further,
+        )  # fmt: skip
+        covariance[part] = piece["covariance"].values
+        influence[:, part] = piece["influence"].values
+        pieces = pieces or [piece]
+    piece = pieces[0]
+    whole: dict[str, Any] = {"covariance": covariance, "influence": influence}
+    whole |= {name: values[:, k] for k, name in enumerate(piece["dof"].values)}
+    variables = {name: (piece[name].dims, array, piece[name].attrs) for name, array in whole.items()}
+    own = {name: piece.coords[name] for name in piece.coords if "target" not in piece[name].dims}
+    places = {
+        name: (piece[name].dims, array, piece[name].attrs)
+        for name, (dims, array, _) in coords.items() if "target" in dims
+    }  # fmt: skip
+    return xr.Dataset(variables, {**own, **places}, piece.attrs).assign(dict(extras))
