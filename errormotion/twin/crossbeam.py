@@ -99,9 +99,9 @@ class Crossbeam:
         ndarray, (n, 4, 4)
             In the machine, m. Z moves the spindle in the carriage and not the carriage.
         """
-        going = np.tile(np.eye(4), (len(places), 1, 1))
-        going[:, :2, 3] = places[:, :2]
-        return np.asarray(going @ displaced(self.twist(t, places[:, 1])).as_matrix())
+        going = np.tile(np.eye(4), (len(positions), 1, 1))
+        going[:, :2, 3] = positions[:, :2]
+        return np.asarray(going @ displaced(self.twist(t, positions[:, 1])).as_matrix())
 
     def artefact_pose(self, seed: int, position: float) -> Array:
         """Return the pose of the artefact of a position, (4, 4) in the machine, m: under the profiler, misaligned."""

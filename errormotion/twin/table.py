@@ -78,11 +78,11 @@ class Table:
         """Yield which of increasing positions (n,) of the axis lie over which piece, None over none, in order."""
         first = 0
         for target in self.targets:
-            begin, end = (int(place) for place in np.searchsorted(y, target.reach))
-            if first < begin:
-                yield slice(first, begin), None
-            if begin < end:
-                yield slice(begin, end), target
+            start, end = (int(place) for place in np.searchsorted(y, target.reach))
+            if first < start:
+                yield slice(first, start), None
+            if start < end:
+                yield slice(start, end), target
             first = max(first, end)
         if first < y.size:
             yield slice(first, y.size), None
@@ -110,8 +110,8 @@ class Table:
         """
         alone = len(t) == 1
         if alone:  # a direction along the feed takes two lines
-            t, places = np.repeat(t, 2), places + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
-        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, places), target.pose, lift=places[:, 2])
+            t, positions = np.repeat(t, 2), positions + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
+        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, positions), target.pose, lift=positions[:, 2])
         heights = profiler.scan(target.artefact, lines, key=key)
         return heights[:1] if alone else heights
 

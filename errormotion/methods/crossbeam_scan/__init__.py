@@ -3,7 +3,7 @@
 Measuring: ``schedule`` and ``programs`` (what happens when, as NC programs), ``acquisition`` (the scans line by line),
 ``pocket`` (scans for the profiler's pose), ``live`` (what it shows meanwhile).
 Identifying: ``cutting`` (scans out of the record), ``registration`` and ``registrations`` (warm scans on cold ones),
-``strain`` and ``carriage`` (to the six errors of the carriage), ``judgement`` (artefacts that moved), ``curves``
+``strain`` and ``carriage`` (to the six errors of the carriage), ``artefact_check`` (artefacts that moved), ``curves``
 (smooth curves), ``identification`` (all of it); ``edges``, ``calibration`` and ``pose_errors`` (the profiler's own
 pose).
 """

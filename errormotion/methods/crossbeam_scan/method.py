@@ -20,17 +20,17 @@ SCHEMA = "errormotion.raw.crossbeam_scan/1"
 
 
 class CrossbeamScan:
-    """How the carriage on a crossbeam moves and turns as the machine warms up, from scans of artefacts beneath it."""
+    """Thermal errors of the carriage on a crossbeam, from repeated scans of artefacts below it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="crossbeam_scan",
-        summary="Six thermal errors of a crossbeam's axis from a line profiler that scans artefacts again and again",
+        summary="Six thermal errors of a crossbeam's axis from repeated scans of artefacts with a line profiler",
         status="simulated_only",
         version="1",
         cannot_see=(
-            "errors that the cold machine has already: all is relative to the cold scans",
-            "what moves the table and its artefacts along with the crossbeam",
-            "errors between two artefacts that neither of them shows",
+            "errors of the cold machine: all errors are relative to the cold scans",
+            "motion of the table and its artefacts together with the crossbeam",
+            "errors between two artefacts that affect neither of them",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
@@ -91,7 +91,7 @@ class CrossbeamScan:
         return float(len(settings.pocket_lifts) if settings.procedure == "profiler_pose" else expected_lines(settings))
 
     def follow(self, settings: ScanSettings) -> Callable[[xr.Dataset], str]:
-        """Return what tells, chunk by chunk while measuring, how far things are."""
+        """Return a function that reports the progress for each chunk."""
         from errormotion.methods.crossbeam_scan.acquisition.live import LiveScans
 
         return LiveScans(settings).update
@@ -107,24 +107,24 @@ class CrossbeamScan:
         return program_texts(settings)
 
     def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
         from errormotion.methods.crossbeam_scan.planning import plan
 
         return plan(self.info, settings or ScanSettings())
 
     def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
+        """Return the error dataset of a raw dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
 
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; stays as it is and may be larger than memory.
+            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; not changed, and possibly larger than memory.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations at once.
+            The raw dataset does not follow its schema; all violations are listed.
         MethodError
             The data do not determine the answer.
         """

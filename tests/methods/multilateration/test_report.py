@@ -176,7 +176,7 @@ def test_alternating_scheme_is_reported_beside_ours_where_it_was_run(tmp_path):
         page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
     )
     assert "iterations 4" in html
-    assert "turns of the alternating scheme, beside ours 715 what it had left to go / µm 0.250" in html
+    assert "iterations of the alternating scheme 715 its estimated remaining distance / µm 0.250" in html
 
 
 def test_targets_that_are_unknown_are_counted(tmp_path):

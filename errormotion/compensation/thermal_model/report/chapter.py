@@ -10,7 +10,6 @@ import xarray as xr
 from errormotion.report import budget, provenance, quality, sensors, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
-from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
 from errormotion.report.text import fixed, integer, listed, percent
 
@@ -166,5 +165,4 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
 
 def notes(errors: xr.Dataset) -> list[Block]:
     """Return the notes on a dataset, and its completeness."""
-    found: list[Block] = [Text(note, "warning") for note in remarks(errors)]
-    return [*found, *quality.sentences(errors, None)]
+    return [*quality.notes(errors), *quality.sentences(errors, None)]

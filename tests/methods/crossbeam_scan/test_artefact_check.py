@@ -10,8 +10,8 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, check_artefacts
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
-from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, judge
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
 from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
@@ -170,7 +170,7 @@ def judged(seed, step=None):
     axis = dataclasses.replace(axis, profiler=twist, profiler_covariance=known)
     found = Registrations(**dict.fromkeys((f.name for f in dataclasses.fields(Registrations)), None))
     found.reason, found.cold_share = np.full(shape, "", dtype=object), np.full(shape, 0.5)
-    return judge(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
+    return check_artefacts(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
 
 
 def test_clean_campaigns_name_nobody():
