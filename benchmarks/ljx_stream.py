@@ -115,7 +115,7 @@ def take(layout: StreamLayout, rate: float, seconds: float) -> tuple[int, float,
 def main() -> int:
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 5.0
     pin(0)
-    table = Table(title=f"Profiles of {codec.MOST_POINTS} points, driver on one of {os.cpu_count()} cores")
+    table = Table(title=f"Profiles of {codec.MAX_POINTS} points, driver on one of {os.cpu_count()} cores")
     for column in ("", "sent at", "taken in", "bytes", "heights", "CPU", "CPU a profile", "lost"):
         table.add_column(column, justify="right")
     failed = False
@@ -124,7 +124,7 @@ def main() -> int:
         ("with intensities", INTENSITY, 0.0),
         ("at the sensor's pace", 0, RATE),
     ):
-        layout = StreamLayout(1, kind, codec.MOST_POINTS, 1e-7, -0.02, 12.5e-6)
+        layout = StreamLayout(1, kind, codec.MAX_POINTS, 1e-7, -0.02, 12.5e-6)
         taken, wall, processor, lost = take(layout, rate, seconds)
         failed = failed or bool(lost)
         table.add_row(
@@ -138,7 +138,7 @@ def main() -> int:
             str(lost),
         )
     Console(width=120).print(table)
-    bits = 8 * (StreamLayout(1, 0, codec.MOST_POINTS, 1e-7, 0.0, 1e-5).words * 4)
+    bits = 8 * (StreamLayout(1, 0, codec.MAX_POINTS, 1e-7, 0.0, 1e-5).words * 4)
     gigabit = 1e9 * 1448 / 1538 / bits  # data in an Ethernet frame with TCP time stamps, of the bytes on the wire
     print(f"A gigabit line carries {gigabit / 1e3:.1f} kHz of these profiles at most.")
     if failed:

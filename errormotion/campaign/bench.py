@@ -96,12 +96,8 @@ class OpenBench:
             raise BenchError("\n".join([head, *tree([answer.line() for answer in self.answers])]))
 
     def try_open(self) -> None:
-<<<<<<< HEAD
         """Open all instruments; ``answers`` contains the failures."""
-=======
-        """Open what can be opened; ``answers`` says what could not."""
         describe(self.description)
->>>>>>> machine
         for instrument in self.plan.instruments:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)

@@ -313,17 +313,6 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
     return mistakes
 
 
-<<<<<<< HEAD
-def _machine_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> Iterator[str]:
-    """Yield the settings that contradict the machine of the bench."""
-    check = getattr(plugins.get("methods", method)(), "check_machine", None)
-    if check is not None and bench.description is not None:
-        for key, text in check(settings, bench.description).items():
-            yield f"{tomlfile.dotted((*place, 'settings', key))}: {text} ([machine] of {bench.source})"
-
-
-=======
->>>>>>> machine
 def _choice_mistakes(choice: Any, place: tuple[str | int, ...], bench: BenchPlan) -> list[str] | None:
     """Return the selected instruments that are not on the bench; None if the selection is not a table of names."""
     if not isinstance(choice, dict) or not all(isinstance(name, str) for name in choice.values()):

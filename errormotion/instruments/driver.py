@@ -15,7 +15,7 @@ from errormotion.plugins import InstrumentInfo, PluginSettings
 class Driver:
     """Base of drivers with one transport.
 
-    A subclass has ``info`` and ``Settings``, starts the device in ``_begin``, stops it in ``_end``, and uses
+    A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and uses
     ``self.transport``.
 
     Parameters
@@ -58,7 +58,7 @@ class Driver:
             return
         self._transport = self._connect()
         try:
-            self._begin()
+            self._start_session()
         except BaseException:
             self._drop()
             raise
@@ -68,7 +68,7 @@ class Driver:
         if self._transport is None:
             return
         try:
-            self._end()
+            self._end_session()
         finally:
             transport, self._transport = self._transport, None
             transport.close()
@@ -89,10 +89,10 @@ class Driver:
     def _connect(self) -> Transport:
         return open_transport(self.address, simulator=self.info.simulator, recorder=self._record)
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         """Check the device right after connecting."""
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         """Stop the device right before closing."""
 
     def _drop(self) -> None:

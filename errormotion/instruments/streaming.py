@@ -91,7 +91,7 @@ class Reader:
         self._prompt = prompt
         self._queue: deque[_Entry] = deque()
         self._queued = 0
-        self._handed_over = 0
+        self._delivered = 0
         self._text = b""
         self._reply: bytes | None = None
         self._listening = False
@@ -136,8 +136,8 @@ class Reader:
             else:
                 values[into], reasons[into] = entry.chunk.values[part], entry.chunk.reasons[part]
             done += n
-        self._handed_over += size
-        self._transport.handed_over(self._handed_over)
+        self._delivered += size
+        self._transport.report_delivered(self._delivered)
 
     def _await_samples(self, timeout: float) -> None:
         start = time.monotonic()
@@ -157,7 +157,7 @@ class Reader:
             self._queued = 0
             self._change.notify_all()
 
-    def ask(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
+    def query(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
         """Write a request and return the answer's text, prompt included, which comes between the data.
 
         With ``final`` nothing is read after the answer.
@@ -186,7 +186,7 @@ class Reader:
         """Write the request that ends the stream, wait for its answer, end the thread; return the answer."""
         self.drain()
         try:
-            return self.ask(request, timeout, final=True)
+            return self.query(request, timeout, final=True)
         finally:
             self.abandon()
 
@@ -254,7 +254,7 @@ class Reader:
             if self._draining or not size:
                 return
             if self._queued >= self._limit:
-                if self._transport.holds_back:
+                if self._transport.flow_control:
                     self._change.wait_for(self._may_go_on)
                     if self._draining:
                         return

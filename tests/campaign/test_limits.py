@@ -111,11 +111,7 @@ def test_the_extent_is_what_the_steps_say() -> None:
         (
             'duration = "20 min"',
             'duration = "20 min"\ninterval = "1 min"',
-<<<<<<< HEAD
             r"test\[0\]: interval: expected more than the duration of a cycle, \d",
-=======
-            r"test\[0\]: interval: expected more than the duration of a cycle",
->>>>>>> machine
         ),
     ],
     ids=["two balls", "no cycle", "no time to warm up"],

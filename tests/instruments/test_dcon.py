@@ -107,7 +107,7 @@ def test_fewer_inputs_than_names_is_an_error() -> None:
 
 def test_a_refused_request_and_a_foreign_module_are_errors() -> None:
     with DconTemperature(ADDRESS) as thermometer, pytest.raises(InstrumentError, match=r"refuses '\$01X': '\?01'"):
-        thermometer._ask("$01X", "!01")
+        thermometer._query("$01X", "!01")
     with pytest.raises(InstrumentError, match="refuses"):
         DconTemperature(ADDRESS, DconSettings(unit=2)).open()
 

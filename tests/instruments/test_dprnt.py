@@ -228,7 +228,7 @@ def test_a_lost_connection_is_an_error(machine: Machine, probe: Dprnt) -> None:
     machine.say(printed(0))
     source = probe.measure(TOUCHES)
     assert next(source).flag == ""
-    machine.server.hang_up()
+    machine.server.disconnect()
     with pytest.raises(InstrumentError, match=r"Touch 2 of 5 .* is lost"):
         next(source)
 

@@ -223,7 +223,7 @@ def test_the_trigger_count_may_overflow() -> None:
     assert decode(stream, layout())[1].tolist() == [0, 0, LOST, 0]
 
 
-@pytest.mark.parametrize("count", [3, 4, 5 + kernels.LARGEST_GAP + 1])
+@pytest.mark.parametrize("count", [3, 4, 5 + kernels.MAX_GAP_PROFILES + 1])
 def test_a_trigger_count_that_goes_back_or_leaps_is_a_protocol_error_behind_the_profiles_before_it(count: int) -> None:
     profiles, _, end = decode(profile(4) + profile(count), layout())
     assert len(profiles) == 1

@@ -84,7 +84,7 @@ class Waiting:
                 yield Lines(np.array([4711]), np.full((1, layout.points), 1e-3), np.zeros(1))
             yield None
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         pass
 
     def end(self) -> None:

@@ -17,9 +17,9 @@ OVERRUN = 9
 class Tap(Transport):
     """Gives the bytes that a test puts in; each byte is a sample of that value, capitals are text."""
 
-    def __init__(self, holds_back: bool) -> None:
+    def __init__(self, flow_control: bool) -> None:
         super().__init__("tap://", timeout=1.0)
-        self.holds_back = holds_back
+        self.flow_control = flow_control
         self.waiting: list[bytes] = []
         self.change = threading.Condition()
         self.told: list[int] = []
@@ -34,7 +34,7 @@ class Tap(Transport):
         with self.change:
             assert self.change.wait_for(lambda: not self.waiting, 5.0)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         self.told.append(samples)
 
     def _send(self, data: bytes) -> None:
@@ -112,7 +112,7 @@ def test_what_nothing_holds_back_is_thrown_away_and_counted_at_its_place(tap: Ta
 def test_an_answer_gets_through_a_full_queue(tap: Tap, reader: Reader) -> None:
     for piece in (b"\1\2\3\4", b"\5\6", b"\7"):
         tap.put(piece)
-    assert reader.ask(b"hello", 2.0) == b"OK>"
+    assert reader.query(b"hello", 2.0) == b"OK>"
     assert fill(reader, 7)[0] == [1, 2, 3, 4, 5, 6, 7]
 
 
@@ -135,7 +135,7 @@ def test_an_error_in_the_thread_comes_out_behind_the_samples_before_it(
     with pytest.raises(error, match=message):
         fill(reader, 1)
     with pytest.raises(error, match=message):
-        reader.ask(b"hello", 1.0)
+        reader.query(b"hello", 1.0)
 
 
 def test_silence_is_a_timeout_error(reader: Reader) -> None:

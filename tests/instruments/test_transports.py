@@ -123,7 +123,7 @@ def test_a_broken_tcp_connection_is_an_instrument_error_and_can_be_opened_again(
     first = open_transport(echo.server.url)
     first.write(b"a")
     assert first.read() == b"A"
-    echo.server.hang_up()
+    echo.server.disconnect()
     with pytest.raises(InstrumentError, match="lost"):
         first.read()
     first.close()

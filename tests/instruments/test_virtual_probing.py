@@ -420,7 +420,7 @@ def test_no_motion_begins_within_a_block_under_way(order: str) -> None:
     """At 100 samples/s a block lasts 41 s: what is ordered meanwhile starts after it."""
     here, stream = VirtualWorld("cframe", 5), Held()
     here.mount("sphere")
-    here.begin_stream(stream)
+    here.start_stream(stream)
     assert stream.pushing.wait(10.0)
     if order == "run_program":
         begin = here.run_program("G1 X10 F600\nM30").begin

@@ -343,5 +343,5 @@ class VirtualController(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

@@ -65,7 +65,7 @@ class SimulatedDevice:
         self._server.close()
         self.world.detach(self)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take note of how many samples of the running stream its reader has had."""
 
     def answer(self, request: bytes) -> bytes:
@@ -79,7 +79,7 @@ class SimulatedDevice:
         if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self.drops_answers):
             return
         if fault.kind == "disconnect" and self.drops_answers and number >= fault.at:
-            self._server.hang_up()
+            self._server.disconnect()
             return
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data

@@ -173,7 +173,7 @@ class CanTemperature(Thermometer):
             retry=self.settings.retry,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         if self.settings.start:
             self.node.start_node()
         self.identify()

@@ -14,7 +14,7 @@ from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, Thermometer, ThermometerSettings
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
@@ -114,7 +114,7 @@ class DconTemperature(Thermometer):
 
     def identify(self) -> Identity:
         """Query the module for its name and firmware."""
-        name, firmware = (self._ask(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
+        name, firmware = (self._query(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
         return Identity(
             manufacturer="DCON",
             model=name,
@@ -129,7 +129,7 @@ class DconTemperature(Thermometer):
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:
-        values = parse_temperatures(">" + self._ask(f"#{self._unit}", ">"))
+        values = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
         if len(values) < len(self.channels):
             raise ProtocolError(
                 f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(values)}"
@@ -142,16 +142,16 @@ class DconTemperature(Thermometer):
     def _unit(self) -> str:
         return f"{self.settings.unit:02X}"
 
-    def _ask(self, request: str, expected: str) -> str:
+    def _query(self, request: str, expected: str) -> str:
         """Send a request and return the answer behind the start that was expected."""
         with_checksum = self.settings.checksum
         line = self.transport
-        forget_input(line)
+        discard_input(line)
         line.write(encode(request, with_checksum=with_checksum))
         try:
             answer = decode(line.read_until(LINE_END, limit=512), with_checksum=with_checksum)
         except InstrumentTimeoutError:
-            give_up_silent(line)
+            disconnect_after_timeout(line)
             raise
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
@@ -169,5 +169,5 @@ class DconTemperature(Thermometer):
             baudrate=self.settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

@@ -86,5 +86,5 @@ class ModbusTemperature(Thermometer):
             baudrate=settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self.identify()

@@ -34,7 +34,7 @@ MAPS: Mapping[str, Mapping[str, Any]] = {
     "adam-6018": {"function": 3, "first": 0, "type": "u16", "open_codes": (65535,)},
     "logger-16": {"function": 3, "first": 0x20, "type": "i16", "scale": 0.1, "open_from": 10000},
 }
-_MOST = {"adam-6018": 8, "logger-16": 16}
+_MAX_CHANNELS = {"adam-6018": 8, "logger-16": 16}
 
 
 class ModbusSettings(ThermometerSettings):
@@ -92,8 +92,8 @@ class ModbusSettings(ThermometerSettings):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         n = len(self.channels)
-        if n > _MOST.get(self.map, n):
-            raise ValueError(f"the {self.map} has {_MOST[self.map]} channels; found {n} names")
+        if n > _MAX_CHANNELS.get(self.map, n):
+            raise ValueError(f"the {self.map} has {_MAX_CHANNELS[self.map]} channels; found {n} names")
         if self.registers and len(self.registers) != n:
             raise ValueError(f"'registers': expected one for each of the {n} channels; found {len(self.registers)}")
         for name in ("scale", "offset", "thermocouples"):

@@ -20,14 +20,14 @@ class Transport(ABC):
         The address.
     timeout : float
         Time limit of a read without data, s.
-    holds_back : bool
+    flow_control : bool
         Whether a device waits (or loses data itself, visibly) while nothing is read here. A serial line holds
         nothing back: bytes are lost without a trace.
     simulated : bool
         Whether a simulator is at the other end.
     """
 
-    holds_back = True
+    flow_control = True
     simulated = False
 
     def __init__(self, url: str, timeout: float) -> None:
@@ -99,7 +99,7 @@ class Transport(ABC):
                 ) from None
         return data
 
-    def handed_over(self, samples: int) -> None:  # noqa: B027 - most transports do not care
+    def report_delivered(self, samples: int) -> None:  # noqa: B027 - most transports do not care
         """Take note of the number of samples of the running stream that the caller has received.
 
         A real device does not care. A virtual clock does: it counts the time that its reader has seen.

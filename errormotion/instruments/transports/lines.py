@@ -24,7 +24,7 @@ from errormotion.instruments.transports.recording import (
 from errormotion.instruments.transports.simulated import SimulatedTransport
 from errormotion.instruments.transports.tcp import TcpTransport
 
-FIRST = "command"
+COMMAND = "command"
 """Name of the first line in recordings."""
 
 
@@ -35,7 +35,7 @@ class ManyLines(Transport):
         self._lines = dict(lines)
         self._first = next(iter(self._lines.values()))
         super().__init__(self._first.url, self._first.timeout)
-        self.holds_back = self._first.holds_back
+        self.flow_control = self._first.flow_control
         self.simulated = self._first.simulated
 
     def line(self, name: str) -> Transport:
@@ -107,17 +107,17 @@ def _opened(
 ) -> Iterator[tuple[str, Transport]]:
     match address.scheme:
         case "tcp":
-            yield FIRST, TcpTransport(address, timeout=timeout)
+            yield COMMAND, TcpTransport(address, timeout=timeout)
             for name, port in further.items():
                 yield name, TcpTransport(address.line(name, port), timeout=timeout)
         case "sim":
             first = SimulatedTransport(address, load_simulator(simulator, address.url), timeout=timeout)
-            yield FIRST, first
+            yield COMMAND, first
             for name in further:
                 yield name, first.further(name)
         case "replay":
             recordings = read_index(Path(address.path))
-            for name in (FIRST, *further):
+            for name in (COMMAND, *further):
                 if name not in recordings:
                     raise ReplayError(f"The recording {address.path} has no line '{name}'; is it of another device?")
                 yield name, ReplayTransport(recordings[name], timeout=timeout)

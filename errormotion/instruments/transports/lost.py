@@ -67,7 +67,7 @@ class Reopened(Generic[Connection]):
             self.reason = ""
         return self.connection
 
-    def lose(self, reason: str) -> Connection | None:
+    def drop(self, reason: str) -> Connection | None:
         """Give the connection up, so that `get` opens another one; return it, to be closed."""
         lost, self.connection, self.reason = self.connection, None, reason
         return lost

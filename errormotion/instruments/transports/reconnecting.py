@@ -17,7 +17,7 @@ from errormotion.instruments.transports.recording import Recorder, ReplayTranspo
 class ReconnectingTransport(Transport):
     """A transport whose connection is opened again after it was lost; see `transports.lost`.
 
-    A connection that was closed while it was not in use is detected by `forget_input`, ahead of a request.
+    A connection that was closed while it was not in use is detected by `discard_input`, ahead of a request.
 
     Parameters
     ----------
@@ -57,17 +57,17 @@ class ReconnectingTransport(Transport):
             self.close()
             raise
 
-    def lose(self, reason: str) -> None:
+    def drop(self, reason: str) -> None:
         """Give the connection up; the next exchange opens another one."""
         self._rest = b""
-        lost = self._line.lose(reason)
+        lost = self._line.drop(reason)
         if lost is not None:
             lost.close()
 
     def _opened(self) -> Transport:
         line = self._connect()
         line.url = self.url  # messages state the address of the bench file
-        self.holds_back = line.holds_back
+        self.flow_control = line.flow_control
         return line
 
     def _send(self, data: bytes) -> None:
@@ -77,7 +77,7 @@ class ReconnectingTransport(Transport):
         try:
             line.write(data)
         except InstrumentError as error:
-            self.lose(str(error))
+            self.drop(str(error))
             raise
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
@@ -89,7 +89,7 @@ class ReconnectingTransport(Transport):
         except InstrumentTimeoutError:
             raise
         except InstrumentError as error:
-            self.lose(str(error))
+            self.drop(str(error))
             raise
         if self._recorder is not None:
             self._recorder.frame("R", data)
@@ -109,7 +109,7 @@ class ReconnectingTransport(Transport):
                 self._recorder.close()
 
 
-def forget_input(line: Transport) -> bytes:
+def discard_input(line: Transport) -> bytes:
     """Discard and return the unread bytes of a line, such as late answers; detect a connection that was lost."""
     old = b""
     with suppress(InstrumentError):  # silence is expected; the next write opens a lost connection again
@@ -118,10 +118,10 @@ def forget_input(line: Transport) -> bytes:
     return old
 
 
-def give_up_silent(line: Transport) -> None:
+def disconnect_after_timeout(line: Transport) -> None:
     """Give a TCP connection up after a timeout: it may be dead, and a late answer must not be read as the next one."""
-    if isinstance(line, ReconnectingTransport) and line.holds_back:
-        line.lose(f"{line.url} did not answer")
+    if isinstance(line, ReconnectingTransport) and line.flow_control:
+        line.drop(f"{line.url} did not answer")
 
 
 def open_reconnecting(

@@ -72,7 +72,7 @@ class RecordingTransport(Transport):
         super().__init__(inner.url, inner.timeout)
         self._inner = inner
         self._recorder = recorder
-        self.holds_back = inner.holds_back
+        self.flow_control = inner.flow_control
         self.simulated = inner.simulated
 
     def _send(self, data: bytes) -> None:
@@ -84,9 +84,9 @@ class RecordingTransport(Transport):
         self._recorder.frame("R", data)
         return data
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Pass on how far the reader is."""
-        self._inner.handed_over(samples)
+        self._inner.report_delivered(samples)
 
     def close(self) -> None:
         """Close the connection, then the recording; idempotent."""

@@ -14,7 +14,7 @@ DEFAULT_BAUDRATE = 9600
 class SerialTransport(Transport):
     """A serial line: 8 data bits, no parity, one stop bit; or as ``parity=E``, ``parity=O``, ``stopbits=2`` state."""
 
-    holds_back = False
+    flow_control = False
 
     def __init__(self, address: Address, *, timeout: float = 1.0, baudrate: int | None = None) -> None:
         super().__init__(address.url, timeout)

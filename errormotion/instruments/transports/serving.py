@@ -44,7 +44,7 @@ class Server(ABC):
         if self._ended.is_set():
             return
         self._ended.set()
-        self.hang_up()
+        self.disconnect()
         self._wake_write.send(b".")
         if self._thread is not threading.current_thread() and self._thread.ident is not None:
             self._thread.join()
@@ -57,7 +57,7 @@ class Server(ABC):
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
 
     @abstractmethod
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
 
     @abstractmethod
@@ -97,7 +97,7 @@ class TcpServer(Server):
                 return False
             return True
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
         line = self._line  # no lock: a sender may hold it, waiting for a reader who is gone
         if line is not None:
@@ -128,7 +128,7 @@ class TcpServer(Server):
 
     def _forget(self) -> None:
         line = self._line
-        self.hang_up()
+        self.disconnect()
         with self.lock:
             self._line = None
             self._connected.clear()
@@ -167,7 +167,7 @@ class PtyServer(Server):
                         return False
         return not self._cut and not self._ended.is_set()
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Pull the cable: a serial line has no connection to drop, it just stops sending."""
         self._cut = True
 

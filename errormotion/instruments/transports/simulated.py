@@ -19,7 +19,7 @@ class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
     ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine), ``close()`` and ``handed_over(samples)``. A device with several lines has ``urls`` of the further ones,
+    machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of the further ones,
     by name.
     """
 
@@ -59,9 +59,9 @@ class SimulatedTransport(Transport):
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         return self._inner.read(max_bytes, timeout)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Report the reader's progress to the simulator."""
-        self._device.handed_over(samples)
+        self._device.report_delivered(samples)
 
     def close(self) -> None:
         """Close the connection and end the device; idempotent."""

@@ -31,18 +31,18 @@ from typing import Any
 
 PORT = 5007
 POLL_INTERVAL = 0.01  # s between two looks at an order
-BEAT = 0.2  # s
-SETTLE = 5.0  # s that LinuxCNC may take to accept an order
-START = 30.0  # s
-AT_REST = 0.5  # s that a machine without orders may seem to move
-CHANGE = 1.0  # s that a change of state or mode may take
-TEXTS = 0.3  # s that the text of an error may lag behind the error
-REACHED = 1e-6  # m: an order that ends closer than this has reached its goal
-LONGEST = 1 << 24  # bytes of a request
-UNREAD = 1 << 20  # bytes of answers
+BEAT_INTERVAL = 0.2  # s
+ACCEPT_TIMEOUT = 5.0  # s that LinuxCNC may take to accept an order
+START_TIMEOUT = 30.0  # s
+REST_TIMEOUT = 0.5  # s that a machine without orders may seem to move
+CHANGE_TIMEOUT = 1.0  # s that a change of state or mode may take
+TEXT_TIMEOUT = 0.3  # s that the text of an error may lag behind the error
+POSITION_TOLERANCE = 1e-6  # m: an order that ends closer than this has reached its goal
+MAX_REQUEST_BYTES = 1 << 24  # bytes of a request
+MAX_UNREAD_BYTES = 1 << 20  # bytes of answers
 AXES = "XYZ"
-OTHERS = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
-OURS = "G21 G90 G94"  # mm, absolute, mm/min
+MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
+ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
 
 
 class RefusedError(Exception):
@@ -62,7 +62,7 @@ class Client:
         if self.gone or self.writer.is_closing():
             return
         self.writer.write(json.dumps(message).encode() + b"\n")
-        if self.writer.transport.get_write_buffer_size() > UNREAD:
+        if self.writer.transport.get_write_buffer_size() > MAX_UNREAD_BYTES:
             self.writer.transport.abort()
 
 
@@ -110,7 +110,7 @@ class Bridge:
 
     async def await_linuxcnc(self) -> None:
         """Wait until LinuxCNC has started, for a while: until then its state means nothing."""
-        until = time.monotonic() + START
+        until = time.monotonic() + START_TIMEOUT
         while not self.stat.linear_units > 0 and time.monotonic() < until:
             await asyncio.sleep(POLL_INTERVAL)
             self.stat.poll()
@@ -125,7 +125,7 @@ class Bridge:
             while line := await reader.readline():
                 await self._take(client, line)
         except ValueError:
-            client.send(self._failure(None, f"a request of more than {LONGEST} bytes"))
+            client.send(self._failure(None, f"a request of more than {MAX_REQUEST_BYTES} bytes"))
         except OSError:
             pass
         finally:
@@ -186,7 +186,7 @@ class Bridge:
         while True:
             count += 1
             client.send({"id": number, "beat": count, "time": self.time, "running": bool(self.job or self.program)})
-            await asyncio.sleep(BEAT)
+            await asyncio.sleep(BEAT_INTERVAL)
 
     async def _answer(self, number: Any, work: Callable[[], Any]) -> dict[str, Any]:
         try:
@@ -357,7 +357,7 @@ class Bridge:
         goal, words = self._goal(target), _speed(feed, "G38.3")
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
-        if math.dist(goal, self._metres(self.stat.position)) < REACHED:
+        if math.dist(goal, self._metres(self.stat.position)) < POSITION_TOLERANCE:
             raise RefusedError("the probe is at the target already")
         if self.stat.spindle[0]["direction"]:
             raise RefusedError("the spindle turns; stop it before the machine probes")
@@ -440,7 +440,7 @@ class Bridge:
     async def _demand(self, *, homed: bool = True) -> None:
         """Refuse unless the machine is ready for an order."""
         self._look()
-        await self._rest(AT_REST)
+        await self._rest(REST_TIMEOUT)
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it, and enable it again")
         if self.stat.task_state != self.cnc.STATE_ON:
@@ -478,9 +478,9 @@ class Bridge:
     async def _mdi(self, line: str) -> None:
         """Have one line carried out to its end in mm and mm/min, and the modes be as before."""
         await self._mode(self.cnc.MODE_MDI)
-        before = [word for code, word in OTHERS.items() if code in self.stat.gcodes]
+        before = [word for code, word in MODAL_CODES.items() if code in self.stat.gcodes]
         if before:  # on a line of its own: a feed beside it would be read in the units before
-            await self._line(OURS)
+            await self._line(ORDER_MODES)
         await self._line(line)
         if before and self.stat.state != self.cnc.RCS_ERROR:
             await self._line(" ".join(before))
@@ -508,7 +508,7 @@ class Bridge:
 
     async def _settle(self, what: str, *, running: bool = False) -> None:
         """Wait until LinuxCNC has taken an order, and carried it out unless it is one that runs on."""
-        until = time.monotonic() + SETTLE
+        until = time.monotonic() + ACCEPT_TIMEOUT
         while True:
             self._look()
             done = running or self.stat.state != self.cnc.RCS_EXEC
@@ -516,7 +516,7 @@ class Bridge:
                 return
             if time.monotonic() > until:
                 self.command.abort()  # what is not taken now must not be carried out later
-                raise RefusedError(f"LinuxCNC does not respond: {what} took more than {SETTLE:g} s")
+                raise RefusedError(f"LinuxCNC does not respond: {what} took more than {ACCEPT_TIMEOUT:g} s")
             await asyncio.sleep(POLL_INTERVAL / 2)
 
     def _calm(self) -> None:
@@ -528,7 +528,7 @@ class Bridge:
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
             self.command.abort()
 
-    async def _rest(self, limit: float = SETTLE) -> None:
+    async def _rest(self, limit: float = ACCEPT_TIMEOUT) -> None:
         """Wait until nothing moves, as it soon does."""
         until = time.monotonic() + limit
         with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
@@ -538,7 +538,7 @@ class Bridge:
 
     async def _becomes(self, condition: Callable[[], bool]) -> bool:
         """Wait until something is so, for a while; whether it is."""
-        until = time.monotonic() + CHANGE
+        until = time.monotonic() + CHANGE_TIMEOUT
         while True:
             self._look()
             if condition() or time.monotonic() > until:
@@ -547,13 +547,13 @@ class Bridge:
 
     async def _require_arrival(self, goal: list[float]) -> None:
         place = self._metres(self.stat.position)
-        if math.dist(goal, place) > REACHED:
+        if math.dist(goal, place) > POSITION_TOLERANCE:
             found = ", ".join(f"{1e3 * x:.4f}" for x in place)
             raise RefusedError(f"the machine has stopped at {found} mm before its goal{await self._texts()}")
 
     async def _texts(self) -> str:
         """Return what LinuxCNC states of an error, to be appended."""
-        until = time.monotonic() + TEXTS
+        until = time.monotonic() + TEXT_TIMEOUT
         while not self.alarms and time.monotonic() < until:
             await asyncio.sleep(POLL_INTERVAL)
             self._look()
@@ -595,7 +595,7 @@ async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, ended.set)
     await bridge.await_linuxcnc()
-    server = await asyncio.start_server(bridge.serve, "127.0.0.1", port, limit=LONGEST)
+    server = await asyncio.start_server(bridge.serve, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
     port = server.sockets[0].getsockname()[1]
     print(f"errormotion's bridge listens on 127.0.0.1:{port}", flush=True)
     if announce is not None:

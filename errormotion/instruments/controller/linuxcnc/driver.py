@@ -56,7 +56,7 @@ class LinuxCNC(Driver):
 
     def identify(self) -> Identity:
         """Request the identity of the machine."""
-        facts = self._ask("identify")
+        facts = self._query("identify")
         try:
             return Identity(
                 manufacturer=str(facts["manufacturer"]),
@@ -86,7 +86,7 @@ class LinuxCNC(Driver):
         (``manual``, ``mdi``, ``automatic``), ``program`` (name of the file, or empty), ``running``, ``homed``,
         ``enabled``, ``estop``, ``alarms`` (LinuxCNC's error texts since the last order or `reset`).
         """
-        return codec.decode_state(self._ask("state"))
+        return codec.decode_state(self._query("state"))
 
     # ------------------------------------------------------------------ orders
 
@@ -219,7 +219,7 @@ class LinuxCNC(Driver):
 
     # ------------------------------------------------------------------ the wire
 
-    def _ask(self, op: str) -> Any:
+    def _query(self, op: str) -> Any:
         """Send a request, and once more over a new connection if it breaks."""
         try:
             return self._order(op)
@@ -296,7 +296,7 @@ class LinuxCNC(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._number, self._lost = 0, False
         self._unawaited.clear()
         self.identify()

@@ -106,7 +106,7 @@ class MTConnect(Driver):
 
     def identify(self) -> Identity:
         """Return the identity of the device as the agent states it."""
-        document = self._ask("probe")
+        document = self._query("probe")
         device = self._one(document)
         return Identity(
             manufacturer=device.manufacturer or "unknown",
@@ -146,7 +146,7 @@ class MTConnect(Driver):
         InstrumentTimeoutError
             No answer within the time limit.
         """
-        document = self._ask("current")
+        document = self._query("current")
         self._notice(document)
         last = {each.item: each for each in document.observations if not each.level}
         now = document.header.created - self._start(document)
@@ -186,11 +186,11 @@ class MTConnect(Driver):
             The agent overwrites its buffer faster than it can be read.
         """
         if self._next is None:
-            document = self._ask("current")
+            document = self._query("current")
             self._notice(document)
             restarted, self._restarted = self._restarted, False
             return self._taken(document, 0, restarted=restarted)
-        document = self._ask("sample", self._from(), refused=False)
+        document = self._query("sample", self._from(), refused=False)
         return self._understood(document) or self._caught_up(document)
 
     def observations(self, interval: float = 0.1) -> Iterator[Observed]:
@@ -256,7 +256,7 @@ class MTConnect(Driver):
         """Go on at the first observation that the agent still holds."""
         lost, restarted = 0, False
         for _ in range(_ATTEMPTS):
-            document = self._ask("current")
+            document = self._query("current")
             header = document.header
             assert self._next is not None
             again = self._notice(document)
@@ -266,7 +266,7 @@ class MTConnect(Driver):
             elif header.first > self._next:
                 lost += header.first - self._next
                 self._next = header.first
-            document = self._ask("sample", self._from(), refused=False)
+            document = self._query("sample", self._from(), refused=False)
             if document.header.instance == self._instance and OUT_OF_RANGE not in document.errors:
                 self._refuse(document, "sample")
                 lost += max(0, document.header.first - self._next)
@@ -326,7 +326,7 @@ class MTConnect(Driver):
         device = target.path if target.scheme in ("http", "tcp") else ""
         return f"/{device}/{request}" if device else f"/{request}"
 
-    def _ask(self, request: str, query: Mapping[str, str] | None = None, *, refused: bool = True) -> Document:
+    def _query(self, request: str, query: Mapping[str, str] | None = None, *, refused: bool = True) -> Document:
         answer = self._http.get(self._path(request), query, limit=self.settings.most_bytes)
         try:
             document = parse(answer.body)
@@ -352,7 +352,7 @@ class MTConnect(Driver):
         return document.devices[0]
 
     def _examine(self) -> None:
-        document = self._ask("probe")
+        document = self._query("probe")
         self._instance = document.header.instance
         self._device = self._one(document)
         self._items = choose(self._device, self.settings)
@@ -366,7 +366,7 @@ class MTConnect(Driver):
             self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         before = self._instance
         self._examine()
         if before is not None and before != self._instance:

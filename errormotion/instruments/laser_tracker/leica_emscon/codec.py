@@ -20,7 +20,7 @@ from typing import Any
 from errormotion.errors import ProtocolError
 
 HEADER = struct.Struct("<iI")
-LARGEST = 1 << 20  # bytes; 4 points a millisecond for 7 s
+MAX_PACKET_BYTES = 1 << 20  # bytes; 4 points a millisecond for 7 s
 NAME = "64s"
 
 # ---------------------------------------------------------------------- types of packets
@@ -218,7 +218,7 @@ def decode_header(data: bytes | bytearray) -> tuple[int, int]:
     """
     size, kind = HEADER.unpack(data)
     known = kind in RESULTS or kind in (COMMAND, ERROR, CHANGE) or kind in UNUSED_TYPES
-    if not (HEADER.size + 4 <= size <= LARGEST and known):
+    if not (HEADER.size + 4 <= size <= MAX_PACKET_BYTES and known):
         raise ProtocolError(
             f"Expected the header of an emScon packet; found {data.hex(' ')}, that is {size} bytes of type {kind}. Is "
             "it an emScon server that answers here?"

@@ -91,9 +91,9 @@ class LeicaEmScon(Driver):
 
     def identify(self) -> Identity:
         """Request the identity of the tracker and of its weather station."""
-        status = self._ask(codec.GET_SYSTEM_STATUS).values
-        tracker = self._ask_if_known(codec.GET_TRACKER_INFO)
-        station = self._ask_if_known(codec.GET_METEO_STATION)
+        status = self._query(codec.GET_SYSTEM_STATUS).values
+        tracker = self._query_optional(codec.GET_TRACKER_INFO)
+        station = self._query_optional(codec.GET_METEO_STATION)
         return Identity(
             manufacturer="Leica Geosystems",
             model=str(tracker.get("name") or f"emScon tracker ({self.settings.tracker})"),
@@ -109,11 +109,11 @@ class LeicaEmScon(Driver):
 
     def environment(self) -> Environment:
         """Return the air that the tracker reckons with: of its weather station, or as set."""
-        return _environment(self._ask(codec.GET_ENVIRONMENT).values)
+        return _environment(self._query(codec.GET_ENVIRONMENT).values)
 
     def set_environment(self, environment: Environment) -> None:
         """Set the state of the air; takes effect where no weather station overrules it."""
-        self._ask(
+        self._query(
             codec.SET_ENVIRONMENT,
             temperature=environment.temperature,
             pressure=environment.pressure / MILLIBAR,
@@ -122,19 +122,19 @@ class LeicaEmScon(Driver):
 
     def refraction(self) -> float:
         """Return the index by which the tracker divides the optical path."""
-        found = self._ask(codec.GET_REFRACTION).values
+        found = self._query(codec.GET_REFRACTION).values
         self._link.stale_refraction = False
         self._refraction = float(found["ifm" if self.distance_is_displacement else "adm"])
         return self._refraction
 
     def set_refraction(self, index: float) -> None:
         """Set the index, of interferometer and absolute distance meter alike."""
-        self._ask(codec.SET_REFRACTION, ifm=float(index), adm=float(index))
+        self._query(codec.SET_REFRACTION, ifm=float(index), adm=float(index))
         self._link.stale_refraction = True
 
     def reflectors(self) -> tuple[Reflector, ...]:
         """Return the reflectors that the tracker knows."""
-        found = self._link.ask_many(codec.GET_REFLECTORS, total=lambda first: int(first.values["total"]))
+        found = self._link.query_all(codec.GET_REFLECTORS, total=lambda first: int(first.values["total"]))
         return tuple(
             Reflector(
                 int(each.values["number"]),
@@ -151,18 +151,18 @@ class LeicaEmScon(Driver):
         known = {each.name: each.number for each in self.reflectors()}
         if name not in known:
             raise InstrumentError(f"{self.address} knows the reflectors {', '.join(known) or 'none'}; found '{name}'")
-        self._ask(codec.SET_REFLECTOR, number=known[name])
+        self._query(codec.SET_REFLECTOR, number=known[name])
 
     def direction(self) -> tuple[float, float]:
         """Return where the tracker points: azimuth and zenith angle, rad."""
-        found = self._ask(codec.GET_DIRECTION).values
+        found = self._query(codec.GET_DIRECTION).values
         return float(found["azimuth"]), float(found["zenith"])
 
     # ------------------------------------------------------------------ moving
 
     def initialise(self) -> None:
         """Let the tracker initialise: it moves, and takes a minute."""
-        self._ask(codec.INITIALIZE, limit=self.settings.initialise_timeout)
+        self._query(codec.INITIALIZE, limit=self.settings.initialise_timeout)
 
     def home(self, *, clockwise: bool = True) -> None:
         """Go to the nest at the tracker and take up the reflector there: the interferometer has its distance again.
@@ -201,7 +201,7 @@ class LeicaEmScon(Driver):
     def _move(self, number: int, /, **values: Any) -> None:
         self._not_streaming()
         try:
-            self._ask(number, limit=self.settings.motion_timeout, **values)
+            self._query(number, limit=self.settings.motion_timeout, **values)
         except RefusedError as error:
             if error.status not in statuses.NO_TARGET and not self._link.broken:
                 raise
@@ -284,16 +284,16 @@ class LeicaEmScon(Driver):
             )
         if self._link.broken:
             self._reacquire()
-        link, failed, handed_over = self._link, False, 0
-        self._ask(codec.SET_MODE, mode=codec.CONTINUOUS_TIME)
-        self._ask(codec.SET_CONTINUOUS_TIME, milliseconds=self.settings.interval, region=codec.NO_REGION)
+        link, failed, delivered = self._link, False, 0
+        self._query(codec.SET_MODE, mode=codec.CONTINUOUS_TIME)
+        self._query(codec.SET_CONTINUOUS_TIME, milliseconds=self.settings.interval, region=codec.NO_REGION)
         self._streaming = True
         try:
             link.early.clear()
-            self._ask(codec.START_MEASUREMENT)
+            self._query(codec.START_MEASUREMENT)
             for samples in points(link, self.settings, block):
-                handed_over += samples.values.shape[1]
-                self.transport.handed_over(handed_over)
+                delivered += samples.values.shape[1]
+                self.transport.report_delivered(delivered)
                 yield samples
         except InstrumentError:
             failed = True
@@ -305,8 +305,8 @@ class LeicaEmScon(Driver):
                     self._stop()
 
     def _stop(self) -> None:
-        self._ask(codec.STOP_MEASUREMENT)
-        self._ask(codec.SET_MODE, mode=codec.STATIONARY)
+        self._query(codec.STOP_MEASUREMENT)
+        self._query(codec.SET_MODE, mode=codec.STATIONARY)
 
     def _reacquire(self, goal: tuple[float, float, float] | None = None) -> None:
         """Find the reflector again: where it should be, where it was last, or around where the beam points."""
@@ -332,7 +332,7 @@ class LeicaEmScon(Driver):
             number, values = codec.GO_AND_MEASURE, dict(zip(("val1", "val2", "val3"), goal, strict=True))
         limit = settings.motion_timeout if values else settings.timeout
         try:
-            self._ask(number, limit=limit, **values)
+            self._query(number, limit=limit, **values)
             packet = link.await_packet(
                 lambda each: (
                     each.kind in (codec.SINGLE, codec.SINGLE2) or (each.kind == codec.ERROR and each.command == number)
@@ -371,12 +371,12 @@ class LeicaEmScon(Driver):
             raise InstrumentError(f"The connection to {self.address} is closed; open it again")
         return self._connection
 
-    def _ask(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
-        return self._link.ask(number, limit=limit, **values)
+    def _query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
+        return self._link.query(number, limit=limit, **values)
 
-    def _ask_if_known(self, number: int) -> dict[str, Any]:
+    def _query_optional(self, number: int) -> dict[str, Any]:
         try:
-            return dict(self._ask(number).values)
+            return dict(self._query(number).values)
         except RefusedError as error:
             if error.status not in (statuses.NOT_IMPLEMENTED, 27):
                 raise
@@ -395,7 +395,7 @@ class LeicaEmScon(Driver):
             The tracker refuses, or does not know the reflector.
         """
         self._not_streaming()
-        self._ask(
+        self._query(
             codec.SET_UNITS,
             length=codec.METRE,
             angle=codec.RADIAN,
@@ -403,21 +403,21 @@ class LeicaEmScon(Driver):
             pressure=codec.MILLIBAR,
             humidity=codec.RELATIVE,
         )
-        self._ask(codec.SET_COORDINATES, kind=codec.SPHERICAL)
-        system = dict(self._ask(codec.GET_SYSTEM_SETTINGS).values)
+        self._query(codec.SET_COORDINATES, kind=codec.SPHERICAL)
+        system = dict(self._query(codec.GET_SYSTEM_SETTINGS).values)
         system |= {"meteo": METEO[settings.meteo], "transformation": 0, "orientation": 0, "unsolicited": 1}
-        self._ask(codec.SET_SYSTEM_SETTINGS, **system)
-        initialised = self._ask(codec.GET_SYSTEM_STATUS).values["processor"] == codec.INITIALISED
+        self._query(codec.SET_SYSTEM_SETTINGS, **system)
+        initialised = self._query(codec.GET_SYSTEM_STATUS).values["processor"] == codec.INITIALISED
         if settings.initialise == "always" or (settings.initialise == "if_needed" and not initialised):
-            self._ask(codec.INITIALIZE, limit=settings.initialise_timeout)
+            self._query(codec.INITIALIZE, limit=settings.initialise_timeout)
         if settings.meteo == "manual":
             self.set_environment(Environment(settings.temperature, settings.pressure, settings.humidity))
         if settings.refraction_index is not None:
             self.set_refraction(settings.refraction_index)
-        self._ask(codec.SET_MODE, mode=codec.STATIONARY)
-        self._ask(codec.SET_STATIONARY, milliseconds=round(1000 * settings.measuring_time), use_adm=1)
+        self._query(codec.SET_MODE, mode=codec.STATIONARY)
+        self._query(codec.SET_STATIONARY, milliseconds=round(1000 * settings.measuring_time), use_adm=1)
         milliseconds = round(1000 * settings.motion_timeout / 2)
-        self._ask(codec.SET_SEARCH, radius=settings.search_radius, milliseconds=milliseconds)
+        self._query(codec.SET_SEARCH, radius=settings.search_radius, milliseconds=milliseconds)
         if settings.reflector is not None:
             self.set_reflector(settings.reflector)
         self._link.stale_refraction = True
@@ -428,18 +428,18 @@ class LeicaEmScon(Driver):
             self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._last, self._set_anew = None, 0
         self._streaming = False
         self._connection = Link(self.transport, self.settings.timeout, self.settings.busy_timeout)
         self.configure(self.settings)
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         link, self._connection = self._connection, None
         if link is not None and self._streaming:
             self._streaming = False
             with suppress(InstrumentError):
-                link.ask(codec.STOP_MEASUREMENT)
+                link.query(codec.STOP_MEASUREMENT)
 
 
 def _environment(values: Any) -> Environment:

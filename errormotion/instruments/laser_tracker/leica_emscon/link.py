@@ -26,9 +26,9 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import (
 )
 from errormotion.instruments.transports import Transport
 
-BUSY_PAUSE = 0.1  # s between two requests to a busy server
-MOST_EVENTS = 1000
-MOST_EARLY = 100
+BUSY_INTERVAL = 0.1  # s between two requests to a busy server
+MAX_EVENTS = 1000
+MAX_EARLY_PACKETS = 100
 
 
 class RefusedError(InstrumentError):
@@ -90,13 +90,13 @@ class Link:
         self._busy_timeout = busy_timeout
         self._lost = ""
         self._waiting = bytearray()
-        self.events: deque[Event] = deque(maxlen=MOST_EVENTS)
-        self.early: deque[Packet] = deque(maxlen=MOST_EARLY)
+        self.events: deque[Event] = deque(maxlen=MAX_EVENTS)
+        self.early: deque[Packet] = deque(maxlen=MAX_EARLY_PACKETS)
         self.broken = False
         self.breaks = 0
         self.stale_refraction = True
 
-    def ask(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
+    def query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
         """Send a command and return its answer; a busy server is queried again.
 
         Raises
@@ -106,9 +106,9 @@ class Link:
         InstrumentTimeoutError, ProtocolError
             No answer in time, or none that can be read: the connection has to be opened again.
         """
-        return next(self.ask_many(number, limit=limit, **values))
+        return next(self.query_all(number, limit=limit, **values))
 
-    def ask_many(
+    def query_all(
         self,
         number: int,
         /,
@@ -130,7 +130,7 @@ class Link:
                 break
             if time.monotonic() >= patience:
                 raise self._refusal(number, packet.status, f", for {self._busy_timeout:g} s by now")
-            time.sleep(BUSY_PAUSE)
+            time.sleep(BUSY_INTERVAL)
         yield packet
         for _ in range(total(packet) - 1):
             yield self._answer(number, allowed)

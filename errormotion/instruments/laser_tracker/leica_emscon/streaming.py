@@ -17,7 +17,7 @@ from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBroke
 from errormotion.plugins import Samples
 
 BLOCK_SECONDS = 0.5
-LONGEST_GAP = 600.0  # s
+MAX_GAP = 600.0  # s
 LOST, BROKEN = "lost", "beam broken"
 _WARNINGS = frozenset({0, 1})
 
@@ -48,7 +48,7 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
             clock = 1_000_000 * int(point["seconds"]) + int(point["microseconds"])
             start = clock if start is None else start
             place = round((clock - start) / interval)
-            if not 0 <= place - expected <= LONGEST_GAP * settings.rate:
+            if not 0 <= place - expected <= MAX_GAP * settings.rate:
                 raise ProtocolError(
                     f"The tracker's clock goes from point {expected - 1} to point {place}: expected one after the "
                     f"other, {settings.interval} ms apart. Is another client measuring?"

@@ -36,7 +36,7 @@ GET_COUNTS, GET_TEMPERATURE, GET_STATUS = 0x4B, 0x4C, 0x65
 REQUEST_HEAD = 16
 REPLY_HEAD = 28
 RETURN_CODE, PROGRAM = 17, 24  # positions in a reply
-LARGEST_REPLY = 3 << 20  # (m)
+MAX_REPLY_BYTES = 3 << 20  # (m)
 FROM_NEXT = 2  # argument of PREPARE_STREAM: start with the next profile
 PROGRAMS = 16
 
@@ -98,9 +98,9 @@ class Reply:
 def reply_length(head: bytes) -> int:
     """Return the length of a reply from its first four bytes; ProtocolError where it cannot be."""
     length: int = struct.unpack("<I", head)[0] + 4
-    if not REPLY_HEAD <= length <= LARGEST_REPLY:
+    if not REPLY_HEAD <= length <= MAX_REPLY_BYTES:
         raise ProtocolError(
-            f"A reply has {REPLY_HEAD} to {LARGEST_REPLY} bytes; found {length} (its first bytes are {head.hex(' ')})"
+            f"A reply has {REPLY_HEAD} to {MAX_REPLY_BYTES} bytes; found {length} (its first bytes are {head.hex(' ')})"
         )
     return length
 
@@ -162,7 +162,7 @@ TRIGGER_WORD, ENCODER_WORD = 1, 2
 INTENSITY = 0x40  # bit of the kind
 HEIGHT_BITS, INTENSITY_BITS, WORD_BITS = 20, 10, 32
 SMALLEST_HEIGHT = -(1 << 19) + 4  # below lie the codes of points without height
-MOST_POINTS = 3200
+MAX_POINTS = 3200
 
 NOTIFY = 0xFFFFFFFF
 NOTIFY_WORDS = 2
@@ -237,9 +237,9 @@ def parse_layout(reply: Reply) -> StreamLayout:
         No points, more than there can be, or a unit of 0.
     """
     code, _, kind, _, _, points, z_unit, x_start, x_pitch = reply.unpack(_LAYOUT, 4)
-    if not 0 < points <= MOST_POINTS or z_unit == 0:
+    if not 0 < points <= MAX_POINTS or z_unit == 0:
         raise ProtocolError(
-            f"Expected profiles of 1 to {MOST_POINTS} points with a Z unit; the profiler announces {points} points "
+            f"Expected profiles of 1 to {MAX_POINTS} points with a Z unit; the profiler announces {points} points "
             f"and the unit {z_unit}"
         )
     return StreamLayout(code, kind, points, z_unit * LENGTH, x_start * LENGTH, x_pitch * LENGTH)

@@ -342,7 +342,7 @@ class KeyenceLJX(Driver):
             timeout=self.settings.timeout,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._lost, self._notice_pending = None, False
         try:
             self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
@@ -352,7 +352,7 @@ class KeyenceLJX(Driver):
                 raise
         self.configure(self.settings)
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         self._stop()
 
     def _refuse_while_streaming(self) -> None:

@@ -18,7 +18,7 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
 Array = np.ndarray[Any, Any]
 
 LOWEST = SMALLEST_HEIGHT - SENTINELS
-LARGEST_GAP = 1 << 16
+MAX_GAP_PROFILES = 1 << 16
 """Profiles: a trigger count that leaps further did not come from lost profiles."""
 
 MORE, NOTICE, DAMAGED, LEAP = range(4)  # why `follow` stops
@@ -65,7 +65,7 @@ def follow(words: Array, size: int, trigger: Any, aheads: Array) -> tuple[int, i
             return n, DAMAGED
         count = np.int64(words[first + TRIGGER_WORD])
         ahead = (count - trigger) & 0xFFFFFFFF if trigger >= 0 else 0
-        if ahead > LARGEST_GAP:
+        if ahead > MAX_GAP_PROFILES:
             return n, LEAP
         aheads[n] = ahead
         trigger = (count + 1) & 0xFFFFFFFF
@@ -83,7 +83,7 @@ def search(words: Array, size: int, trigger: int) -> int:
     for first in range(words.size - size + 1):
         if total == words[first + size - 1] and words[first] != NOTIFY:
             count = np.int64(words[first + TRIGGER_WORD])
-            if trigger < 0 or (count - trigger) & 0xFFFFFFFF <= LARGEST_GAP:
+            if trigger < 0 or (count - trigger) & 0xFFFFFFFF <= MAX_GAP_PROFILES:
                 return first
         total = np.uint32(total + words[first + size - 1] - words[first])
     return -1

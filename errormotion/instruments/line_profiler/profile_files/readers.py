@@ -15,7 +15,7 @@ from errormotion.plugins.readings import Scan
 
 Array = np.ndarray[Any, Any]
 
-LARGEST_HEIGHT = 0.5  # m; a larger one is a mistaken unit
+MAX_HEIGHT = 0.5  # m; a larger one is a mistaken unit
 FULL = 0.25
 """Share of the cells of a height map that a point cloud must fill to be one."""
 
@@ -38,7 +38,7 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
     if not np.isfinite(heights).any():
         raise InstrumentError(f"{path}: not a single height in it; is it the whole file?")
     highest = float(np.nanmax(np.abs(heights)))
-    if highest > LARGEST_HEIGHT:
+    if highest > MAX_HEIGHT:
         raise InstrumentError(f"{path}: a height of {highest:.4g} m; is its unit really '{settings.unit or 'm'}'?")
     for name, places in (("y", y), ("x", x)):
         steps = np.diff(places)

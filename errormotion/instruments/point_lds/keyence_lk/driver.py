@@ -38,8 +38,8 @@ from errormotion.instruments.transports import Transport, open_transport, parse_
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 
 BLOCK_SECONDS = 0.5
-LONGEST_LINE = 256  # bytes
-MOST_LATE_LINES = 16
+MAX_LINE_BYTES = 256  # bytes
+MAX_LATE_LINES = 16
 
 
 class KeyenceLK(Driver):
@@ -120,7 +120,7 @@ class KeyenceLK(Driver):
             try:
                 if settings.set_up == "set":
                     for name, value in ((DISPLAY_SETTING, unit), (OFFSET_SETTING, NO_OFFSET)):
-                        self._ask(f"SW,{name},{output},{value}", header=f"SW,{name}")
+                        self._query(f"SW,{name},{output},{value}", header=f"SW,{name}")
                 else:
                     self._check_controller(output, unit, settings)
             except InstrumentError:
@@ -128,7 +128,7 @@ class KeyenceLK(Driver):
                 raise
             self._enter(MEASURING)
         if settings.set_up == "set":
-            self._ask(CONTROLLERS[settings.controller].zero_off_request(settings.output))
+            self._query(CONTROLLERS[settings.controller].zero_off_request(settings.output))
         self.settings = settings
 
     def read(self) -> float:
@@ -187,20 +187,20 @@ class KeyenceLK(Driver):
     def _measure(self) -> tuple[float, int]:
         settings = self.settings
         try:
-            text = self._ask(CONTROLLERS[settings.controller].measure_request(settings.output))
+            text = self._query(CONTROLLERS[settings.controller].measure_request(settings.output))
         except ProtocolError:
             return float("nan"), GARBLED
         value, reason = parse_value(text, DISPLAYS[settings.display])
         self._in_step = reason != GARBLED
         return SIGNS[settings.positive] * value, reason
 
-    def _ask(self, request: str, header: str | None = None) -> str:
+    def _query(self, request: str, header: str | None = None) -> str:
         """Send a request and return what the answer states behind its header."""
         if not self._in_step:
             self._enter(MEASURING)
         self._in_step = False
         self.transport.write(encode(request))
-        text = decode(self.transport.read_until(LINE_END, limit=LONGEST_LINE))
+        text = decode(self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES))
         self._in_step = error_code(request, text) is not None  # a refusal is an answer as well
         answer = parse_answer(request, text, header)
         self._in_step = True
@@ -214,26 +214,26 @@ class KeyenceLK(Driver):
         """
         self._in_step = False
         self.transport.write(encode(mode))
-        for _ in range(MOST_LATE_LINES):
-            line = self.transport.read_until(LINE_END, limit=LONGEST_LINE)
+        for _ in range(MAX_LATE_LINES):
+            line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
             if text.endswith((mode, f"{ERROR},{mode},{STATE_ERROR}")):  # an error where it was in this mode already
                 self._in_step = True
                 return
             if error_code(mode, text) is not None:
                 parse_answer(mode, text)
-        raise ProtocolError(f"{self.address}: expected '{mode}' as an answer; {MOST_LATE_LINES} other lines came")
+        raise ProtocolError(f"{self.address}: expected '{mode}' as an answer; {MAX_LATE_LINES} other lines came")
 
     def _check_controller(self, output: str, unit: str, settings: LKSettings) -> None:
         request = f"SR,{DISPLAY_SETTING},{output}"
-        if (found := self._ask(request)) != unit:
+        if (found := self._query(request)) != unit:
             names = {str(display.number): name for name, display in DISPLAYS.items()}
             raise InstrumentError(
                 f"In the settings the controller at {self.address} shows units of {settings.display}; it answers "
                 f"'{request}' with {names.get(found, found)!r}. Change one of them, or have it set: set_up = \"set\""
             )
         request = f"SR,{OFFSET_SETTING},{output}"
-        if set(found := self._ask(request)) & set("123456789"):
+        if set(found := self._query(request)) & set("123456789"):
             raise InstrumentError(
                 f"The controller at {self.address} has an offset of {found}, so that 0 is not the middle of the range. "
                 'Clear it, or have it cleared: set_up = "set"'
@@ -265,6 +265,6 @@ class KeyenceLK(Driver):
             baudrate=self._line_speed(self.settings),
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._enter(MEASURING)
         self.configure(self.settings)

@@ -22,7 +22,7 @@ LINE_END = b"\r\n"
 SCALE = 1.02 / 65520  # x = (raw * SCALE - OFFSET) * range, from the start of the range
 OFFSET = 0.01
 LOWEST, HIGHEST = 643, 64876  # the measuring range
-LARGEST_DISTANCE = 65535
+MAX_DISTANCE_CODE = 65535
 COUNTER_BITS = 18
 BITS_PER_BYTE = 10  # 8N1
 BYTES_PER_VALUE = 3
@@ -95,7 +95,7 @@ def reason(raw: int) -> str:
     """Return why a raw value is no distance inside the measuring range; empty where it is one."""
     if raw in ERROR_CODES:
         return ERROR_CODES[raw]
-    if raw > LARGEST_DISTANCE:
+    if raw > MAX_DISTANCE_CODE:
         return REASONS[UNKNOWN]
     if raw < LOWEST:
         return REASONS[BELOW]

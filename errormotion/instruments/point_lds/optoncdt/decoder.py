@@ -11,7 +11,7 @@ from errormotion.instruments.point_lds.optoncdt import kernels
 from errormotion.instruments.point_lds.optoncdt.codec import COUNTER_BITS, encode_value
 from errormotion.instruments.streaming import Chunk
 
-LARGEST_GAP = 1 << (COUNTER_BITS - 1)
+MAX_GAP_SAMPLES = 1 << (COUNTER_BITS - 1)
 """Samples: half the counter's circle; more cannot be distinguished from a counter that ran backwards."""
 
 
@@ -59,7 +59,7 @@ class StreamDecoder:
         if not raws.size:
             return np.empty(0), np.empty(0, dtype=np.uint8)
         size = int(numbers[-1]) + 1 - self._next
-        if size - raws.size > LARGEST_GAP:
+        if size - raws.size > MAX_GAP_SAMPLES:
             raise ProtocolError(
                 f"The sample counter leaps by {size - raws.size}, more than half of its {COUNTER_BITS} bits: "
                 "the sensor was restarted, or these are no samples; start the stream again"

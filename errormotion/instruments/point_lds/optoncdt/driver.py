@@ -151,7 +151,7 @@ class OptoNCDT(Driver):
         request = text.encode("ascii") + LINE_END
         timeout = self.settings.timeout
         if self._reader is not None:
-            return parse_reply(text, self._reader.ask(request, timeout))
+            return parse_reply(text, self._reader.query(request, timeout))
         self.transport.write(request)
         return parse_reply(text, text_of(self.transport.read_until(PROMPT, limit=1 << 24, timeout=timeout)))
 
@@ -257,12 +257,12 @@ class OptoNCDT(Driver):
             baudrate=baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._lost = None
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
         self.configure(self.settings)
 
-    def _end(self) -> None:
+    def _end_session(self) -> None:
         self.stop()
 
     def _abandon(self) -> None:

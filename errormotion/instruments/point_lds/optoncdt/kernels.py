@@ -17,7 +17,7 @@ from errormotion.instruments.point_lds.optoncdt.codec import (
     FIRST_ERROR_REASON,
     GARBLED,
     HIGHEST,
-    LARGEST_DISTANCE,
+    MAX_DISTANCE_CODE,
     LOST,
     LOWEST,
     NO_PEAK,
@@ -204,7 +204,7 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
                 reasons[place] = GARBLED
             elif raw < LOWEST:
                 reasons[place] = BELOW
-            elif raw <= LARGEST_DISTANCE:
+            elif raw <= MAX_DISTANCE_CODE:
                 reasons[place] = ABOVE
             elif FIRST_ERROR_CODE <= raw <= LAST_ERROR_CODE:
                 reasons[place] = FIRST_ERROR_REASON + raw - FIRST_ERROR_CODE

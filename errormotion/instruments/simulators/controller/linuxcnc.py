@@ -31,7 +31,7 @@ from errormotion.instruments.transports import Address, Transport, open_transpor
 
 LINGER = 10.0  # s
 START_TIMEOUT = 90.0  # s
-FIRST = 5.0  # s that LinuxCNC waits for its first driver, at least
+LEAST_IDLE = 5.0  # s that LinuxCNC waits for its first driver, at least
 OWN = "simulator"
 """What the numbers of requests start with that the driver knows nothing of."""
 ANSWER = 10.0  # s
@@ -56,7 +56,7 @@ class Control:
 
     def _started(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
-        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, FIRST):g} --pins {PINS}"
+        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, LEAST_IDLE):g} --pins {PINS}"
         ini = ini_text(
             self.world.name,
             machine.travel,
@@ -296,7 +296,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             except InstrumentTimeoutError:
                 continue
             except InstrumentError:
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             *lines, buffer = buffer.split(b"\n")
             for line in lines:

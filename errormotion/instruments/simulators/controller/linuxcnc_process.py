@@ -25,17 +25,17 @@ from errormotion.errors import InstrumentError
 PACKAGE = "linuxcnc-uspace"
 PYTHON = "/usr/bin/python3"
 LOCK = Path("/tmp/errormotion-linuxcnc.lock")
-THEIR_LOCK = Path("/tmp/linuxcnc.lock")
+LINUXCNC_LOCK = Path("/tmp/linuxcnc.lock")
 FOLDER = "errormotion-linuxcnc-"
-SIGN = "processes"
+MARKER_FILE = "processes"
 """File in its folder that all of its processes, and they alone, hold open."""
 PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
 PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
 MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
 """Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
-START = 15.0  # s
-END = 10.0  # s
+START_TIMEOUT = 15.0  # s
+END_TIMEOUT = 10.0  # s
 
 
 def why_not() -> str:
@@ -129,7 +129,7 @@ class LinuxCNCProcess:
             with suppress(ProcessLookupError, AttributeError):
                 os.kill(self._bridge, signal.SIGTERM)  # LinuxCNC ends with its display
             with suppress(subprocess.TimeoutExpired):
-                self._child.wait(END)
+                self._child.wait(END_TIMEOUT)
         self._kill_the_rest()
         self._child.wait()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -153,7 +153,7 @@ class LinuxCNCProcess:
     def _start(self, lock: int) -> subprocess.Popen[bytes]:
         user = _user()
         environment = {"HOME": str(self.folder), "PATH": PATH, "LC_ALL": "C.UTF-8"}
-        with (self.folder / "log.txt").open("wb") as log, (self.folder / SIGN).open("wb") as sign:
+        with (self.folder / "log.txt").open("wb") as log, (self.folder / MARKER_FILE).open("wb") as sign:
             return subprocess.Popen(
                 ["linuxcnc", "-r", str(self.folder / "linuxcnc.ini")],
                 cwd=self.folder,
@@ -169,11 +169,11 @@ class LinuxCNCProcess:
             )
 
     def _await(self) -> tuple[int, int]:
-        until = time.monotonic() + START
+        until = time.monotonic() + START_TIMEOUT
         file = self.folder / "bridge.json"
         while not file.exists():
             if not self.running or time.monotonic() > until:
-                why = "ended at once" if not self.running else f"did not start within {START:g} s"
+                why = "ended at once" if not self.running else f"did not start within {START_TIMEOUT:g} s"
                 log = (self.folder / "log.txt").read_text(errors="replace")
                 raise InstrumentError(f"LinuxCNC {why}; the end of what it stated:\n{log[-2000:]}")
             time.sleep(0.02)
@@ -192,7 +192,7 @@ class LinuxCNCProcess:
                     ["rtapi_app", "exit"],
                     env={"HOME": str(self.folder), "PATH": PATH},
                     capture_output=True,
-                    timeout=END,
+                    timeout=END_TIMEOUT,
                     check=False,
                     user=user.pw_uid if user else None,
                     group=user.pw_gid if user else None,
@@ -215,7 +215,9 @@ def _parts(of: Path | None = None) -> dict[int, str]:
     for pid, (name, _) in _processes().items():
         with suppress(OSError):
             links = [os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()]
-            if any(link.startswith(begin) and Path(link.removesuffix(" (deleted)")).name == SIGN for link in links):
+            if any(
+                link.startswith(begin) and Path(link.removesuffix(" (deleted)")).name == MARKER_FILE for link in links
+            ):
                 found[pid] = name
     return found
 
@@ -243,7 +245,7 @@ def _lock(wait: float) -> int:
             parts = _parts()
             if not parts or "bridge.py" in parts.values():
                 led = time.monotonic()
-            elif time.monotonic() - led > 2 * START:  # they run on without a head
+            elif time.monotonic() - led > 2 * START_TIMEOUT:  # they run on without a head
                 _kill(parts)
             if time.monotonic() < until:
                 time.sleep(0.1)
@@ -262,7 +264,7 @@ def _refuse_beside_another() -> None:
         named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
         raise InstrumentError(f"A LinuxCNC runs on this computer that is not a simulated one of ours: {named}")
     with suppress(OSError):
-        THEIR_LOCK.unlink()  # left by one that was killed
+        LINUXCNC_LOCK.unlink()  # left by one that was killed
 
 
 def _processes() -> dict[int, tuple[str, str]]:

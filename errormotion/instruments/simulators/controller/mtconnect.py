@@ -95,7 +95,7 @@ class SimulatedAgent:
         self._server.close()
         self.world.detach(self)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take no note: an agent follows the world's clock and never drives it."""
 
     # ------------------------------------------------------------------ what is observed

@@ -85,7 +85,7 @@ class SimulatedEmScon(SimulatedDevice):
         super().close()
         self._end_stream()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Let the world's clock follow the reader, unless others drive it."""
         now = self._begin + samples * self._milliseconds / 1000.0
         if not self.world.streaming and now > self.world.time:
@@ -103,9 +103,9 @@ class SimulatedEmScon(SimulatedDevice):
         self._buffer += data
         while len(self._buffer) >= codec.HEADER.size + 4:
             size, _ = codec.HEADER.unpack_from(self._buffer)
-            if not codec.HEADER.size + 4 <= size <= codec.LARGEST:
+            if not codec.HEADER.size + 4 <= size <= codec.MAX_PACKET_BYTES:
                 self._buffer = b""
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             if len(self._buffer) < size:
                 return
@@ -395,7 +395,7 @@ class SimulatedEmScon(SimulatedDevice):
                     if not all(map(self._server.send, self.fault.pieces(packet))):
                         return
             if self.fault.kind == "disconnect" and first + POINTS_A_PACKET > self.fault.at:
-                self._server.hang_up()
+                self._server.disconnect()
                 return
             if self.world.pace:
                 ahead = (first + POINTS_A_PACKET) * self._milliseconds / 1000.0 / self.world.pace

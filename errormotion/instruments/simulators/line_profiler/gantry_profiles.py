@@ -95,9 +95,9 @@ class GantryProfiles:
         self._times, self._taken = [], 0
         self._began = self._rested = self._world.time
         self._triggers = threading.Semaphore(0)
-        self._world.begin_triggered(self)
+        self._world.start_triggered(self)
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
         self._taken = min(profiles, len(self._times))
 

@@ -61,7 +61,7 @@ class SimulatedLJX(SimulatedDevice):
         artefact = address.params.get("artefact", "twin" if address.host == "gantry" else "swept")
         if source is None and artefact != "twin":
             source = make_source(artefact, int(address.number("seed", 0)))
-        self._points = int(address.number("points", codec.MOST_POINTS))
+        self._points = int(address.number("points", codec.MAX_POINTS))
         self._kind = INTENSITY if address.number("intensity", 0) else 0
         self._trigger_start = int(address.number("trigger_start", 0))
         self._notice_delay = address.number("notice_delay", 0.0)
@@ -109,15 +109,15 @@ class SimulatedLJX(SimulatedDevice):
     def close(self) -> None:
         """End the device."""
         self._ended.set()
-        self._data.hang_up()
+        self._data.disconnect()
         self._join()
         self._data.close()
         super().close()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take note of how many profiles of the running stream its reader has had."""
         self._taken = samples
-        self._feed.handed_over(samples)
+        self._feed.report_delivered(samples)
 
     # ------------------------------------------------------------------ requests
 
@@ -260,8 +260,8 @@ class SimulatedLJX(SimulatedDevice):
         if self.fault.kind == "silence":
             self._mute = True
         else:
-            self._data.hang_up()
-            self._server.hang_up()
+            self._data.disconnect()
+            self._server.disconnect()
 
     def _encoded(self, layout: StreamLayout, lines: Lines) -> bytes:
         """Return the next profiles as bytes, with whatever fault is due."""

@@ -53,7 +53,7 @@ class Feed(Protocol):
     def trigger(self) -> None:
         """Have one profile taken now, where nothing else takes them; called while a stream runs."""
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
 
     def end(self) -> None:
@@ -162,7 +162,7 @@ class FreeRunning:
     def trigger(self) -> None:
         """Do nothing: profiles come anyhow."""
 
-    def handed_over(self, profiles: int) -> None:
+    def report_delivered(self, profiles: int) -> None:
         """Take note of how many profiles of the stream its reader has had."""
         self._taken = profiles
 

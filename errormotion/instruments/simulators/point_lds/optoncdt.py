@@ -57,7 +57,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         self._stop()
         super().close()
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take note of how many samples of the running stream its reader has had."""
         stream = self._stream
         if stream is not None:
@@ -144,7 +144,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         """
         with self._server.lock:  # no sample passes before the answer
             if self._starting and self._stream is not None:
-                self.world.begin_stream(self._stream)
+                self.world.start_stream(self._stream)
             self._starting = False
             super().reply(data)
 
@@ -214,7 +214,7 @@ class SensorStream:
             self.sent += size
             heard = all(self._server.send(piece) for piece in self._fault.pieces(data))
         if self._fault.kind == "disconnect" and self.sent > self._fault.at:
-            self._server.hang_up()
+            self._server.disconnect()
             self.ended = True
         self.ended = self.ended or not heard
 

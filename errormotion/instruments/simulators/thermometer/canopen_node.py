@@ -93,7 +93,7 @@ class SimulatedCanopen:
             server.close()
         self.world.detach(self)
 
-    def handed_over(self, samples: int) -> None:
+    def report_delivered(self, samples: int) -> None:
         """Take no note: a node does not stream."""
 
     def _value(self, index: int, subindex: int) -> Any:
@@ -133,7 +133,7 @@ class SimulatedCanopen:
         if self._away.begins(number):
             if self.fault.kind == "bus_off":
                 server.send_bus_off()
-            server.fall_silent()
+            server.stop_heartbeat()
         if self._away.now():
             return None
         if self._away.returns():

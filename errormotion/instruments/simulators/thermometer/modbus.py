@@ -80,7 +80,7 @@ class SimulatedModbus(SimulatedDevice):
         if self._unplugging.keeps_from(self._answers, self._server):
             return
         if self._device is not None:
-            self._device.ask(data)
+            self._device.handle_request(data)
 
     def _blocks(self) -> dict[int, int]:
         """Return the registers that the device has: those of its channels, and what lies between."""

@@ -99,6 +99,6 @@ class Unplugging:
         if self.now():
             return True
         if self.returns() and isinstance(server, TcpServer):
-            server.hang_up()
+            server.disconnect()
             return True
         return False

@@ -57,7 +57,7 @@ class SimulatedPrinter(SimulatedDevice):
         if (fault.kind == "silence" and number >= fault.at) or fault.hits("drop", number):
             return
         if fault.kind == "disconnect" and number >= fault.at:
-            self._server.hang_up()
+            self._server.disconnect()
             return
         line = text.encode("ascii", errors="replace") + b"\r\n"
         if fault.hits("garbage", number):

@@ -111,7 +111,7 @@ class SampleClock:
 
     # ------------------------------------------------------------------ who streams
 
-    def begin_stream(self, stream: Stream) -> None:
+    def start_stream(self, stream: Stream) -> None:
         """Start making samples: at once, for a slave when its master starts, for a master with all its slaves."""
         with self._change:
             if stream.sync == "SLAVE":
@@ -145,7 +145,7 @@ class SampleClock:
                 if not self._streams:
                     self._set_clock(seen)
 
-    def begin_triggered(self, stream: TriggeredStream) -> float:
+    def start_triggered(self, stream: TriggeredStream) -> float:
         """Let a device follow the axes; return the time from which on.
 
         Raises

@@ -90,7 +90,7 @@ class Motion(SampleClock):
             if self.tool != "sphere":
                 raise InstrumentError("Only the sphere is stepped; mount it first")
             self._refuse_to_move()
-            begin = self._begin_of_motion()
+            begin = self._start_of_motion()
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
             self.program = ""
             return self.motion
@@ -99,7 +99,7 @@ class Motion(SampleClock):
         """Run an NC program, see `nc_program`; the motion starts a short and unknown time from now."""
         with self._change:
             self._refuse_to_move()
-            place, begin = self.path.place(self.time), self._begin_of_motion()
+            place, begin = self.path.place(self.time), self._start_of_motion()
             errands = Errands(self, begin)
             try:
                 path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, errands)
@@ -260,7 +260,7 @@ class Motion(SampleClock):
                 self._set_clock(self.path.end)
         return duration
 
-    def _begin_of_motion(self) -> float:
+    def _start_of_motion(self) -> float:
         rng = np.random.default_rng([abs(self.seed), self._programs])
         self._programs += 1
         return float(self._next_instant() + rng.uniform(*LEAD_IN))

@@ -21,7 +21,7 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _LINE_END = b"\n"
-_LONGEST = 1024
+_MAX_LINE_BYTES = 1024
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -169,7 +169,9 @@ class Dprnt(Driver):
         pattern = re.compile(self.settings.pattern)
         while True:
             try:
-                raw = self.transport.read_until(_LINE_END, limit=_LONGEST, timeout=max(end - time.monotonic(), 0.0))
+                raw = self.transport.read_until(
+                    _LINE_END, limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
+                )
                 text = text_of(raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
@@ -201,6 +203,6 @@ class Dprnt(Driver):
             baudrate=self.settings.baudrate,
         )
 
-    def _begin(self) -> None:
+    def _start_session(self) -> None:
         self._map = self.settings.pretravel_map()
         self._before = self._ahead = None

@@ -36,7 +36,7 @@ ERROR_FRAME = 0x20000000
 BUS_OFF = 0x40
 """In the identifier of an error frame: the controller has left the bus."""
 _CYCLE = 0.05  # s that closing may wait for the listening thread
-_SILENCE = "No SDO response"  # canopen's text for a timeout
+_TIMEOUT_TEXT = "No SDO response"  # canopen's text for a timeout
 
 
 class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
@@ -241,19 +241,19 @@ class CanNode(Transport):
             raise SdoRefusal(error.code, f"{where}, {what}") from None
         except SdoCommunicationError as error:
             self._check(network)
-            if _SILENCE not in str(error):
+            if _TIMEOUT_TEXT not in str(error):
                 raise ProtocolError(f"{where}, {what}: {error}") from None
             seen = f"its last heartbeat stated {self.state}" if self.state else "no heartbeat of it has been seen"
             raise InstrumentTimeoutError(f"{where} gives no answer within {self.timeout:g} s; {seen}") from None
         except struct.error as error:
             raise ProtocolError(f"{where}, {what}: the answer is too short: {error}") from None
         except (can.CanError, OSError) as error:
-            self._lose(f"{self.url}: the bus is lost: {error}")
+            self._drop_bus(f"{self.url}: the bus is lost: {error}")
             raise InstrumentError(self._bus.reason) from None
 
     def _check(self, network: Network) -> None:
         if network.failed:
-            self._lose(f"{self.url}: {network.failed}")
+            self._drop_bus(f"{self.url}: {network.failed}")
             raise InstrumentError(self._bus.reason)
 
     def _opened(self) -> Network:
@@ -264,9 +264,9 @@ class CanNode(Transport):
         network.add_node(self._remote)
         return network
 
-    def _lose(self, reason: str) -> None:
+    def _drop_bus(self, reason: str) -> None:
         self._remote = None
-        _disconnect(self._bus.lose(reason))
+        _disconnect(self._bus.drop(reason))
 
     def _send(self, data: bytes) -> None:  # noqa: ARG002
         raise InstrumentError(f"{self.url} carries frames, no stream of bytes")

@@ -95,7 +95,7 @@ class CanopenServer:
         """Go to the state STOPPED."""
         self._node.nmt.send_command(2)
 
-    def fall_silent(self) -> None:
+    def stop_heartbeat(self) -> None:
         """Send no heartbeat any more, until the next boot."""
         self._quiet = True
 

@@ -25,9 +25,9 @@ from errormotion.instruments.transports.recording import Recorder, ReplayTranspo
 from errormotion.instruments.transports.tcp import TcpTransport
 
 PORT = 80
-LARGEST_BODY = 16 << 20
+MAX_BODY_BYTES = 16 << 20
 """Bytes: largest body that is taken by default."""
-_LONGEST_LINE = 4096
+_MAX_LINE_BYTES = 4096
 _ANSWER_TIMEOUTS = 10.0
 """Time limit of a whole answer, in time limits without data: a slow server sends, but must end."""
 
@@ -102,7 +102,7 @@ class HttpTransport(Transport):
 
     # ------------------------------------------------------------------ requests
 
-    def get(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = LARGEST_BODY) -> Answer:
+    def get(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES) -> Answer:
         """Request a path.
 
         A connection that the server has ended since the last answer is renewed.
@@ -116,7 +116,7 @@ class HttpTransport(Transport):
         InstrumentError
             The connection is lost.
         """
-        response = self._asked(path, query, keep=True)
+        response = self._response(path, query, keep=True)
         try:
             body = response.read(limit + 1)
             if len(body) > limit:
@@ -126,16 +126,18 @@ class HttpTransport(Transport):
                     f"{self.url}: the answer to '{path}' is cut off, {response.length} bytes before its end"
                 )
         except http.client.HTTPException as error:
-            self._hang_up()
+            self._disconnect()
             raise ProtocolError(f"{self.url}: the answer to '{path}' is cut off: {error!r}") from None
         except BaseException:
-            self._hang_up()
+            self._disconnect()
             raise
         if response.will_close:
-            self._hang_up()
+            self._disconnect()
         return Answer(response.status, response.headers.get_content_type(), body)
 
-    def parts(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = LARGEST_BODY) -> Iterator[bytes]:
+    def parts(
+        self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES
+    ) -> Iterator[bytes]:
         """Request a stream of many parts, and yield the body of each as it comes.
 
         An answer of one part only is yielded whole. The connection is ended with the iterator; the next request opens
@@ -146,7 +148,7 @@ class HttpTransport(Transport):
         InstrumentTimeoutError, ProtocolError, InstrumentError
             As of `get`, while the stream is read. That the server ends it just ends the iterator.
         """
-        response = self._asked(path, query, keep=False)
+        response = self._response(path, query, keep=False)
         try:
             boundary = response.headers.get_boundary()
             if response.headers.get_content_maintype() != "multipart" or not boundary:
@@ -160,7 +162,7 @@ class HttpTransport(Transport):
         except http.client.HTTPException as error:
             raise ProtocolError(f"{self.url}: the stream of '{path}' is damaged: {error!r}") from None
         finally:
-            self._hang_up()
+            self._disconnect()
 
     def _part(self, response: http.client.HTTPResponse, boundary: str, limit: int) -> bytes | None:
         """Return the next part of a stream; None when it is over."""
@@ -185,14 +187,14 @@ class HttpTransport(Transport):
 
     def _text_line(self, response: http.client.HTTPResponse) -> str | None:
         """Return the next line without its end; None at the end of the stream."""
-        line = response.readline(_LONGEST_LINE)
+        line = response.readline(_MAX_LINE_BYTES)
         if not line:
             return None
         if not line.endswith(b"\n"):
             raise ProtocolError(f"{self.url}: expected a line of a part's head; found {line[:80]!r}")
         return line.decode("latin-1").strip()
 
-    def _asked(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> http.client.HTTPResponse:
+    def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> http.client.HTTPResponse:
         """Send a request and return the answer with its head read."""
         target = quote(path) + (f"?{urlencode(query)}" if query else "")
         host = f"{self.target.host}:{self.target.port}" if self.target.port else self.target.host
@@ -207,20 +209,20 @@ class HttpTransport(Transport):
                 self.write(request)
                 response.begin()
             except InstrumentTimeoutError:
-                self._hang_up()
+                self._disconnect()
                 raise
             except (_EndedError, http.client.RemoteDisconnected):
-                self._hang_up()
+                self._disconnect()
                 if fresh:
                     raise InstrumentError(
                         f"The connection to {self.url} is lost: the server ends it without an answer"
                     ) from None
                 continue  # it had ended an idle connection, as servers do
             except http.client.HTTPException as error:
-                self._hang_up()
+                self._disconnect()
                 raise ProtocolError(f"{self.url}: expected an answer of HTTP; found {str(error)[:100]!r}") from None
             except BaseException:
-                self._hang_up()
+                self._disconnect()
                 raise
             self._fresh = False
             return response
@@ -235,7 +237,7 @@ class HttpTransport(Transport):
             self._fresh = True
         return self._line
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         """End the connection; a replayed one stays, since the recording goes on."""
         self._fresh = True
         if self._line is not None and self._address.scheme != "replay":

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-_LONGEST = 8192
-_MOST_HEADERS = 100
+_MAX_LINE_BYTES = 8192
+_MAX_HEADERS = 100
 
 Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 
@@ -93,9 +93,9 @@ class HttpServer:
 
 def _request(handler: socketserver.StreamRequestHandler) -> tuple[str, dict[str, str]] | None:
     """Return path and query of the next request; None where the client has gone or sends something else."""
-    words = handler.rfile.readline(_LONGEST).decode("latin-1").split()
-    for _ in range(_MOST_HEADERS):
-        if handler.rfile.readline(_LONGEST) in (b"\r\n", b"\n", b""):
+    words = handler.rfile.readline(_MAX_LINE_BYTES).decode("latin-1").split()
+    for _ in range(_MAX_HEADERS):
+        if handler.rfile.readline(_MAX_LINE_BYTES) in (b"\r\n", b"\n", b""):
             break
     if len(words) != 3 or words[0] != "GET":
         return None

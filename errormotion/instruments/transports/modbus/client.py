@@ -27,11 +27,11 @@ from errormotion.instruments.transports.modbus.codec import (
     encode_request,
     missing,
 )
-from errormotion.instruments.transports.reconnecting import forget_input, give_up_silent, open_reconnecting
+from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
 QUIET_INTERVAL = 0.05  # s without a byte: what was under way is over
-LONGEST_RUBBISH = 512  # bytes of rubbish that are waited for
+MAX_STRAY_BYTES = 512  # bytes of rubbish that are waited for
 
 
 class ModbusLine(Transport):
@@ -58,7 +58,7 @@ class ModbusLine(Transport):
 
     def __init__(self, line: Transport, framing: Framing, unit: int, retries: int = 0) -> None:
         super().__init__(line.url, line.timeout)
-        self.holds_back, self.simulated = line.holds_back, line.simulated
+        self.flow_control, self.simulated = line.flow_control, line.simulated
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
 
@@ -86,7 +86,7 @@ class ModbusLine(Transport):
         raise AssertionError  # the loop has ended by itself
 
     def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        forget_input(self._line)
+        discard_input(self._line)
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
         end = time.monotonic() + self.timeout
@@ -103,7 +103,7 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
-            give_up_silent(self._line)
+            disconnect_after_timeout(self._line)
             raise
 
     def _frame(self, end: float) -> bytes:
@@ -126,8 +126,8 @@ class ModbusLine(Transport):
         """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
         came = 0
         with suppress(InstrumentError):
-            while came < LONGEST_RUBBISH:
-                came += len(self._line.read(LONGEST_RUBBISH, timeout=QUIET_INTERVAL))
+            while came < MAX_STRAY_BYTES:
+                came += len(self._line.read(MAX_STRAY_BYTES, timeout=QUIET_INTERVAL))
 
     def _send(self, data: bytes) -> None:
         self._line.write(data)

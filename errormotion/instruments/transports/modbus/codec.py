@@ -24,7 +24,7 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 _HEAD = 7  # bytes of an MBAP header
-_LONGEST = 254  # bytes behind its length
+_MAX_MBAP_LENGTH = 254  # bytes behind its length
 
 
 def crc16(data: bytes) -> bytes:
@@ -63,7 +63,9 @@ def missing(framing: Framing, data: bytes) -> int:
         size = _HEAD + 2
     else:
         protocol, length = struct.unpack(">HH", data[2:6])
-        size = 6 + length if not protocol and length <= _LONGEST else 0  # else no head: no further bytes are awaited
+        size = (
+            6 + length if not protocol and length <= _MAX_MBAP_LENGTH else 0
+        )  # else no head: no further bytes are awaited
     return max(size - len(data), 0)
 
 

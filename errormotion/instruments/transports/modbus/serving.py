@@ -70,7 +70,7 @@ class ModbusServer:
             self._thread.join()
             raise self._failure
 
-    def ask(self, data: bytes) -> None:
+    def handle_request(self, data: bytes) -> None:
         """Hand a request to the server; what it answers comes to ``on_answer``."""
         unit = data[0] if self._framing == "rtu" else data[6] if len(data) > 6 else self._unit
         if unit == self._unit:

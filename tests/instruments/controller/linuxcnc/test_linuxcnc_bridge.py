@@ -133,7 +133,7 @@ class Wire:
     """A client's end: what the bridge writes, line by line."""
 
     def __init__(self, bridge: Bridge) -> None:
-        self.reader = asyncio.StreamReader(limit=module.LONGEST)
+        self.reader = asyncio.StreamReader(limit=module.MAX_REQUEST_BYTES)
         self.answers: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self.beats = 0
         self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0, abort=lambda: None)
@@ -162,7 +162,7 @@ class Wire:
         assert answer["id"] == 7
         return answer["result"] if answer["ok"] else answer["error"]
 
-    async def hang_up(self) -> None:
+    async def disconnect(self) -> None:
         self.reader.feed_eof()
         await self.task
 
@@ -173,9 +173,9 @@ Test = Callable[[Wire, FakeLinuxCNC, Bridge], Coroutine[Any, Any, None]]
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Test], None]:
     """Return what runs a test with a client at a bridge; LinuxCNC is given less time than in earnest."""
-    monkeypatch.setattr(module, "SETTLE", 0.2)
-    monkeypatch.setattr(module, "CHANGE", 0.1)
-    monkeypatch.setattr(module, "TEXTS", 0.05)
+    monkeypatch.setattr(module, "ACCEPT_TIMEOUT", 0.2)
+    monkeypatch.setattr(module, "CHANGE_TIMEOUT", 0.1)
+    monkeypatch.setattr(module, "TEXT_TIMEOUT", 0.05)
 
     def run(test: Test) -> None:
         async def session() -> None:
@@ -183,7 +183,7 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Test], No
             bridge = Bridge(fake, FakeHAL(), tmp_path, ("ball",), "load")
             wire = Wire(bridge)
             await test(wire, fake, bridge)
-            await wire.hang_up()
+            await wire.disconnect()
             assert not bridge.clients
 
         asyncio.run(session())
@@ -212,7 +212,7 @@ def test_nothing_that_comes_in_ends_it(play: Callable[[Test], None], line: bytes
 
 
 def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "LONGEST", 1000)
+    monkeypatch.setattr(module, "MAX_REQUEST_BYTES", 1000)
 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         wire.reader.feed_data(b"x" * 5000)
@@ -408,7 +408,7 @@ def test_an_order_beats_until_it_ends_and_others_wait_their_turn(play: Callable[
         assert "broken off: it was stopped" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
         assert wire.beats >= 1
         assert fake.lines.count("abort") == 1
-        await other.hang_up()
+        await other.disconnect()
 
     play(test)
 
@@ -419,7 +419,7 @@ def test_a_client_that_hangs_up_takes_its_motion_with_it(play: Callable[[Test], 
         fake.on_run = lambda: setattr(fake.values, "interp_state", fake.INTERP_READING)
         assert (await other.ask("run_program", text="G4 P9"))["program"] == "errormotion-1.ngc"
         assert (await wire.ask("state"))["running"] is True
-        await other.hang_up()
+        await other.disconnect()
         assert fake.lines[-1] == "abort"
         assert "the connection of its client is lost" in await wire.ask("finish")
         assert not list(bridge.programs.iterdir())
@@ -462,7 +462,7 @@ def test_waiting_ends_by_a_stop(play: Callable[[Test], None]) -> None:
         other = Wire(bridge)
         await other.ask("stop")
         assert (await asyncio.wait_for(wire.answers.get(), 10))["error"] == "waiting was stopped"
-        await other.hang_up()
+        await other.disconnect()
 
     play(test)
 

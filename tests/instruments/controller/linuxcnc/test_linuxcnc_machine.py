@@ -475,4 +475,4 @@ def test_an_ini_file_in_inches_switched_on_and_homed_by_hand_and_nothing_left_be
     assert not folder.exists()
     running = {name for name, state in linuxcnc_process._processes().values() if state != "Z"}
     assert running.isdisjoint(linuxcnc_process.PROCESSES)
-    assert not linuxcnc_process.THEIR_LOCK.exists()
+    assert not linuxcnc_process.LINUXCNC_LOCK.exists()

@@ -16,7 +16,7 @@ from errormotion.instruments.simulators.controller.linuxcnc_process import Linux
 @pytest.fixture
 def own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(linuxcnc_process, "LOCK", tmp_path / "lock")
-    monkeypatch.setattr(linuxcnc_process, "THEIR_LOCK", tmp_path / "theirs")
+    monkeypatch.setattr(linuxcnc_process, "LINUXCNC_LOCK", tmp_path / "theirs")
     monkeypatch.setattr(linuxcnc_process, "why_not", lambda: "")
     monkeypatch.setattr(linuxcnc_process, "_processes", dict)
     return tmp_path / "lock"
@@ -43,7 +43,7 @@ def test_a_second_one_waits_and_then_says_why(own_lock: Path) -> None:
 def test_a_linuxcnc_that_may_run_a_machine_is_not_touched(
     own_lock: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    theirs = linuxcnc_process.THEIR_LOCK
+    theirs = linuxcnc_process.LINUXCNC_LOCK
     theirs.touch()
     monkeypatch.setattr(linuxcnc_process, "_processes", lambda: {4711: (name, "S")})
     with pytest.raises(InstrumentError, match=rf"not a simulated one of ours: {name} \(4711\)"):
