@@ -91,7 +91,7 @@ class Crossbeam:
         there[1, 3] = middle
         return there @ displaced(self.twist(t, middle)).as_matrix() @ going
 
-    def carriage_at(self, t: Array, places: Array) -> Array:
+    def carriage_at(self, t: Array, positions: Array) -> Array:
         """Return the poses of the carriage at times t (n,) since the start of the warm-up, s, and positions (n, 3), m.
 
         Returns

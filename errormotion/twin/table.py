@@ -87,7 +87,7 @@ class Table:
         if first < y.size:
             yield slice(first, y.size), None
 
-    def scan(self, target: Target, profiler: Profiler, t: Array, places: Array, key: tuple[int, ...]) -> Array:
+    def scan(self, target: Target, profiler: Profiler, t: Array, positions: Array, key: tuple[int, ...]) -> Array:
         """Return the lines that the profiler takes of a piece, each with the error at its own time.
 
         Parameters
@@ -98,7 +98,7 @@ class Table:
             The sensor.
         t : ndarray, (n,)
             Time since the start of the warm-up, s, of each line; cold before 0.
-        places : ndarray, (n, 3)
+        positions : ndarray, (n, 3)
             Commanded X, Y and Z, m.
         key : tuple of int
             Of the noise.
