@@ -203,8 +203,8 @@ def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
         where = {1: "on one line", 2: "in one plane"}[spread]
         undetermined = ", ".join(group.name for group in shape.groups)
         raise FitError(
-            f"the points lie {where}, which leaves the {shape.name} undetermined ({undetermined}); it needs "
-            f"points that spread {'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
+            f"the points lie {where}, which leaves the {shape.name} undetermined ({undetermined}); it needs points "
+            f"that spread {'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
         )
 
 

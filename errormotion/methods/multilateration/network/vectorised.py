@@ -192,13 +192,13 @@ def examine(
 def equations(c: Array, e: Array) -> Array:
     """Return the equations (4 n, (n - 3) m) of targets for (U, L) of every station, from rows c (n - 3, n, m)."""
     by_station = -c[:, :, None] * np.concatenate([e, np.ones_like(e[:, :1])], axis=1)
-    return by_station.transpose(1, 2, 0, 3).reshape(4 * len(e), -1)
+    return np.asarray(by_station.transpose(1, 2, 0, 3).reshape(4 * len(e), -1))
 
 
 def response(own: Array, e: Array) -> Array:
     """Return the motion (m, 3, 4 n) of targets by (U, L) of every station, from w^2 D e (n, 3, m)."""
     by_station = np.einsum("jam,jbm->majb", own, np.concatenate([e, np.ones_like(e[:, :1])], axis=1))
-    return by_station.reshape(e.shape[2], 3, -1)
+    return np.asarray(by_station.reshape(e.shape[2], 3, -1))
 
 
 def _reach(reading: Array, dead_path: Array, extra: Array, value: Array) -> Array:
