@@ -9,8 +9,8 @@ from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.methods.beam_direction import simulation
-from errormotion.twin.planes import Plane
-from errormotion.twin.point_sensor import PointSensor
+from errormotion.twin.artefacts.planes import Plane
+from errormotion.twin.sensors.point_sensor import PointSensor
 
 SLOW = OptoSettings(rate=1500.0, timeout=10.0)
 LONG = OptoSettings(rate=1500.0, timeout=10.0, range=20e-3)
