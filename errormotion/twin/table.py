@@ -10,9 +10,9 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
-from errormotion.twin.artefacts import Artefact, circular_pocket, swept
+from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 #: default distance of two artefacts, m
 SPACING = 0.2

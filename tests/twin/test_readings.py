@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from errormotion.errors import BenchError
 from errormotion.twin import Event, StepProgram, VirtualMachine, intersections
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
+from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE, Sensing
 
 RATE = 20000.0
 MIN = 60.0

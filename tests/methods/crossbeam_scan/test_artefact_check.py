@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 PROFILER = Profiler(800, 25e-6)
 PLACES = np.linspace(-0.7, 0.7, 8)

@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose import cali
 from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 PROFILER = Profiler(800, 25e-6)
 TIMES, PLACES = [0.0, 1800.0, 7200.0], [-0.5, 0.0, 0.5]

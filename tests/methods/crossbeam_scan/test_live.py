@@ -7,7 +7,7 @@ import xarray as xr
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.acquisition.live import QUEUE_LENGTH, LiveScans
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 POSITIONS = (0.1, 0.3)
 SETTINGS = Settings(positions=POSITIONS, warm_up=(7200.0,), cold_repeats=0, scan_length=400 * 70e-6)

@@ -8,7 +8,7 @@ from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registration import prepare
 from errormotion.methods.crossbeam_scan.identification.registrations import register_all
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 
 def test_bending_of_a_block_is_that_of_its_parabola():

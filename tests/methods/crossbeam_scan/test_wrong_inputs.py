@@ -10,8 +10,8 @@ from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.artefacts import freeform, plane
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.artefacts.pieces import freeform, plane
+from errormotion.twin.sensors.profiler import Profiler
 
 PROFILER, LINES, FEED = Profiler(800, 25e-6), 400, 70e-6
 #: two cold cycles, the second a repeat, and two warm ones, s

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.twin import kernels
-from errormotion.twin.planes import CheckBar, SineGauge, Target, seeded_check_bar
-from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
+from errormotion.twin.artefacts.planes import CheckBar, SineGauge, Target, seeded_check_bar
+from errormotion.twin.sensors.point_sensor import PointSensor, seeded_point_sensor
 
 PIVOT, BAR_POSITION = (0.10, 0.05, 0.12), (-0.10, 0.05, 0.10)
 """A point on every face of the sine gauge, and a point on the axis of the check bar, m."""
