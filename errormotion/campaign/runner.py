@@ -29,7 +29,7 @@ from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
-from errormotion.datasets.folders import looking_beside
+from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import RunError
 
 log = logging.getLogger(__name__)

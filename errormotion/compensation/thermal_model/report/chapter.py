@@ -7,10 +7,11 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.report import budget, provenance, quality, sensors, timeline
+from errormotion.report import budget, provenance, quality, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
 from errormotion.report.generic import unit_at
+from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent
 
 _PREDICTED = (

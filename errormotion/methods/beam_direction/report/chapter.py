@@ -14,10 +14,10 @@ from errormotion.methods.beam_direction.report import planes as beam_direction_p
 from errormotion.methods.beam_direction.report import surface as beam_direction_surface
 from errormotion.methods.beam_direction.report.view import STROKES, Found, found, is_direction
 from errormotion.report import budget, provenance, quality
-from errormotion.report.beams import angle_between
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
 from errormotion.report.fields import remarks, unit_of
+from errormotion.report.parts.beams import angle_between
 from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
 
 __all__ = ["is_direction", "part"]

@@ -19,7 +19,7 @@ from errormotion.methods.normal_vector.report.view import (
     is_normal_vector,
     probing,
 )
-from errormotion.report import budget, provenance, quality, sensors, timeline
+from errormotion.report import budget, provenance, quality, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
     Block,
@@ -35,6 +35,7 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.generic import unit_at
+from errormotion.report.parts import sensors
 from errormotion.report.series import events
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
