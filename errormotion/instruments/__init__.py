@@ -1,6 +1,6 @@
-"""Sensors, controllers and thermometers, and the wires they speak on.
+"""Drivers of sensors, controllers and thermometers, and their connections.
 
-A driver goes through three steps: a *transport* moves bytes (`instruments.transports`), a *codec* is pure functions
-between bytes and values, a *driver* is one plain class. One folder a kind, one module or folder a device. The
-`simulators` sit below the drivers: they speak the wire protocol and query the twin for the truth.
+An instrument has three layers: a *transport* moves bytes (`instruments.transports`), a *codec* consists of pure functions
+between bytes and values, a *driver* is one plain class. Each kind has a folder, each device a module or folder. The
+`simulators` are below the drivers: they implement the wire protocol and read the truth from the twin.
 """

@@ -1,4 +1,4 @@
-"""What all drivers share: settings, opening and closing, an error for use before opening. Nothing more."""
+"""Base of drivers: settings, opening and closing, an error for use before opening."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Driver:
         Raises
         ------
         InstrumentError
-            No device answers, or not the expected device.
+            No device or another device answers.
         """
         if self._transport is not None:
             return

@@ -1,8 +1,8 @@
-"""One reader thread for a streaming instrument, and a bounded queue behind it.
+"""One reader thread for a streaming instrument, and a bounded queue.
 
-The thread takes bytes off the transport, has them decoded, and queues the samples. When the queue is full the thread
-waits, if the transport holds the device back; if it does not (a serial line) the samples are thrown away, counted,
-and appear as lost. No sample is lost without being counted.
+The thread reads bytes from the transport, decodes them, and queues the samples. When the queue is full the thread
+waits, if the transport has flow control; if it has none (a serial line), the samples are discarded, counted,
+and marked as lost. No sample is lost without being counted.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import Transport
 
 POLL_INTERVAL = 0.1
-"""Seconds after which the thread looks whether it shall end."""
+"""Interval at which the thread checks whether it has to end, s."""
 
 Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Samples as they came off the wire.
+    """Samples as received.
 
     Attributes
     ----------
     values : ndarray, (n, ...)
-        Distances (float64, NaN where there is none), or whole profiles as they were sent.
+        Distances (float64, NaN where missing), or packed profiles.
     reasons : ndarray, uint8, (n,)
-        Why not; 0 where there is one.
+        Code of the reason for a missing value; 0 for a value.
     text : bytes
-        What came between the values.
+        Bytes received between the values.
     end : InstrumentError, optional
-        Why nothing comes behind these samples.
+        Reason why no samples follow.
     """
 
     values: Array
@@ -55,7 +55,7 @@ class Decoder(Protocol):
 
 
 def count_reasons(reasons: Array, names: Sequence[str], prefix: str = "") -> dict[str, int]:
-    """Return how many samples have no value, by the name of the reason; code 0 stands for a value."""
+    """Return the number of samples without a value by the name of the reason; code 0 means a value."""
     if not reasons.any():
         return {}
     counts = np.bincount(reasons, minlength=len(names))
@@ -71,13 +71,13 @@ class Reader:
     decode : Decoder
         Called in the thread.
     name : str
-        Of the instrument, for messages.
+        Name of the instrument, for messages.
     limit : int
-        Samples in the queue at which the thread starts to wait.
+        Number of samples in the queue at which the thread waits.
     overrun : int
-        Reason code of samples that were thrown away.
+        Reason code of discarded samples.
     prompt : bytes
-        What ends an answer of the device; empty where answers come on another line.
+        End of an answer of the device; empty where answers use another line.
     """
 
     def __init__(
@@ -99,22 +99,22 @@ class Reader:
         self._error: InstrumentError | None = None
         self._draining = False
         self._ended = False
-        self._heard = time.monotonic()
+        self._last_data = time.monotonic()
         self._change = threading.Condition()
-        self.host_time = self._heard
+        self.host_time = self._last_data
         self.stray_bytes = 0
         self._thread = threading.Thread(target=self._run, name=f"reader-{name}", daemon=True)
         self._thread.start()
 
     def fill(self, values: Array, reasons: Array, timeout: float) -> None:
-        """Fill both arrays with the next samples; ``host_time`` is then when the last of them came.
+        """Fill both arrays with the next samples; ``host_time`` is then the time at which the last of them was received.
 
         Raises
         ------
         InstrumentTimeoutError
             The device sent no data for ``timeout`` s while samples were missing.
         InstrumentError
-            Whatever ended the thread.
+            The error that ended the thread.
         """
         done, size = 0, len(values)
         while done < size:
@@ -144,13 +144,15 @@ class Reader:
         while not self._queue:
             if self._error is not None:
                 raise self._error
-            left = max(self._heard, start) + timeout - time.monotonic()
+            left = max(self._last_data, start) + timeout - time.monotonic()
             if left <= 0:
-                raise InstrumentTimeoutError(f"{self._name}: no data for {timeout:g} s; is it on, is the cable in?")
+                raise InstrumentTimeoutError(
+                    f"{self._name}: no data for {timeout:g} s; is it switched on and connected?"
+                )
             self._change.wait(left)
 
     def drain(self) -> None:
-        """From now on throw all samples away, so that the device is never held back."""
+        """Discard all samples from now on, so that the device need not wait."""
         with self._change:
             self._draining = True
             self._queue.clear()
@@ -158,7 +160,7 @@ class Reader:
             self._change.notify_all()
 
     def query(self, request: bytes, timeout: float, *, final: bool = False) -> bytes:
-        """Write a request and return the answer's text, prompt included, which comes between the data.
+        """Write a request and return the text of the answer with its prompt, which arrives between the data.
 
         With ``final`` nothing is read after the answer.
 
@@ -167,7 +169,7 @@ class Reader:
         InstrumentTimeoutError
             No answer within ``timeout`` s.
         InstrumentError
-            Whatever ended the thread.
+            The error that ended the thread.
         """
         with self._change:
             self._text, self._reply, self._listening, self._final = b"", None, True, final
@@ -191,9 +193,9 @@ class Reader:
             self.abandon()
 
     def finish(self, quiet: float, timeout: float) -> InstrumentError | None:
-        """Throw away what still comes, until the stream ends or nothing has come for ``quiet`` s; end the thread.
+        """Discard further samples until the stream ends or no data have arrived for ``quiet`` s; end the thread.
 
-        Returns what ended the thread, None where the device just fell quiet.
+        Returns the error that ended the thread, None where the device stopped sending.
 
         Raises
         ------
@@ -206,7 +208,7 @@ class Reader:
             with self._change:
                 while self._error is None:
                     now = time.monotonic()
-                    if now - max(self._heard, start) >= quiet:
+                    if now - max(self._last_data, start) >= quiet:
                         break
                     if now - start >= timeout:
                         raise InstrumentTimeoutError(f"{self._name}: still sending {timeout:g} s after it was stopped")
@@ -216,7 +218,7 @@ class Reader:
         return self._error
 
     def abandon(self) -> None:
-        """End the thread whatever the device does; idempotent."""
+        """End the thread, whatever the state of the device; idempotent."""
         with self._change:
             self._ended = True
             self._change.notify_all()
@@ -237,7 +239,7 @@ class Reader:
         except InstrumentError as error:
             self._fail(type(error)(f"{self._name}: {error}"))
         except Exception as error:  # noqa: BLE001 - the caller must receive every error
-            self._fail(InstrumentError(f"{self._name}: the reader broke: {type(error).__name__}: {error}"))
+            self._fail(InstrumentError(f"{self._name}: the reader thread failed: {type(error).__name__}: {error}"))
 
     def _fail(self, error: InstrumentError) -> None:
         with self._change:
@@ -246,8 +248,8 @@ class Reader:
 
     def _accept(self, chunk: Chunk, now: float) -> None:
         with self._change:
-            if chunk.values.size:  # bytes without samples are no sign that the stream is well
-                self._heard = now
+            if chunk.values.size:  # bytes without samples do not show that the stream works
+                self._last_data = now
             if chunk.text:
                 self._accept_text(chunk.text)
             size = len(chunk.values)
@@ -255,18 +257,18 @@ class Reader:
                 return
             if self._queued >= self._limit:
                 if self._transport.flow_control:
-                    self._change.wait_for(self._may_go_on)
+                    self._change.wait_for(self._may_continue)
                     if self._draining:
                         return
                 else:
-                    self._throw_away(size, now)
+                    self._discard(size, now)
                     return
             self._queue.append(_Entry(chunk, size, now))
             self._queued += size
             self._change.notify_all()
 
-    def _may_go_on(self) -> bool:
-        """Whether the thread may take more: there is room, or an answer is awaited that comes behind the data."""
+    def _may_continue(self) -> bool:
+        """Whether the thread may continue: the queue has room, or an answer is expected after the data."""
         return self._queued < self._limit or self._listening or self._draining or self._ended
 
     def _accept_text(self, text: bytes) -> None:
@@ -281,7 +283,7 @@ class Reader:
             self._ended = self._ended or self._final
             self._change.notify_all()
 
-    def _throw_away(self, size: int, now: float) -> None:
+    def _discard(self, size: int, now: float) -> None:
         last = self._queue[-1]
         if last.chunk is None:
             last.size += size
@@ -292,7 +294,7 @@ class Reader:
 
 @dataclass
 class _Entry:
-    chunk: Chunk | None  # None: thrown away
+    chunk: Chunk | None  # None: discarded
     size: int
     host_time: float
     used: int = 0

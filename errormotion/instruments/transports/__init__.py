@@ -1,4 +1,4 @@
-"""Moving bytes: serial lines, TCP, buses, simulators, recordings. Only this package touches ``serial`` and ``socket``.
+"""Transports of bytes: serial lines, TCP, buses, simulators, recordings. Only this package uses ``serial`` and ``socket``.
 
 ``open_transport(url)`` returns a `Transport`:
 
@@ -8,7 +8,7 @@
 * ``replay://session.rec`` a recorded session, played back strictly
 
 Buses have modules of their own: `transports.modbus` (``modbus+tcp``, ``modbus+rtu``, ``modbus+rtu-tcp``) and
-`transports.can` (``can``). A line that comes back by itself after it was lost is in `transports.reconnecting`.
+`transports.can` (``can``). A line that is opened again after it was lost is in `transports.reconnecting`.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ def open_transport(
     simulator : str, optional
         ``module:Class`` of the wire simulator behind ``sim://``.
     recorder : Recorder or path, optional
-        Where every frame of the session is written.
+        File or recorder to which every frame of the session is written.
     timeout : float
         Time limit of a read without data, s.
     baudrate : int, optional
-        Of a serial line; the address wins where it names one.
+        Baud rate of a serial line; that of the address takes precedence.
 
     Raises
     ------
@@ -74,8 +74,8 @@ def open_transport(
             transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout)
         case _:
             raise InstrumentError(
-                f"This instrument speaks no {address.scheme}: expected {', '.join(f'{each}://' for each in BYTES)}; "
-                f"found '{url}'"
+                f"This instrument has no connection of type {address.scheme}: expected "
+                f"{', '.join(f'{each}://' for each in BYTES)}; found '{url}'"
             )
     if recorder is None:
         return transport
@@ -89,9 +89,7 @@ def open_transport(
 def load_simulator(name: str | None, url: str) -> Any:
     """Return the simulator class named ``module:Class``; InstrumentError where there is none."""
     if name is None:
-        raise InstrumentError(
-            f"This instrument has no simulator, so '{url}' leads nowhere; use the address of a device"
-        )
+        raise InstrumentError(f"This instrument has no simulator; found '{url}', expected the address of a device")
     module, _, attribute = name.partition(":")
     try:
         return getattr(import_module(module), attribute)

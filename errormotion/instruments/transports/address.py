@@ -1,4 +1,4 @@
-"""Addresses of devices are URLs. They go into the provenance, so that simulated data never pass for real ones."""
+"""Addresses of devices: URLs. The provenance of results contains them, so that simulated data are marked as such."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class Address:
-    """A device address, taken apart.
+    """The parts of a device address.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Address:
     path : str
         Device file of a serial line, file of ``replay``, device of ``sim``, channel of ``can``.
     params : mapping of str to str
-        What follows the question mark.
+        Parameters after the question mark.
     """
 
     url: str
@@ -55,7 +55,7 @@ class Address:
     params: Mapping[str, str] = field(default_factory=dict)
 
     def number(self, name: str, default: float) -> float:
-        """Return a parameter as a number; InstrumentError names a value that is none."""
+        """Return a parameter as a number; InstrumentError for another value."""
         text = self.params.get(name)
         if text is None:
             return default
@@ -78,7 +78,7 @@ class Address:
         return replace(self, url=f"tcp://{self.host}:{port:.0f}", port=int(port), params={})
 
     def whole(self, name: str, default: int, most: int) -> int:
-        """Return a parameter as a whole number from 0 to ``most``; InstrumentError names a value that is none."""
+        """Return a parameter as a whole number from 0 to ``most``; InstrumentError for another value."""
         value = float(self.number(name, default))
         if not (value.is_integer() and 0 <= value <= most):
             raise InstrumentError(f"'{name}' in '{self.url}': expected a number from 0 to {most}; found {value:g}")
@@ -91,7 +91,7 @@ class Address:
 
 
 def parse_address(url: str) -> Address:
-    """Return a URL taken apart.
+    """Return the parts of a URL.
 
     Raises
     ------
@@ -101,16 +101,18 @@ def parse_address(url: str) -> Address:
     scheme, mark, rest = url.partition("://")
     if not mark or scheme not in SCHEMES:
         raise InstrumentError(f"Expected an address such as {_EXAMPLES}; found '{url}'")
-    if scheme == "replay":  # the rest is a file name, with whatever characters files have
+    if scheme == "replay":  # the rest is a file name; it may contain any characters
         if not rest:
-            raise InstrumentError(f"'{url}' names no recording; write replay://FILE")
+            raise InstrumentError(f"Expected the file of a recording, as in replay://FILE; found '{url}'")
         return Address(url, scheme, path=rest)
     try:
         parts = urlsplit(url)
         port = parts.port
         params = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
     except ValueError as error:
-        raise InstrumentError(f"The address '{url}' cannot be read: {error}; such as {_EXAMPLES}") from None
+        raise InstrumentError(
+            f"The address '{url}' cannot be read: {error}; expected an address such as {_EXAMPLES}"
+        ) from None
     serial = scheme in ("serial", "modbus+rtu")
     path = parts.path if serial else parts.path.removeprefix("/") if scheme == CAN else parts.path.strip("/")
     if scheme == "modbus+tcp" and port is None:

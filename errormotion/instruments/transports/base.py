@@ -1,4 +1,4 @@
-"""What a transport is: bytes out, bytes in, a time limit."""
+"""Base of transports: bytes out, bytes in, a time limit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from errormotion.errors import InstrumentTimeoutError, ProtocolError
 
 CHUNK = 65536
-"""Most bytes taken off the wire at once."""
+"""Largest number of bytes read at once."""
 
 
 class Transport(ABC):
@@ -21,8 +21,8 @@ class Transport(ABC):
     timeout : float
         Time limit of a read without data, s.
     flow_control : bool
-        Whether a device waits (or loses data itself, visibly) while nothing is read here. A serial line holds
-        nothing back: bytes are lost without a trace.
+        Whether the device waits, or reports lost data, while nothing is read here. A serial line has no flow control:
+        bytes are lost without notice.
     simulated : bool
         Whether a simulator is at the other end.
     """
@@ -36,18 +36,18 @@ class Transport(ABC):
         self._rest = b""
 
     def write(self, data: bytes) -> None:
-        """Send bytes; InstrumentError when the connection is gone."""
+        """Send bytes; InstrumentError when the connection is lost."""
         self._send(data)
 
     def read(self, max_bytes: int = CHUNK, timeout: float | None = None) -> bytes:
-        """Return between 1 and ``max_bytes`` bytes, as soon as there are any.
+        """Return between 1 and ``max_bytes`` bytes, as soon as any are available.
 
         Raises
         ------
         InstrumentTimeoutError
-            Silence for ``timeout`` (default: the transport's own) seconds.
+            No data for ``timeout`` (default: the transport's own) seconds.
         InstrumentError
-            The connection is gone.
+            The connection is lost.
         """
         if self._rest:
             data, self._rest = self._rest[:max_bytes], self._rest[max_bytes:]
@@ -55,14 +55,14 @@ class Transport(ABC):
         return self._receive(max_bytes, self.timeout if timeout is None else timeout)
 
     def read_until(self, terminator: bytes, *, limit: int = CHUNK, timeout: float | None = None) -> bytes:
-        """Return all bytes up to and with ``terminator``; what follows it stays for the next read.
+        """Return all bytes up to and with ``terminator``; later bytes remain for the next read.
 
         Raises
         ------
         InstrumentTimeoutError
-            No terminator within the time limit; the message shows what came.
+            No terminator within the time limit; the message shows the received bytes.
         ProtocolError
-            ``limit`` bytes without one.
+            ``limit`` bytes without a terminator.
         """
         allowed = self.timeout if timeout is None else timeout
         end, data = time.monotonic() + allowed, b""
@@ -72,9 +72,9 @@ class Transport(ABC):
             try:
                 data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
             except InstrumentTimeoutError:
-                came = f"only {data[:64]!r}" if data else "nothing"
+                received = f"{data[:64]!r}" if data else "nothing"
                 raise InstrumentTimeoutError(
-                    f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; {came} came"
+                    f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; received {received}"
                 ) from None
         head, found, tail = data.partition(terminator)
         self._rest = tail + self._rest
@@ -86,7 +86,7 @@ class Transport(ABC):
         Raises
         ------
         InstrumentTimeoutError
-            Fewer within the time limit; the message states how many came.
+            Fewer within the time limit; the message states their number.
         """
         allowed = self.timeout if timeout is None else timeout
         end, data = time.monotonic() + allowed, b""
@@ -95,14 +95,14 @@ class Transport(ABC):
                 data += self.read(size - len(data), timeout=max(end - time.monotonic(), 0.0))
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
-                    f"{self.url}: expected {size} bytes within {allowed:g} s; {len(data)} came"
+                    f"{self.url}: expected {size} bytes within {allowed:g} s; received {len(data)}"
                 ) from None
         return data
 
-    def report_delivered(self, samples: int) -> None:  # noqa: B027 - most transports do not care
-        """Take note of the number of samples of the running stream that the caller has received.
+    def report_delivered(self, samples: int) -> None:  # noqa: B027 - without effect for most transports
+        """Report the number of samples of the running stream that the caller has received.
 
-        A real device does not care. A virtual clock does: it counts the time that its reader has seen.
+        Without effect for a real device; a virtual clock counts the time that its reader has received.
         """
 
     @abstractmethod

@@ -1,7 +1,7 @@
-"""A device with several lines: commands on one TCP connection, data on another.
+"""Devices with several connections: commands on one TCP connection, data on another.
 
-``open_lines("tcp://192.168.0.1:24691?stream=24692", {"stream": 24692})`` opens both. A recording of them is a list,
-with one file for each line beside it.
+``open_lines("tcp://192.168.0.1:24691?stream=24692", {"stream": 24692})`` opens both. A recording of them is a list
+of files, one for each line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ COMMAND = "command"
 
 
 class ManyLines(Transport):
-    """Several lines to one device: itself the first one, ``line(name)`` the others."""
+    """Several lines to one device: reads and writes use the first one, ``line(name)`` returns the others."""
 
     def __init__(self, lines: Mapping[str, Transport]) -> None:
         self._lines = dict(lines)
@@ -68,23 +68,23 @@ def open_lines(
     record: Path | None = None,
     timeout: float = 1.0,
 ) -> ManyLines:
-    """Open a device's first line and its further ones.
+    """Open all lines of a device.
 
     Parameters
     ----------
     url : str
-        ``tcp://host:port``, where a parameter ``name=port`` states where a further line is; ``sim://``; ``replay://``.
+        ``tcp://host:port``, where a parameter ``name=port`` states of a further line; ``sim://``; ``replay://``.
     further : mapping of str to int
-        Further lines by name, with the port where the address names none.
+        Further lines by name, with the default port.
     simulator, timeout
         As in `open_transport`.
     record : Path, optional
-        List of the recordings of all lines, which lie beside it.
+        List of the recordings of all lines, which are written beside it.
 
     Raises
     ------
     InstrumentError
-        Another scheme, no device at one of the ports, a recording that is there already.
+        Another scheme, no device at one of the ports, a recording that exists already.
     """
     address = parse_address(url)
     lines: dict[str, Transport] = {}
@@ -119,7 +119,9 @@ def _opened(
             recordings = read_index(Path(address.path))
             for name in (COMMAND, *further):
                 if name not in recordings:
-                    raise ReplayError(f"The recording {address.path} has no line '{name}'; is it of another device?")
+                    raise ReplayError(
+                        f"The recording {address.path} has no line '{name}'; was another device recorded?"
+                    )
                 yield name, ReplayTransport(recordings[name], timeout=timeout)
         case _:
             raise InstrumentError(

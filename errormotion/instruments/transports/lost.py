@@ -1,4 +1,4 @@
-"""Connections that are opened again after they were lost: the one policy for all transports.
+"""Connections that are opened again after they were lost: one policy for all transports.
 
 The exchange in which a connection is lost fails. The next exchange opens another connection, but two attempts are at
 least an interval apart; until then every exchange fails with the reason of the loss.
@@ -49,7 +49,7 @@ class Reopened(Generic[Connection]):
         Raises
         ------
         InstrumentError
-            It is closed for good, it does not open, or the interval since the last attempt has not passed.
+                It is closed, it cannot be opened, or the interval since the last attempt has not passed.
         """
         if self._closed:
             raise InstrumentError(f"The connection to {self.url} is closed")
@@ -68,12 +68,12 @@ class Reopened(Generic[Connection]):
         return self.connection
 
     def drop(self, reason: str) -> Connection | None:
-        """Give the connection up, so that `get` opens another one; return it, to be closed."""
+        """Drop the connection, so that `get` opens another one; return it, to be closed."""
         lost, self.connection, self.reason = self.connection, None, reason
         return lost
 
     def close(self) -> Connection | None:
-        """Open none any more; return the connection, to be closed."""
+        """Open no further connection; return the present one, to be closed."""
         self._closed = True
         last, self.connection = self.connection, None
         return last

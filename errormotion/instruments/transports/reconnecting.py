@@ -32,7 +32,7 @@ class ReconnectingTransport(Transport):
     end : callable, optional
         Called when this is closed.
     recorder : Recorder, optional
-        Records the frames of all connections, and those that were not sent while there was none: in a replay the same
+        Records the frames of all connections, and those that were not sent without a connection: in a replay the same
         exchanges fail.
     """
 
@@ -58,7 +58,7 @@ class ReconnectingTransport(Transport):
             raise
 
     def drop(self, reason: str) -> None:
-        """Give the connection up; the next exchange opens another one."""
+        """Drop the connection; the next exchange opens another one."""
         self._rest = b""
         lost = self._line.drop(reason)
         if lost is not None:
@@ -96,7 +96,7 @@ class ReconnectingTransport(Transport):
         return data
 
     def close(self) -> None:
-        """Close for good; idempotent."""
+        """Close permanently; idempotent."""
         line = self._line.close()
         end, self._end = self._end, None
         try:
@@ -112,14 +112,14 @@ class ReconnectingTransport(Transport):
 def discard_input(line: Transport) -> bytes:
     """Discard and return the unread bytes of a line, such as late answers; detect a connection that was lost."""
     old = b""
-    with suppress(InstrumentError):  # silence is expected; the next write opens a lost connection again
+    with suppress(InstrumentError):  # a timeout is expected; the next write opens a lost connection again
         while data := line.read(CHUNK, timeout=0.0):
             old += data
     return old
 
 
 def disconnect_after_timeout(line: Transport) -> None:
-    """Give a TCP connection up after a timeout: it may be dead, and a late answer must not be read as the next one."""
+    """Drop a TCP connection after a timeout: it may be broken, and a late answer must not be read as the next one."""
     if isinstance(line, ReconnectingTransport) and line.flow_control:
         line.drop(f"{line.url} did not answer")
 

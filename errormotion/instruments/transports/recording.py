@@ -1,18 +1,18 @@
-"""Recording a session, and playing it back strictly.
+"""Recording of a session and strict playback.
 
-A recording is a text file: a head line with the address, then one line a frame::
+A recording is a text file: a header line with the address, then one line per frame::
 
     errormotion-session/1 2025-03-01T12:00:00+00:00 tcp://192.168.0.2:23
     W 0.000213 5f3a11c0 4f5554505554204e4f4e450d0a
     R 0.001877 91b2d377 2d3e
     END 2 91b2d377
 
-``W`` is written by the driver, ``R`` came from the device; then follow seconds since the start, a checksum, and the
-bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: no byte changes, no
-frame vanishes or moves unseen.
+``W`` is written by the driver, ``R`` received from the device; then follow seconds since the start, a checksum, and the
+bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: changed bytes and
+missing or moved frames are detected.
 
-Played back, each write must be the next recorded one, byte for byte; a frame that came after a write comes after that
-write again; and at the end nothing may be left over. Everything else is a `ReplayError`.
+In playback each write must be the next recorded one, byte for byte; a frame that followed a write is returned only after
+that write; and at the end no frame may remain. Everything else is a `ReplayError`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ INDEX_FORMAT = "errormotion-sessions/1"
 
 
 class Recorder:
-    """Writes the frames of one session to a new file; InstrumentError where the file is there or cannot be made."""
+    """Writes the frames of one session to a new file; InstrumentError where the file exists or cannot be created."""
 
     def __init__(self, path: Path | str, address: str) -> None:
         self._start = time.monotonic()
@@ -43,9 +43,9 @@ class Recorder:
         try:
             self._file = Path(path).open("x", encoding="ascii", errors="backslashreplace")  # noqa: SIM115 - kept open
         except FileExistsError:
-            raise InstrumentError(f"The recording {path} is there already; name another file or remove it") from None
+            raise InstrumentError(f"The recording {path} exists already; choose another file or remove it") from None
         except OSError as error:
-            raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+            raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
         self._file.write(f"{FORMAT} {datetime.now(UTC).isoformat(timespec='seconds')} {address}\n")
 
     def frame(self, direction: str, data: bytes) -> None:
@@ -66,7 +66,7 @@ class Recorder:
 
 
 class RecordingTransport(Transport):
-    """Passes all through to another transport, and every frame to a recorder."""
+    """Forwards all calls to another transport, and every frame to a recorder."""
 
     def __init__(self, inner: Transport, recorder: Recorder) -> None:
         super().__init__(inner.url, inner.timeout)
@@ -85,7 +85,7 @@ class RecordingTransport(Transport):
         return data
 
     def report_delivered(self, samples: int) -> None:
-        """Pass on how far the reader is."""
+        """Report the reader's progress."""
         self._inner.report_delivered(samples)
 
     def close(self) -> None:
@@ -124,15 +124,15 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
         except ValueError:
             right = False
         if not right:
-            raise ReplayError(f"{path}, line {number}: this frame is not what was recorded (its checksum is wrong)")
+            raise ReplayError(f"{path}, line {number}: this frame was changed after the recording (wrong checksum)")
         frames.append((direction, data))
     if lines[-1] != f"END {len(frames)} {crc:08x}":
-        raise ReplayError(f"{path}: its end does not fit its {len(frames)} frames; record it again")
+        raise ReplayError(f"{path}: its last line does not match its {len(frames)} frames; record it again")
     return head[2], frames
 
 
 class ReplayTransport(Transport):
-    """Plays a recorded session back; see the module for what it is strict about."""
+    """Plays a recorded session back; see the module for the conditions."""
 
     def __init__(self, path: Path, *, timeout: float = 1.0) -> None:
         super().__init__(f"replay://{path}", timeout)
@@ -156,10 +156,10 @@ class ReplayTransport(Transport):
             self._partial += data
             while self._partial:
                 if not self._writes:
-                    raise ReplayError(f"{self.url}: expected no further write; the driver writes {self._partial!r}")
+                    raise ReplayError(f"{self.url}: expected no further write; found {self._partial!r}")
                 expected = self._writes[0]
                 if not expected.startswith(self._partial[: len(expected)]):
-                    raise ReplayError(f"{self.url}: expected the driver to write {expected!r}; it writes {data!r}")
+                    raise ReplayError(f"{self.url}: expected the driver to write {expected!r}; found {data!r}")
                 if len(self._partial) < len(expected):
                     break
                 self._partial = self._partial[len(expected) :]
@@ -172,11 +172,9 @@ class ReplayTransport(Transport):
             if self._closed:
                 raise InstrumentError(f"The recording {self.url} is closed")
             if not self._reads:
-                raise ReplayError(f"{self.url}: the recording is over, but the driver reads on")
+                raise ReplayError(f"{self.url}: the driver reads after the end of the recording")
             if not self._change.wait_for(lambda: self._closed or self._reads[0][0] <= self._written, timeout):
-                raise InstrumentTimeoutError(
-                    f"{self.url}: the device goes on only after {self._writes[0]!r} is written"
-                )
+                raise InstrumentTimeoutError(f"{self.url}: no data before the driver has written {self._writes[0]!r}")
             if self._closed:
                 raise InstrumentError(f"The recording {self.url} is closed")
             before, data = self._reads.popleft()
@@ -190,7 +188,7 @@ class ReplayTransport(Transport):
         Raises
         ------
         ReplayError
-            The session went on where the driver stops.
+            The driver stops before the end of the recorded session.
         """
         with self._change:
             if self._closed:
@@ -201,32 +199,32 @@ class ReplayTransport(Transport):
             left_writes = len(self._writes)
         if left_bytes or left_writes or self._partial:
             raise ReplayError(
-                f"{self.url}: the driver stops, but the recording goes on with {left_writes} writes "
-                f"and {left_bytes} bytes from the device"
+                f"{self.url}: the driver stops before the end of the recording: {left_writes} writes "
+                f"and {left_bytes} bytes from the device remain"
             )
 
 
 def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
-    """Write the recording of an instrument with several transports: a list of theirs, which lie beside it.
+    """Write the recording of an instrument with several transports: a list of their files, which are beside it.
 
-    Returns the path for each part. Raises InstrumentError where the file is there or cannot be made.
+    Returns the path for each part. Raises InstrumentError where the file exists or cannot be created.
     """
     files = {part: path.with_name(f"{path.stem}.{part}{path.suffix}") for part in parts}
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(f"{INDEX_FORMAT}\n" + "".join(f"{part} {each.name}\n" for part, each in files.items()))
     except OSError as error:
-        raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+        raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
     return files
 
 
 def read_index(path: Path) -> dict[str, Path]:
-    """Return the recordings that a list names, by part; ReplayError where it is no such list."""
+    """Return the recordings that a list names, by part; ReplayError where it is not such a list."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
     pairs = [line.partition(" ") for line in lines[1:]]
     if not lines or lines[0] != INDEX_FORMAT or not all(name for _, _, name in pairs):
-        raise ReplayError(f"{path} is no list of recordings: expected a first line '{INDEX_FORMAT}'")
+        raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
     return {part: path.with_name(name) for part, _, name in pairs}

@@ -37,7 +37,7 @@ class SerialTransport(Transport):
         try:
             self._line().write(data)
         except serial.SerialTimeoutException:
-            raise InstrumentTimeoutError(f"{self.url} takes no bytes for {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(f"{self.url} accepted no data for {self.timeout:g} s") from None
         except OSError as error:
             raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
 

@@ -1,4 +1,4 @@
-"""The device end of a wire, on loopback: what the simulators speak through."""
+"""The device's end of a connection, on loopback, for the simulators."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Server(ABC):
     Attributes
     ----------
     url : str
-        Where a driver reaches it.
+        Address for the driver.
     lock : threading.RLock
         Held while bytes go out, so that two senders do not mix theirs.
     """
@@ -40,7 +40,7 @@ class Server(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Hang up and end the thread; idempotent."""
+        """Disconnect and end the thread; idempotent."""
         if self._ended.is_set():
             return
         self._ended.set()
@@ -99,12 +99,12 @@ class TcpServer(Server):
 
     def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
-        line = self._line  # no lock: a sender may hold it, waiting for a reader who is gone
+        line = self._line  # no lock: a sender may hold it while it waits for a reader that has closed
         if line is not None:
             try:
                 line.shutdown(socket.SHUT_RDWR)
             except OSError:
-                return  # the other side was faster
+                return  # the other side has closed it already
 
     def _run(self) -> None:
         while not self._ended.is_set():
@@ -147,7 +147,7 @@ class PtyServer(Server):
         import tty  # only where there are terminals
 
         super().__init__(name, on_data)
-        self._near, self._far = os.openpty()  # the far end stays open here: else its first closing ends the line
+        self._near, self._far = os.openpty()  # the far end stays open here, else its first close ends the line
         tty.setraw(self._far)
         os.set_blocking(self._near, False)
         self._cut = False
@@ -168,7 +168,7 @@ class PtyServer(Server):
         return not self._cut and not self._ended.is_set()
 
     def disconnect(self) -> None:
-        """Pull the cable: a serial line has no connection to drop, it just stops sending."""
+        """Simulate an unplugged cable: a serial line has no connection to drop, it only stops sending."""
         self._cut = True
 
     def _run(self) -> None:
@@ -194,4 +194,4 @@ def make_server(wire: str, name: str, on_data: Callable[[bytes], None]) -> Serve
         return TcpServer(name, on_data)
     if wire == "pty":
         return PtyServer(name, on_data)
-    raise InstrumentError(f"A simulated device speaks over 'wire=tcp' or 'wire=pty'; found 'wire={wire}'")
+    raise InstrumentError(f"A simulated device has 'wire=tcp' or 'wire=pty'; found 'wire={wire}'")

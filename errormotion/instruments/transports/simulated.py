@@ -50,7 +50,7 @@ class SimulatedTransport(Transport):
         except BaseException:
             self._device.close()
             raise
-        line.url = self.url  # messages name the address that a person knows
+        line.url = self.url  # messages state the address of the bench file
         return line
 
     def _send(self, data: bytes) -> None:

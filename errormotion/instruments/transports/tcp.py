@@ -12,7 +12,7 @@ from errormotion.instruments.transports.base import Transport
 class TcpTransport(Transport):
     """A TCP connection to a device or a serial server.
 
-    ``receive_buffer`` (bytes) bounds what the system holds for a slow reader; the default is the system's.
+    ``receive_buffer`` (bytes) limits the data that the system holds for a slow reader; default: the system's limit.
     """
 
     def __init__(self, address: Address, *, timeout: float = 1.0, receive_buffer: int | None = None) -> None:
@@ -27,7 +27,7 @@ class TcpTransport(Transport):
             line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except TimeoutError:
             line.close()
-            raise InstrumentTimeoutError(f"No device answers at {self.url} within {timeout:g} s") from None
+            raise InstrumentTimeoutError(f"No device answered at {self.url} within {timeout:g} s") from None
         except OSError as error:
             line.close()
             raise InstrumentError(
@@ -46,7 +46,7 @@ class TcpTransport(Transport):
             line.settimeout(self.timeout)
             line.sendall(data)
         except TimeoutError:
-            raise InstrumentTimeoutError(f"{self.url} takes no bytes for {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(f"{self.url} accepted no data for {self.timeout:g} s") from None
         except OSError as error:
             raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
 

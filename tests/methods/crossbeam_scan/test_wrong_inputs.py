@@ -104,7 +104,7 @@ def test_a_scan_shifted_by_a_quarter_of_the_artefact(gantry, raw, errors):
     # a scan of 28 mm out of one of 42 mm that begins 7 mm earlier
     longer = scan(gantry, [1800.0], [0.0], seed=9, lines=600)
     spoil(raw, longer["height"][0, 0, :LINES].values)
-    assert_lost_alone(identify(raw), errors, "6.96 mm across and 0.000 rad; let both scans at the same position")
+    assert_lost_alone(identify(raw), errors, "6.96 mm across and 0.000 rad; start both scans at the same position")
 
 
 def test_heights_that_are_no_surface(raw, errors):
@@ -140,7 +140,7 @@ def test_a_scan_backwards_is_the_same_scan(raw, errors):
 
 def test_places_that_run_against_the_heights(raw, errors):
     raw["y"][CYCLE, ARTEFACT] = raw["y"][CYCLE, ARTEFACT, ::-1].values
-    assert_lost_alone(identify(raw), errors, "let both scans at the same position of the artefact")
+    assert_lost_alone(identify(raw), errors, "start both scans at the same position of the artefact")
 
 
 def test_places_in_millimetres(raw, errors):

@@ -2,7 +2,7 @@
 
 ``can://socketcan/can0?node=5`` names an interface of python-can, a channel and the node. Further parameters go to
 python-can: ``bitrate=250000``, ``port=43113``. ``can://udp_multicast/239.74.163.2?node=5`` is a bus that crosses
-processes, ``can://virtual/NAME?node=5`` one inside this process; ``sim://`` and ``replay://`` as ever.
+processes, ``can://virtual/NAME?node=5`` one inside this process; ``sim://`` and ``replay://`` as for every transport.
 
 A recording holds the frames of this node: four bytes of identifier, as SocketCAN has them (bit 29: an error frame),
 then the data.
@@ -54,12 +54,12 @@ class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
 
 
 class Network(canopen.Network):
-    """A CANopen network that notices when its controller leaves the bus, and reports every frame.
+    """A CANopen network that detects when its controller leaves the bus, and records every frame.
 
     Attributes
     ----------
     failed : str
-        Why the bus can no longer be used; empty while it is.
+        Reason why the bus can no longer be used; empty while it can.
     """
 
     NOTIFIER_CYCLE = _CYCLE
@@ -88,7 +88,7 @@ class Network(canopen.Network):
         super().send_message(can_id, data, remote)
 
     def notify(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """Take in a frame; one that is too short for what it claims to be is ignored."""
+        """Accept a frame; one that is too short for its type is ignored."""
         if can_id not in self.subscribers:
             return
         if self._recorder is not None:
@@ -105,7 +105,7 @@ class Network(canopen.Network):
 
 
 class _Errors(can.Listener):
-    """Receives what canopen ignores: error frames, and that the bus is gone."""
+    """Receives what canopen ignores: error frames and the loss of the bus."""
 
     def __init__(self, network: Network) -> None:
         self._network = network
@@ -116,7 +116,7 @@ class _Errors(can.Listener):
 
     def on_error(self, error: Exception) -> None:
         self._network.failed = f"the bus is lost: {error}"
-        time.sleep(_CYCLE)  # the library tries on at once, until the bus is closed
+        time.sleep(_CYCLE)  # the library retries at once, until the bus is closed
 
 
 class ReplayedNetwork(Network):
@@ -132,11 +132,11 @@ class ReplayedNetwork(Network):
         self._thread.start()
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002 - not recorded
-        """Take a frame that must be the next recorded one."""
+        """Accept a frame that must be the next recorded one."""
         self._frames.write(to_bytes(can_id, bytes(data)))
 
     def disconnect(self) -> None:
-        """End, with all frames that come without a further question."""
+        """Stop after all frames that need no further request."""
         if not self._stopped.is_set():
             self._stopped.set()
             self._thread.join()
@@ -148,7 +148,7 @@ class ReplayedNetwork(Network):
             self._stopped.wait(0.001)
 
     def _take_all(self, timeout: float) -> None:
-        with suppress(InstrumentTimeoutError, ReplayError):  # the next one waits for a question; or all are played
+        with suppress(InstrumentTimeoutError, ReplayError):  # the next one follows a request, or all are played
             while frame := self._frames.read(timeout=timeout):
                 can_id = int.from_bytes(frame[:4], "big")
                 if can_id & ERROR_FRAME:
@@ -224,7 +224,7 @@ class CanNode(Transport):
         InstrumentTimeoutError
             The node does not answer; the message states its last heartbeat.
         ProtocolError
-            An answer to something else.
+            An answer to another request.
         InstrumentError
             The bus is off or lost; a later call opens it again.
         """
@@ -243,8 +243,8 @@ class CanNode(Transport):
             self._check(network)
             if _TIMEOUT_TEXT not in str(error):
                 raise ProtocolError(f"{where}, {what}: {error}") from None
-            seen = f"its last heartbeat stated {self.state}" if self.state else "no heartbeat of it has been seen"
-            raise InstrumentTimeoutError(f"{where} gives no answer within {self.timeout:g} s; {seen}") from None
+            seen = f"its last heartbeat stated {self.state}" if self.state else "no heartbeat was received"
+            raise InstrumentTimeoutError(f"{where} did not answer within {self.timeout:g} s; {seen}") from None
         except struct.error as error:
             raise ProtocolError(f"{where}, {what}: the answer is too short: {error}") from None
         except (can.CanError, OSError) as error:
@@ -269,10 +269,10 @@ class CanNode(Transport):
         _disconnect(self._bus.drop(reason))
 
     def _send(self, data: bytes) -> None:  # noqa: ARG002
-        raise InstrumentError(f"{self.url} carries frames, no stream of bytes")
+        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes")
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:  # noqa: ARG002
-        raise InstrumentError(f"{self.url} carries frames, no stream of bytes")
+        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes")
 
     def close(self) -> None:
         """Leave the bus; idempotent."""
@@ -287,7 +287,7 @@ class CanNode(Transport):
 
 def _disconnect(network: Network | None) -> None:
     if network is not None:
-        with suppress(can.CanError, OSError, struct.error):  # it is given up anyway
+        with suppress(can.CanError, OSError, struct.error):  # the network is not used again
             network.disconnect()
 
 
@@ -300,7 +300,7 @@ def open_can(
     timeout: float = 1.0,
     retry: float = 1.0,
 ) -> CanNode:
-    """Open the CANopen node that an address names; its ``node`` wins over the argument.
+    """Open the CANopen node that an address names; its ``node`` takes precedence over the argument.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ def open_can(
     Raises
     ------
     InstrumentError
-        No such bus, no address of a CAN bus, or a node number that there is not.
+        No such bus, no address of a CAN bus, or an invalid node number.
     """
     address = parse_address(url)
     if address.scheme == "replay":

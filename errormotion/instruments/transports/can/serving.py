@@ -41,10 +41,10 @@ class CanopenServer:
     entries : sequence of Entry
         Its object dictionary.
     value : callable
-        ``value(index, subindex)`` returns what an entry holds now, or None for nothing known; it raises
+        ``value(index, subindex)`` returns the present value of an entry, or None where unknown; it raises
         `Refused` to abort.
     outgoing : callable
-        ``outgoing(data)`` returns the SDO answer as it is to go out, or None for none.
+        ``outgoing(data)`` returns the SDO answer as it is sent, or None for no answer.
     bus : mapping, optional
         Arguments of `can.Bus`; default: a bus of its own inside this process.
     heartbeat : float
@@ -53,7 +53,7 @@ class CanopenServer:
     Attributes
     ----------
     url : str
-        Where a driver finds the node.
+        Address of the node for the driver.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class CanopenServer:
         self._node.nmt.send_command(2)
 
     def stop_heartbeat(self) -> None:
-        """Send no heartbeat any more, until the next boot."""
+        """Send no heartbeat until the next boot."""
         self._quiet = True
 
     def send_bus_off(self) -> None:
@@ -125,7 +125,7 @@ class CanopenServer:
 
 
 class Refused(SdoAbortedError):  # noqa: N818 - that is what it is
-    """What the node answers with an SDO abort code."""
+    """The node answers with an SDO abort code."""
 
 
 class _FaultyNetwork(canopen.Network):

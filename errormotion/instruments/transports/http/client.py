@@ -1,8 +1,8 @@
-"""Requests to an HTTP server, one after another on one connection that is renewed when the server ends it.
+"""Requests to an HTTP server, one after another on one connection that is opened again when the server closes it.
 
-Only what a reader needs: GET, bodies of a limited size, and streams of many parts. What a server sends is never
-trusted: each answer has a time limit, its body a limit of size. Sessions are recorded and played back like those of
-every other transport; that the connection ended is recorded as a frame without bytes.
+Only GET, bodies of a limited size, and streams of many parts are available. Each answer has a time limit, each body a
+size limit. Sessions are recorded and played back like those of
+every other transport; the end of a connection is recorded as a frame without bytes.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from errormotion.instruments.transports.tcp import TcpTransport
 
 PORT = 80
 MAX_BODY_BYTES = 16 << 20
-"""Bytes: largest body that is taken by default."""
+"""Default limit of the size of a body, bytes."""
 _MAX_LINE_BYTES = 4096
 _ANSWER_TIMEOUTS = 10.0
-"""Time limit of a whole answer, in time limits without data: a slow server sends, but must end."""
+"""Time limit of a complete answer, in multiples of the time limit without data."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a server answered: its status (200, 404, ...), the type of the body, the body."""
+    """Answer of a server: status (200, 404, ...), type of the body, body."""
 
     status: int
     content_type: str
@@ -63,7 +63,7 @@ class HttpTransport(Transport):
     Raises
     ------
     InstrumentError
-        Another scheme, no device answers, no simulator, a recording that is there already.
+        Another scheme, no answer, no simulator, a recording that exists already.
     """
 
     def __init__(
@@ -105,14 +105,14 @@ class HttpTransport(Transport):
     def get(self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES) -> Answer:
         """Request a path.
 
-        A connection that the server has ended since the last answer is renewed.
+        A connection that the server has closed since the last answer is opened again.
 
         Raises
         ------
         InstrumentTimeoutError
             No answer, or an answer that takes too long.
         ProtocolError
-            The answer is none of HTTP, or its body is larger than ``limit``.
+            The answer is not HTTP, or its body is larger than ``limit``.
         InstrumentError
             The connection is lost.
         """
@@ -138,15 +138,15 @@ class HttpTransport(Transport):
     def parts(
         self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES
     ) -> Iterator[bytes]:
-        """Request a stream of many parts, and yield the body of each as it comes.
+        """Request a stream of many parts, and yield the body of each as it arrives.
 
-        An answer of one part only is yielded whole. The connection is ended with the iterator; the next request opens
+        An answer of one part only is yielded as one body. The connection is closed with the iterator; the next request opens
         another one.
 
         Raises
         ------
         InstrumentTimeoutError, ProtocolError, InstrumentError
-            As of `get`, while the stream is read. That the server ends it just ends the iterator.
+            As of `get`, while the stream is read. When the server ends the stream, the iterator ends.
         """
         response = self._response(path, query, keep=False)
         try:
@@ -191,11 +191,11 @@ class HttpTransport(Transport):
         if not line:
             return None
         if not line.endswith(b"\n"):
-            raise ProtocolError(f"{self.url}: expected a line of a part's head; found {line[:80]!r}")
+            raise ProtocolError(f"{self.url}: expected a header line of a part; found {line[:80]!r}")
         return line.decode("latin-1").strip()
 
     def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> http.client.HTTPResponse:
-        """Send a request and return the answer with its head read."""
+        """Send a request and return the answer, its header read."""
         target = quote(path) + (f"?{urlencode(query)}" if query else "")
         host = f"{self.target.host}:{self.target.port}" if self.target.port else self.target.host
         request = (
@@ -215,12 +215,12 @@ class HttpTransport(Transport):
                 self._disconnect()
                 if fresh:
                     raise InstrumentError(
-                        f"The connection to {self.url} is lost: the server ends it without an answer"
+                        f"The connection to {self.url} is lost: the server closed it without an answer"
                     ) from None
-                continue  # it had ended an idle connection, as servers do
+                continue  # the server had closed an idle connection
             except http.client.HTTPException as error:
                 self._disconnect()
-                raise ProtocolError(f"{self.url}: expected an answer of HTTP; found {str(error)[:100]!r}") from None
+                raise ProtocolError(f"{self.url}: expected an HTTP answer; found {str(error)[:100]!r}") from None
             except BaseException:
                 self._disconnect()
                 raise
@@ -238,7 +238,7 @@ class HttpTransport(Transport):
         return self._line
 
     def _disconnect(self) -> None:
-        """End the connection; a replayed one stays, since the recording goes on."""
+        """Close the connection; a replayed one remains open for the rest of the recording."""
         self._fresh = True
         if self._line is not None and self._address.scheme != "replay":
             self._line.close()
@@ -267,7 +267,7 @@ class HttpTransport(Transport):
         return data
 
     def _lost(self, error: InstrumentError) -> Any:
-        """Take note that the connection is gone."""
+        """Record that the connection is lost."""
         if self._address.scheme == "replay":
             raise error
         if self._recorder is not None:
@@ -289,11 +289,11 @@ class HttpTransport(Transport):
 
 
 class _EndedError(InstrumentError):
-    """The other side has ended the connection."""
+    """The server has closed the connection."""
 
 
 class _Wire:
-    """What the standard library takes for a socket."""
+    """A replacement of a socket for the standard library."""
 
     def __init__(self, transport: HttpTransport, whole: bool) -> None:
         self._transport = transport
@@ -304,7 +304,7 @@ class _Wire:
 
 
 class _Bytes(io.RawIOBase):
-    """Bytes of one answer; with ``whole`` they all have to come within a time limit."""
+    """Bytes of one answer; with ``whole`` all must arrive within a time limit."""
 
     def __init__(self, transport: HttpTransport, whole: bool) -> None:
         self._transport = transport
@@ -316,7 +316,7 @@ class _Bytes(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         left = self._end - time.monotonic()
         if left <= 0:
-            raise InstrumentTimeoutError(f"{self._transport.url}: the answer takes too long")
+            raise InstrumentTimeoutError(f"{self._transport.url}: the answer was not complete within the time limit")
         try:
             data = self._transport.read(min(len(buffer), CHUNK), min(left, self._transport.timeout))
         except _EndedError:

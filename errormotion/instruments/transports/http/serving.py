@@ -1,4 +1,4 @@
-"""The server's end of HTTP, on loopback: what simulated agents speak through."""
+"""An HTTP server on loopback, for simulated agents."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 
 
 class HttpServer:
-    """Answers GET requests on a free port of 127.0.0.1, as many connections as come.
+    """Answers GET requests on a free port of 127.0.0.1, on any number of connections.
 
     Parameters
     ----------
     name : str
         For the names of the threads.
     respond : callable
-        ``respond(path, query)`` returns what goes out, head and all, piece by piece; an empty piece, or None instead
-        of all, hangs up. It is called in the thread of the connection.
+        ``respond(path, query)`` returns the answer with its header in pieces; an empty piece, or None instead
+        of the pieces, closes the connection. It is called in the thread of the connection.
 
     Attributes
     ----------
     url : str
-        Where a client reaches it.
+        Address for the client.
     ended : threading.Event
-        Set when the server closes: a stream has to end then.
+        Set when the server closes: streams must end then.
     """
 
     def __init__(self, name: str, respond: Respond) -> None:
@@ -92,7 +92,7 @@ class HttpServer:
 
 
 def _request(handler: socketserver.StreamRequestHandler) -> tuple[str, dict[str, str]] | None:
-    """Return path and query of the next request; None where the client has gone or sends something else."""
+    """Return path and query of the next request; None where the client has closed the connection or sends something else."""
     words = handler.rfile.readline(_MAX_LINE_BYTES).decode("latin-1").split()
     for _ in range(_MAX_HEADERS):
         if handler.rfile.readline(_MAX_LINE_BYTES) in (b"\r\n", b"\n", b""):

@@ -1,13 +1,13 @@
-"""Modbus: a line on which registers are requested.
+"""Modbus: requests of registers on one line.
 
 * ``modbus+tcp://192.168.0.9:502?unit=1`` Modbus TCP
 * ``modbus+rtu:///dev/ttyUSB0?baudrate=9600&unit=1`` RTU on a serial line, 8N1
 * ``modbus+rtu-tcp://192.168.0.9:4001?unit=1`` RTU frames through a serial server
 * ``sim://cframe/logger?framing=rtu`` a simulated device; ``replay://session.rec`` a recorded session
 
-The frames are our own (`modbus_codec`) and go over the byte transports, so that a session can be recorded and played
-back, and each fault be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit when a
-checksum is wrong, is the simulated device, and the other side in tests.
+The frames are own code (`modbus.codec`) over the byte transports, so that a session can be recorded and played
+back, and faults can be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit after a
+wrong checksum, is used for the simulated device and in tests.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from errormotion.instruments.transports.modbus.codec import (
 from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
-QUIET_INTERVAL = 0.05  # s without a byte: what was under way is over
-MAX_STRAY_BYTES = 512  # bytes of rubbish that are waited for
+QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
+MAX_STRAY_BYTES = 512  # largest number of bytes discarded after a damaged answer
 
 
 class ModbusLine(Transport):
@@ -46,14 +46,14 @@ class ModbusLine(Transport):
     unit : int
         Address of the device.
     retries : int
-        How often a damaged answer is requested once more.
+        Number of repeated requests after a damaged answer.
 
     Attributes
     ----------
     framing, unit
         As given.
     repeated : int
-        How many answers had to be requested again.
+        Number of repeated requests.
     """
 
     def __init__(self, line: Transport, framing: Framing, unit: int, retries: int = 0) -> None:
@@ -70,7 +70,7 @@ class ModbusLine(Transport):
         ModbusRefusal
             An exception reply.
         ProtocolError
-            A damaged answer: garbage, a wrong checksum, another unit, too short; also when queried again.
+            A damaged answer, also in the last retry: stray bytes, a wrong checksum, another unit, too short.
         InstrumentTimeoutError
             No answer within the time limit.
         InstrumentError
@@ -107,7 +107,7 @@ class ModbusLine(Transport):
             raise
 
     def _frame(self, end: float) -> bytes:
-        """Return one answer, as long as its start states that it is."""
+        """Return one answer, of the length that its start states."""
         data = b""
         while lacking := missing(self.framing, data):
             try:
@@ -115,7 +115,7 @@ class ModbusLine(Transport):
             except InstrumentTimeoutError:
                 if data:
                     raise ProtocolError(
-                        f"Expected {lacking} bytes more within {self.timeout:g} s; found {data[:24].hex(' ')}"
+                        f"Expected {lacking} more bytes within {self.timeout:g} s; found {data[:24].hex(' ')}"
                     ) from None
                 raise InstrumentTimeoutError(
                     f"{self.url}: unit {self.unit} did not answer within {self.timeout:g} s"
@@ -124,10 +124,10 @@ class ModbusLine(Transport):
 
     def _settle(self) -> None:
         """Wait until the line is quiet, so that the next answer is not taken for the rest of this one."""
-        came = 0
+        count = 0
         with suppress(InstrumentError):
-            while came < MAX_STRAY_BYTES:
-                came += len(self._line.read(MAX_STRAY_BYTES, timeout=QUIET_INTERVAL))
+            while count < MAX_STRAY_BYTES:
+                count += len(self._line.read(MAX_STRAY_BYTES, timeout=QUIET_INTERVAL))
 
     def _send(self, data: bytes) -> None:
         self._line.write(data)
@@ -151,7 +151,7 @@ def open_modbus(
     retries: int = 0,
     baudrate: int | None = None,
 ) -> ModbusLine:
-    """Open the Modbus line that an address names; what the address states of ``unit`` and ``baudrate`` wins.
+    """Open the Modbus line that an address names; its ``unit`` and ``baudrate`` take precedence.
 
     Parameters
     ----------
@@ -177,12 +177,12 @@ def open_modbus(
 
 
 def original(address: Address) -> Address:
-    """Return the address of the device itself, where this is the one of a recording."""
+    """Return the address of the device, also from the address of a recording."""
     return parse_address(read_recording(Path(address.path))[0]) if address.scheme == "replay" else address
 
 
 def framing_of(address: Address) -> Framing:
-    """Return how frames look at an address."""
+    """Return the framing at an address."""
     if address.scheme == "sim":
         serial = address.params.get("wire") == "pty"
         framing = address.params.get("framing", "rtu" if serial else "tcp")
@@ -198,7 +198,7 @@ def framing_of(address: Address) -> Framing:
 
 
 def _of_bytes(address: Address) -> Address:
-    """Return the address of the bytes beneath; its URL stays the one that a person knows."""
+    """Return the address of the byte transport; its URL remains that of the bench file."""
     if address.scheme == "modbus+rtu":
         return replace(address, scheme="serial")
     return replace(address, scheme="tcp") if address.scheme in MODBUS else address

@@ -24,7 +24,7 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 _HEAD = 7  # bytes of an MBAP header
-_MAX_MBAP_LENGTH = 254  # bytes behind its length
+_MAX_MBAP_LENGTH = 254  # bytes after its length field
 
 
 def crc16(data: bytes) -> bytes:
@@ -56,7 +56,7 @@ def _frame(framing: Framing, unit: int, pdu: bytes, number: int) -> bytes:
 
 
 def missing(framing: Framing, data: bytes) -> int:
-    """Return how many bytes an answer that starts so still lacks, as far as its start shows."""
+    """Return the number of bytes that an incomplete answer still lacks, as far as its start shows."""
     if framing == "rtu":
         size = 5 if len(data) < 3 or data[1] & 0x80 else 5 + data[2]
     elif len(data) < _HEAD - 1:
@@ -65,7 +65,7 @@ def missing(framing: Framing, data: bytes) -> int:
         protocol, length = struct.unpack(">HH", data[2:6])
         size = (
             6 + length if not protocol and length <= _MAX_MBAP_LENGTH else 0
-        )  # else no head: no further bytes are awaited
+        )  # else no header: no further bytes are expected
     return max(size - len(data), 0)
 
 
@@ -87,7 +87,7 @@ def decode_answer(
 
 
 class ModbusRefusal(InstrumentError):  # noqa: N818 - that is what it is
-    """The device answers that it does not do what it was requested.
+    """The device refuses a request.
 
     Attributes
     ----------
@@ -115,17 +115,17 @@ def _decode_tcp(data: bytes, unit: int, function: int, count: int, number: int) 
         raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
     came, protocol, length, came_unit = struct.unpack(">HHHB", data[:_HEAD])
     if protocol or length != len(data) - 6:
-        raise ProtocolError(f"Expected the head of a Modbus answer; found {_shown(data)}")
+        raise ProtocolError(f"Expected the header of a Modbus answer; found {_shown(data)}")
     if came != number:
         if (number - came) % (1 << 16) < 1 << 15:
             return None
-        raise ProtocolError(f"Expected the answer to transaction {number}; found one to {came}")
+        raise ProtocolError(f"Expected the answer to transaction {number}; found that to {came}")
     return _decode_pdu(came_unit, data[_HEAD:], unit, function, count, data)
 
 
 def _decode_pdu(came_unit: int, pdu: bytes, unit: int, function: int, count: int, data: bytes) -> list[int]:
     if came_unit != unit:
-        raise ProtocolError(f"Expected an answer of unit {unit}; found one of unit {came_unit}: {_shown(data)}")
+        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {came_unit}: {_shown(data)}")
     if pdu[0] == function | 0x80 and len(pdu) == 2:
         raise ModbusRefusal(pdu[1], f"Function {function} of unit {unit}")
     if pdu[0] != function:

@@ -21,9 +21,9 @@ CHUNK = 4096
 
 
 class ModbusServer:
-    """A Modbus server that takes and returns bytes, through a connection on loopback.
+    """A Modbus server that accepts and returns bytes, over a connection on loopback.
 
-    Between it and whoever queries lies a cable, which is a simulator's to break.
+    The simulator forwards the bytes between the server and the client, and can damage them.
 
     Parameters
     ----------
@@ -34,16 +34,16 @@ class ModbusServer:
     unit : int
         Address of the device; requests to others are not answered.
     blocks : mapping of int to int
-        Register blocks that exist: first register to their number.
+        Existing register blocks: first register to number of registers.
     registers : callable
         Returns registers by number, or the code of an exception reply; called at each request with its function.
     on_answer : callable
-        Gets what the server sends.
+        Called with the bytes that the server sends.
 
     Attributes
     ----------
     address : (str, int)
-        Where the server listens.
+        Host and port at which the server listens.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class ModbusServer:
             raise self._failure
 
     def handle_request(self, data: bytes) -> None:
-        """Hand a request to the server; what it answers comes to ``on_answer``."""
+        """Pass a request to the server, which answers by ``on_answer``."""
         unit = data[0] if self._framing == "rtu" else data[6] if len(data) > 6 else self._unit
         if unit == self._unit:
             with suppress(RuntimeError):  # closed meanwhile
@@ -92,7 +92,7 @@ class ModbusServer:
     def _run(self) -> None:
         try:
             self._loop.run_until_complete(self._serve())
-        except BaseException as error:  # noqa: BLE001 - raised where this was made
+        except BaseException as error:  # noqa: BLE001 - raised in the constructor
             self._failure = error
         finally:
             self._loop.close()
@@ -136,7 +136,7 @@ class ModbusServer:
         current: list[int],
         new: list[int] | list[bool] | None,
     ) -> ExcCodes | None:
-        """Put the present registers where the server takes them from."""
+        """Copy the present registers to those that the server reads."""
         if new is not None:
             return ExcCodes.ILLEGAL_FUNCTION
         found = self._registers(function)
