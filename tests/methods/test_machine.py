@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from errormotion import plugins
 from errormotion.campaign.machine import completed, contradictions
 from errormotion.kinematics.description import MachineDescription
+from errormotion.methods.multilateration import simulation
+from errormotion.twin import VirtualMachine
 
 TRAVEL = {"X": (-0.3, 0.3), "Y": (-0.25, 0.25), "Z": (0.0, 0.46)}
 CFRAME = MachineDescription("C-frame", "workpiece-X-Y-bed-Z-spindle-tool", TRAVEL)
@@ -100,3 +103,26 @@ def test_without_a_description_settings_stay_as_they_are(method):
     settings, wrong = read(method, None)
     assert settings == plugins.get("methods", method).Settings()
     assert not wrong
+
+
+def test_linear_axes_of_a_machine_with_fixed_rotary_axes_are_identified_within_their_uncertainty():
+    # The rotary axes displace the workpiece as one body, which distances do not show.
+    description = MachineDescription(
+        "Trunnion mill",
+        "workpiece-C-A-bed-X-Y-Z-spindle-tool",
+        TRAVEL,
+        positions={"A": (0.0, 0.0, -0.12), "C": (0.0, 0.0, -0.05)},
+        fixed={"A": 0.0, "C": math.pi / 6},
+    )
+    machine = VirtualMachine(description, seed=3)
+    target = simulation.target_grid(machine)
+    errors = plugins.get("methods", "multilateration")().identify(simulation.raw(machine, target, seed=1))
+    truth = simulation.true_errors(machine, target)
+    freedoms = ["EX", "EY", "EZ"]
+    true = np.stack([truth[name].values for name in freedoms])
+    miss = np.stack([errors[name].values for name in freedoms]) - true
+    stated = np.sqrt(np.stack([errors["covariance"].values[:, i, i] for i in range(3)]))
+    size = np.sqrt(np.mean((miss / stated) ** 2))
+    assert 0.7 < size < 1.3  # 300 values that are correlated through the stations
+    assert np.sqrt(np.mean((true / stated) ** 2)) > 4  # the errors themselves are large compared with it
+    assert errors.attrs["machine"] == "Trunnion mill"
