@@ -15,7 +15,8 @@ from errormotion.plugins import InstrumentInfo, PluginSettings
 class Driver:
     """Base of drivers with one transport.
 
-    A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and uses
+    A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and
+    uses
     ``self.transport``.
 
     Parameters

@@ -107,7 +107,7 @@ class Reader:
         self._thread.start()
 
     def fill(self, values: Array, reasons: Array, timeout: float) -> None:
-        """Fill both arrays with the next samples; ``host_time`` is then the time at which the last of them was received.
+        """Fill both arrays with the next samples; ``host_time`` is then the time of receipt of the last one.
 
         Raises
         ------

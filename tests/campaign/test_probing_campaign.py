@@ -242,7 +242,7 @@ def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pyt
     ("fault", "message"),
     [
         ("no_trip", "the probe did not trip on items 0 and 1"),
-        ("tripped", "the probe is tripped before it moves, and stays so"),
+        ("tripped", "the probe is tripped before it moves, and remains so"),
     ],
 )
 def test_a_broken_probe_ends_the_cold_cycle_with_nothing_kept(lab: Lab, fault: str, message: str) -> None:

@@ -193,7 +193,7 @@ def test_a_node_of_another_profile_is_refused() -> None:
 def test_a_missing_node_is_told_by_its_silence() -> None:
     with (
         a_node(two_inputs()) as (address, _),
-        pytest.raises(InstrumentTimeoutError, match=r"node 8 gives no answer .* no heartbeat of it has been seen"),
+        pytest.raises(InstrumentTimeoutError, match=r"node 8 did not answer .* no heartbeat was received"),
     ):
         CanTemperature(address.replace("node=9", "node=8"), TWO).open()
 
@@ -302,10 +302,10 @@ BEFORE = 25  # answers until a first reading is over: 9 for the identity, 5 unit
         (
             "silence",
             InstrumentTimeoutError,
-            "node 5 gives no answer within 0.7 s; its last heartbeat stated OPERATIONAL",
+            "node 5 did not answer within 0.7 s; its last heartbeat stated OPERATIONAL",
         ),
-        ("drop", InstrumentTimeoutError, "node 5 gives no answer"),
-        ("unplugged", InstrumentTimeoutError, "node 5 gives no answer"),
+        ("drop", InstrumentTimeoutError, "node 5 did not answer"),
+        ("unplugged", InstrumentTimeoutError, "node 5 did not answer"),
         ("stopped", InstrumentTimeoutError, "its last heartbeat stated"),
         ("garbage", ProtocolError, "node 5, 0x6130:1"),
         ("bus_off", InstrumentError, "the controller is bus-off"),
@@ -382,5 +382,5 @@ def test_a_recorded_session_that_goes_on_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "can.rec"
     with CanTemperature(ADDRESS, QUICK, record=path) as thermometer:
         thermometer.read()
-    with pytest.raises(InstrumentError, match="the recording goes on"), CanTemperature(f"replay://{path}", QUICK):
+    with pytest.raises(InstrumentError, match="before the end of"), CanTemperature(f"replay://{path}", QUICK):
         pass

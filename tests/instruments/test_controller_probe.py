@@ -138,7 +138,7 @@ def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -
 def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path) -> None:
     path = lobed(0.0, NORMALS[:4]).save(tmp_path / "probe.nc")
     with ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=str(path))) as probe:
-        with pytest.raises(InstrumentError, match=r"direction of touch 5 \(item 0\); 1 of 5 touches"):
+        with pytest.raises(InstrumentError, match=r"direction of touch 5 \(item 0\); it does not cover 1 of 5 touches"):
             next(probe.measure(touches()))
         assert world("cframe", 3).time == 0.0
 
@@ -179,11 +179,11 @@ def test_a_fault_in_the_middle_ends_the_cycle_and_keeps_the_contacts(
 def test_nothing_begins_in_alarm_or_emergency_stop() -> None:
     with ControllerProbe(ADDRESS) as probe, VirtualController(ADDRESS) as control:
         control.press_estop()
-        with pytest.raises(InstrumentError, match="in emergency stop; nothing moves"):
+        with pytest.raises(InstrumentError, match="in emergency stop; nothing was moved"):
             next(probe.measure(touches()))
         control.reset()
         world("cframe", 3).raise_alarm("oil low")
-        with pytest.raises(InstrumentError, match="in alarm: oil low; nothing moves"):
+        with pytest.raises(InstrumentError, match="in alarm: oil low; nothing was moved"):
             next(probe.measure(touches()))
 
 
@@ -208,7 +208,7 @@ def test_a_stuck_probe_gives_its_flag_and_then_an_error() -> None:
     with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30") as probe:
         contacts, raised = gathered(probe)
     assert [contact.flag for contact in contacts] == ["", "", "tripped at the start"]
-    assert "Touch 3 of 5 (item 0): the probe is tripped before it moves, and stays so" in str(raised)
+    assert "Touch 3 of 5 (item 0): the probe is tripped before it moves, and remains so" in str(raised)
 
 
 def test_a_probe_that_sticks_for_a_moment_is_waited_for() -> None:
@@ -224,7 +224,7 @@ def test_something_in_the_way_stops_the_machine_there() -> None:
     with ControllerProbe(ADDRESS, settings) as probe:
         source = probe.measure([touches()[0], touches()[2]])
         assert next(source).flag == ""
-        with pytest.raises(InstrumentError, match=r"Touch 2 of 2 \(item 0\): the probe touched something at X"):
+        with pytest.raises(InstrumentError, match=r"Touch 2 of 2 \(item 0\): the probe tripped at X"):
             next(source)
         here = world("cframe", 3)
         assert here.machine.probe_gap(here.position(), here.time)[0] < 1e-6
@@ -334,7 +334,7 @@ def test_a_false_trip_at_the_start_is_tried_again() -> None:
     contact, control = touch(lambda n, begin, target: 0.1e-3 if n == 0 else surface(begin, target))
     assert contact.flag == ""
     assert control.probings == 4
-    with pytest.raises(InstrumentError, match=r"trips within 0\.2 mm of the start, where nothing is"):
+    with pytest.raises(InstrumentError, match=r"trips within 0\.2 mm of the start, where its path is free"):
         touch(lambda n, begin, target: 0.1e-3)
 
 
@@ -366,5 +366,5 @@ def test_a_place_off_the_way_is_an_error() -> None:
     control.aside = 0.2e-3
     with pytest.raises(InstrumentError, match=r"2\.000 mm along it and 0\.200 mm aside"):
         Toucher(control, ControllerProbeSettings().strategy).touch(WAY)
-    with pytest.raises(InstrumentError, match="target is not its start"):
+    with pytest.raises(InstrumentError, match="target differs from its start"):
         Toucher(control, ControllerProbeSettings().strategy).touch(Touch((0, 0, 0), (0, 0, 0)))

@@ -15,7 +15,7 @@ from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
 from errormotion.instruments.touch_probe.dprnt import Dprnt, DprntSettings
 from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, Line, format_line, parse_line, text_of
-from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, place_of
+from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.transports.serving import TcpServer
 from errormotion.kinematics.fits import fit_sphere
 from errormotion.plugins import Contact, Touch
@@ -105,7 +105,7 @@ def test_a_pattern_of_ones_own_has_to_name_the_places() -> None:
 
 def belongs(text: str, due: int, last: str = "") -> int:
     before = parse_line(last, COMPILED) if last else None
-    return place_of(parse_line(text, COMPILED), TOUCHES, due, before, 1, 1e-3)
+    return touch_of(parse_line(text, COMPILED), TOUCHES, due, before, 1, 1e-3)
 
 
 def test_without_numbers_the_place_decides() -> None:
@@ -113,7 +113,7 @@ def test_without_numbers_the_place_decides() -> None:
     assert belongs(printed(3), 1, printed(0)) == 3  # two lines are missing
     assert belongs(printed(0), 1, printed(0)) == REPEATED
     assert belongs(printed(0, 2.001), 4, printed(3)) == 0  # the next cycle has started
-    with pytest.raises(InstrumentError, match=r"Y 55\.000 Z 0\.000 mm, which is on the way of no touch"):
+    with pytest.raises(InstrumentError, match=r"Y 55\.000 Z 0\.000 mm, which is on the path of no touch"):
         belongs(printed(5).replace("50.", "55."), 0)
 
 
@@ -121,7 +121,7 @@ def test_numbers_decide_and_go_on_or_begin_anew_from_cycle_to_cycle() -> None:
     assert belongs(printed(2, number=3), 0) == 2
     assert belongs(printed(2, number=13), 0) == 2
     assert belongs(printed(0, number=1), 1, printed(0, number=1)) == REPEATED
-    with pytest.raises(InstrumentError, match="not on the way of touch 2; are program and touches the same"):
+    with pytest.raises(InstrumentError, match="not on the path of touch 2; check that program and touches agree"):
         belongs(printed(0, number=2), 0)
 
 

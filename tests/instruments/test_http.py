@@ -72,7 +72,7 @@ def test_a_connection_that_the_server_ended_is_renewed(site: Site, http: HttpTra
     site.pages["/once"] = [answer(b"1", head=b"Connection: close\r\n")]
     site.pages["/gone"] = None
     assert [http.get("/once").body for _ in range(2)] == [b"1", b"1"]
-    with pytest.raises(InstrumentError, match="ends it without an answer"):
+    with pytest.raises(InstrumentError, match="closed it without an answer"):
         http.get("/gone")
     assert len(site.asked) == 3  # on a new connection nobody queries twice
     assert http.get("/once").body == b"1"
@@ -90,8 +90,8 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
 @pytest.mark.parametrize(
     ("page", "error", "message"),
     [
-        ([b"\x00\xff" + answer(b"<x/>")], ProtocolError, "expected an answer of HTTP"),
-        ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an answer of HTTP"),
+        ([b"\x00\xff" + answer(b"<x/>")], ProtocolError, "expected an HTTP answer"),
+        ([b"* OK IMAP4 ready\r\n"], ProtocolError, "expected an HTTP answer"),
         ([answer(b"1")[:-5]], InstrumentTimeoutError, "sent no data"),
         ([], InstrumentTimeoutError, "sent no data"),
         ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
@@ -134,7 +134,7 @@ def test_an_answer_of_one_piece_is_a_stream_of_one_part(site: Site, http: HttpTr
         (b"--x\r\nContent-length: 2000\r\n\r\n", "part of 0 to 1000 bytes; found 2000"),
         (b"--x\r\nContent-length: -1\r\n\r\n", "found None"),
         (b"--x\r\nContent-type: text/xml\r\n\r\n", "found None"),
-        (b"x" * 5000, "line of a part"),
+        (b"x" * 5000, "header line of a part"),
     ],
 )
 def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: bytes, message: str) -> None:

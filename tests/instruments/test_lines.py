@@ -98,7 +98,7 @@ def test_lines_are_recorded_beside_one_another_and_play_back(device: Twofold, tm
     replay = open_lines(f"replay://{recording}", {"data": 1})
     with pytest.raises(ReplayError, match="the driver stops"):
         replay.close()
-    with pytest.raises(InstrumentError, match="cannot be made: File exists"):
+    with pytest.raises(InstrumentError, match="cannot be created: File exists"):
         open_lines(device.url, {"data": 1}, record=recording)
     with pytest.raises(ReplayError, match="has no line 'light'"):
         open_lines(f"replay://{recording}", {"light": 1})

@@ -84,7 +84,7 @@ def test_an_exception_reply_is_a_refusal_in_words(framing: str, frame: bytes) ->
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        ((2, 3, [1, 2]), "expected an answer of unit 1; found one of unit 2"),
+        ((2, 3, [1, 2]), "expected an answer of unit 1; found that of unit 2"),
         ((1, 4, [1, 2]), "expected an answer to function 3"),
         ((1, 3, [1]), "expected 2 registers; found 2 bytes"),
     ],
@@ -166,8 +166,8 @@ def test_blocks_take_what_lies_between_even_channels_only() -> None:
         ({"registers": (1, 2)}, "one for each of the 5 channels; found 2"),
         ({"scale": (1.0, 2.0)}, "one, or one for each of the 5 channels"),
         ({"type": "f32", "stride": 1}, "a f32 fills 2 registers"),
-        ({"first": 65533}, "registers end at 65535"),
-        ({"channels": ("a", "a")}, "names a twice"),
+        ({"first": 65533}, "registers up to 65535"),
+        ({"channels": ("a", "a")}, "has a twice"),
         ({"places": {"bed": (0, 0, 0)}}, "'places' has bed"),
         ({"map": "adam-6017"}, "custom"),
     ],

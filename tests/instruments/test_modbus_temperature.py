@@ -249,8 +249,8 @@ def test_a_wrong_address_says_what_is_expected(address: str, message: str) -> No
         ("unplugged", InstrumentTimeoutError, "unit 1 did not answer"),
         ("exception&code=6", ModbusRefusal, r"exception 6 \(server device busy\)"),
         ("garbage", ProtocolError, "(?i)expected"),
-        ("short", ProtocolError, "bytes more within 0.7 s"),
-        ("unit", ProtocolError, "answer of unit 1; found one of unit 3"),
+        ("short", ProtocolError, "more bytes within 0.7 s"),
+        ("unit", ProtocolError, "answer of unit 1; found that of unit 3"),
     ],
 )
 def test_each_fault_is_a_state_of_its_own(wire: str, fault: str, error: type[InstrumentError], message: str) -> None:

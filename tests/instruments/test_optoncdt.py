@@ -294,5 +294,5 @@ def test_a_session_that_is_cut_short_fails_in_replay(tmp_path: Path) -> None:
         sensor.read()
     sensor = OptoNCDT(f"replay://{path}", SLOW)
     sensor.open()
-    with pytest.raises(ReplayError, match="goes on"):
+    with pytest.raises(ReplayError, match="stops before the end"):
         sensor.close()

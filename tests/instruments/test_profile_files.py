@@ -259,7 +259,7 @@ def test_a_recording_holds_to_the_files_as_they_were(tmp_path: Path) -> None:
     write_netcdf(path, "m")
     with pytest.raises(ReplayError, match=r"scan\.nc has changed since it was recorded"):
         ProfileFiles(f"replay://{recording}").open()
-    with pytest.raises(InstrumentError, match="cannot be made"):
+    with pytest.raises(InstrumentError, match="cannot be created"):
         ProfileFiles(str(path), record=recording).open()
     (tmp_path / "other.rec").write_text("something\n")
     with pytest.raises(ReplayError, match="is no list of scans"):

@@ -165,7 +165,7 @@ def test_a_recording_is_a_copy_and_refused_where_it_is_no_table(tmp_path: Path) 
     with TrackerTable(f"replay://{copy}") as table:
         assert table.identify().serial_number == original.serial_number
         np.testing.assert_array_equal(table.read(), lengths)
-    with pytest.raises(InstrumentError, match=r"The recording .* cannot be made"):
+    with pytest.raises(InstrumentError, match=r"The recording .* cannot be created"):
         TrackerTable(address, record=copy).open()
     copy.write_text("nothing", encoding="utf-8")
     with pytest.raises(ReplayError):

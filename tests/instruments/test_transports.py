@@ -59,7 +59,7 @@ def test_an_address_is_taken_apart(url: str, scheme: str, host: str, port: int |
         ("tcp://host", "tcp://HOST:PORT"),
         ("tcp://host:abc", "cannot be read"),
         ("serial://", "serial:///dev/NAME"),
-        ("replay://", "names no recording"),
+        ("replay://", "Expected the file of a recording"),
         ("sim://cframe/X1?seed", "cannot be read"),
     ],
 )
@@ -88,7 +88,7 @@ def test_what_follows_a_terminator_stays_for_the_next_read(line: Transport) -> N
 
 def test_silence_becomes_a_timeout_error_that_shows_what_came(line: Transport) -> None:
     line.write(b"half")
-    with pytest.raises(InstrumentTimeoutError, match=r"only b'HALF' came"):
+    with pytest.raises(InstrumentTimeoutError, match=r"received b'HALF'"):
         line.read_until(b";", timeout=0.2)
     with pytest.raises(InstrumentTimeoutError, match="sent no data"):
         line.read(timeout=0.05)
@@ -98,7 +98,7 @@ def test_a_number_of_bytes_is_read_whatever_the_pieces(line: Transport) -> None:
     line.write(b"one;two")
     assert line.read_until(b";") == b"ONE;"
     assert line.read_exactly(2) == b"TW"
-    with pytest.raises(InstrumentTimeoutError, match=r"expected 4 bytes within 0\.2 s; 1 came"):
+    with pytest.raises(InstrumentTimeoutError, match=r"expected 4 bytes within 0\.2 s; received 1"):
         line.read_exactly(4, timeout=0.2)
     assert line.read_exactly(0) == b""
 

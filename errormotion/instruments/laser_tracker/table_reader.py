@@ -1,4 +1,4 @@
-"""Exported tables of trackers to lengths by station and target, in SI, with everything that is wrong named at once.
+"""Conversion of exported tables of trackers to lengths by station and target, in SI; all mistakes are reported at once.
 
 A table has a line of column names with their units, and a line for each measurement, in any order::
 
@@ -31,7 +31,7 @@ Repeats = Literal["refuse", "last", "mean"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of numbers: its unit inside, how a person writes one, what is believable, and its other names."""
+    """A column of numbers: internal unit, example of a unit, limits of plausible values, and other names."""
 
     unit: str
     example: str
@@ -67,9 +67,9 @@ class Readings:
     temperature, pressure, humidity : ndarray, (station, target)
         degC, Pa, %; NaN where unknown.
     missing : mapping of str to int
-        Lengths that are not there: ``empty`` (a line without a number) and ``no line``.
+        Number of missing lengths: ``empty`` (a line without a number) and ``no line``.
     repeated : int
-        Lines that another one of the same station and target has replaced, or was averaged with.
+        Number of lines replaced by, or averaged with, another one of the same station and target.
     """
 
     stations: tuple[str, ...]
@@ -92,28 +92,30 @@ def read_table(
     path : Path
         UTF-8 text, see the module; separated by tabulator, semicolon or comma, the decimal sign is a point.
     stations : sequence of str, optional
-        The stations that there are, in their order; default: those of the table, in its order.
+        The stations in their order; default: those of the table, in its order.
     repeats : {"refuse", "last", "mean"}
-        What becomes of a second line for the same station and target.
+        Treatment of a second line for the same station and target.
     least_length : float
-        The longest length must be longer than this, m: finds metres that are called millimetres.
+        The longest length must be longer than this, m: detects wrong units.
 
     Raises
     ------
     DatasetError
-        The file cannot be read; or every mistake in it, with line, column, what was expected and what came.
+        The file cannot be read; or all mistakes in it, with line, column, expected and found value.
     """
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]
-        raise DatasetError(f"{path}, line {line}: a second table starts; expected one, without empty lines in it")
+        raise DatasetError(
+            f"{path}, line {line}: expected one table without empty lines; found the start of a second one"
+        )
     (table,) = tables
     complaints = Complaints(path)
     columns = _columns(table, complaints)
     complaints.raise_any()
     rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, complaints)]
     if not rows and not complaints.count:
-        complaints.add(table.head[0], "expected lines of measurements below the names; found none")
+        complaints.add(table.head[0], "expected lines of measurements below the column names; found none")
     values = {name: _numbers(name, place, unit, rows, table, complaints) for name, (place, unit) in columns.items()}
     keys = {name: [texts[place] for _, texts in rows] for name, (place, _) in columns.items() if name in KEYS}
     names = _names(keys, rows, stations, complaints)
@@ -125,7 +127,7 @@ def read_table(
 
 
 def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]:
-    """Return position and unit of each column that is known."""
+    """Return index and unit of each known column."""
     line, titles = table.head
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
     others |= {other: name for name, them in KEYS.items() for other in them}
@@ -136,7 +138,7 @@ def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]
         name = others.get(name, name)
         unit = ((match[2] or match[3] or "") if match else "").strip()
         if name in found:
-            complaints.add(line, f"column '{title}': there is a column for the {name} already")
+            complaints.add(line, f"column '{title}': expected one column for the {name}; found a second one")
         elif name in KEYS:
             found[name] = (place, "")
         elif name in QUANTITIES:
@@ -177,7 +179,7 @@ def _whole(line: int, texts: list[str], table: Table, complaints: Complaints) ->
 def _numbers(
     name: str, place: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, complaints: Complaints
 ) -> Array:
-    """Return the numbers of a column in SI; NaN where there is none. Nothing for a column of names."""
+    """Return the numbers of a column in SI; NaN where missing. Empty for a column of names."""
     if name in KEYS:
         return np.empty(0)
     quantity, title = QUANTITIES[name], table.head[1][place]
@@ -231,7 +233,7 @@ def _placed(
     repeats: Repeats,
     complaints: Complaints,
 ) -> Readings:
-    """Put every line where it belongs."""
+    """Return the readings by station and target."""
     shape = len(names["station"]), len(names["target"])
     places = {name: {text: k for k, text in enumerate(texts)} for name, texts in names.items()}
     groups: dict[tuple[int, int], list[int]] = {}
@@ -240,8 +242,8 @@ def _placed(
         if group and repeats == "refuse":
             complaints.add(
                 rows[k][0],
-                f"station '{station}', target '{target}': comes again; line {rows[group[0]][0]} has it already. Remove "
-                "one, or state with 'repeats' which counts",
+                f"station '{station}', target '{target}': expected one line; line {rows[group[0]][0]} is another one. "
+                "Remove one, or choose one by 'repeats'",
             )
         group.append(k)
     found = {name: np.full(shape, np.nan) for name in QUANTITIES}
@@ -263,10 +265,10 @@ def _placed(
 
 def _check_length(path: Path, length: Array, title: str, least: float) -> None:
     if not np.isfinite(length).any():
-        raise DatasetError(f"{path}: column '{title}': not a single length in it; is it the whole table?")
+        raise DatasetError(f"{path}: column '{title}': expected lengths; found none. Is the table complete?")
     longest = float(np.nanmax(np.abs(length)))
     if longest <= least:
         raise DatasetError(
-            f"{path}: column '{title}': the longest length is {longest:.4g} m; is its unit right? Set 'least_length' "
-            f"below {least:g} m if it is"
+            f"{path}: column '{title}': the longest length is {longest:.4g} m; check its unit. If it is right, set "
+            f"'least_length' below {least:g} m"
         )

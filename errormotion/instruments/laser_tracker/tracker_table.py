@@ -24,13 +24,15 @@ class TrackerTableSettings(PluginSettings):
     """Settings of ``tracker_table``."""
 
     stations: tuple[str, ...] | None = Field(
-        default=None, description="names of the stations, in their order; those of the table where not given"
+        default=None, description="names of the stations, in their order; default: those of the table"
     )
     repeats: Repeats = Field(
-        default="refuse", description="a second line for a station and target: refuse, take the last, or the mean"
+        default="refuse", description="treatment of a second line for a station and target: refuse, last, or mean"
     )
     least_length: Length = Field(
-        default=0.01, description="the longest length must be longer, else its unit is doubted; 0: never", ge=0
+        default=0.01,
+        description="the longest length must be longer, else the table is refused; detects wrong units; 0: no check",
+        ge=0,
     )
     noise: Length = Field(default=0.5e-6, description="standard deviation of a length", ge=0)
 
@@ -103,7 +105,7 @@ class TrackerTable:
                 with self._record.open("xb") as copy:
                     copy.write(data)
             except OSError as error:
-                raise InstrumentError(f"The recording {self._record} cannot be made: {error.strerror}") from None
+                raise InstrumentError(f"The recording {self._record} cannot be created: {error.strerror}") from None
         self._digest, self._readings = hashlib.sha256(data).hexdigest(), readings
 
     def close(self) -> None:
@@ -165,7 +167,7 @@ class TrackerTable:
     def table(self) -> xr.Dataset:
         """Return ``displacement(station, target)`` in m, and the air: ``temperature``, ``pressure``, ``humidity``.
 
-        Air is in degC, Pa and %. Quantities of which the table knows nothing are left out.
+        Air is in degC, Pa and %. Quantities that the table does not contain are omitted.
         """
         readings, dims = self.readings, ("station", "target")
         found = {"displacement": readings.length, **{name: getattr(readings, name) for name in AIR}}

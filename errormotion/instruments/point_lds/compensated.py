@@ -30,7 +30,7 @@ class CompensatedSamples(Samples):
     Attributes
     ----------
     raw : ndarray, float64, (1, n)
-        As they were read, m.
+        Uncorrected readings, m.
     uncertainty : ndarray, float64, (1, n)
         Standard uncertainty of ``values`` that comes from the calibration, m.
     jacobian : ndarray, float64, (1, n, term)
@@ -52,7 +52,7 @@ class CompensatedSensor:
     sensor : PointLDS
         A sensor that streams, open.
     calibration : path, name or InclinationCalibration
-        Looked for as `InclinationCalibration.find` does.
+        Found by `InclinationCalibration.find`.
     extrapolate : bool
         Whether tilts and depths beyond the calibrated ones are compensated; refused otherwise.
     allow_other_sensor : bool
@@ -61,7 +61,7 @@ class CompensatedSensor:
     Attributes
     ----------
     notes : tuple of str
-        What could not be checked, and what was allowed.
+        Checks that were not possible, and permitted deviations.
 
     Raises
     ------
@@ -93,7 +93,7 @@ class CompensatedSensor:
             log.warning(note)
 
     def read(self, inclination: float, rotation: float) -> Compensated:
-        """Return one reading of a surface that lies so to the beam: ``value`` and ``raw`` (), m.
+        """Return one reading of a surface with a known tilt to the beam: ``value`` and ``raw`` (), m.
 
         Parameters
         ----------
@@ -105,14 +105,14 @@ class CompensatedSensor:
         Raises
         ------
         InstrumentError
-            Of the sensor; or an angle that is no number.
+            Of the sensor; or an angle is not finite.
         MethodError
-            The calibration does not speak for this tilt or depth.
+            The calibration does not cover this tilt or depth.
         """
         return self._compensate(self.sensor.read(), inclination, rotation)
 
     def stream(self, inclination: float, rotation: float, block: int | None = None) -> Iterator[CompensatedSamples]:
-        """Yield blocks of readings of a surface that lies so to the beam, until the caller stops; see `read`."""
+        """Yield blocks of readings of a surface with a known tilt, until the caller stops; see `read`."""
         for samples in self.sensor.stream(block):  # type: ignore[attr-defined]
             known = {field.name: getattr(samples, field.name) for field in fields(Samples)}
             found = self._compensate(samples.values, inclination, rotation)
@@ -129,7 +129,7 @@ class CompensatedSensor:
         q = tilt_vector(inclination, rotation)
         if not np.isfinite(q).all():
             raise InstrumentError(
-                f"Expected how the surface lies to the beam; found inclination {inclination}, rotation {rotation} rad"
+                f"Expected finite angles of the surface; found inclination {inclination}, rotation {rotation} rad"
             )
         found = self.calibration.compensate(reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate)
         shape = np.shape(reading)  # one tilt for all of them adds no dimension

@@ -39,13 +39,13 @@ class CanSettings(ThermometerSettings):
     inputs: tuple[int, ...] = Field(
         default=(), description="subindex of each channel; default: from 1 on, in their order"
     )
-    node: int = Field(default=1, description="node number, where the URL names none", ge=1, le=127)
+    node: int = Field(default=1, description="node number, where the URL has none", ge=1, le=127)
     unit: Literal["as stated", "degC", "K"] = Field(
         default="as stated", description="unit of the values; 'as stated': what object 0x6131 states"
     )
     start: bool = Field(default=False, description="send the node to OPERATIONAL when it is opened")
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least time between two attempts to open a lost bus", ge=0)
+    retry: Time = Field(default=1.0, description="least interval between two attempts to open a lost bus", ge=0)
 
     @model_validator(mode="after")
     def _one_each(self) -> Self:
@@ -100,12 +100,12 @@ class CanTemperature(Thermometer):
         return self.node.state
 
     def identify(self) -> Identity:
-        """Query the node for its profile, its name and its numbers.
+        """Return the identity from the profile, name and numbers of the node.
 
         Raises
         ------
         InstrumentError
-            It is no measuring device after CiA 404.
+            The node is not a measuring device after CiA 404.
         """
         node = self.node
         device = decode_unsigned(node.upload(DEVICE_TYPE), DEVICE_TYPE)
@@ -116,7 +116,7 @@ class CanTemperature(Thermometer):
         vendor, product, serial = (decode_unsigned(node.upload(IDENTITY, i), IDENTITY) for i in (1, 2, 4))
         try:
             name = node.upload(NAME).rstrip(b"\0").decode("latin-1")
-        except SdoRefusal:  # it need not have one
+        except SdoRefusal:  # the name is optional
             name = f"product {product}"
         return Identity(
             manufacturer=f"CiA vendor 0x{vendor:08X}",
@@ -127,10 +127,10 @@ class CanTemperature(Thermometer):
         )
 
     def configure(self, settings: CanSettings) -> None:
-        """Use other settings from now on; the node's own are made with the maker's tool."""
+        """Use other settings from now on; the node itself is configured with the maker's tool."""
         self.settings = settings
         if self._transport is not None:
-            self._learn()
+            self._read_units()
 
     def _measure(self) -> dict[str, tuple[float, str]]:
         node = self.node
@@ -149,8 +149,8 @@ class CanTemperature(Thermometer):
             raise
         return scale * value + offset, flag_of(status, value)
 
-    def _learn(self) -> None:
-        """Query once for what does not change: the units, and whether inputs have a status."""
+    def _read_units(self) -> None:
+        """Read the constant data once: the units, and whether inputs have a status."""
         node, settings = self.node, self.settings
         self._scales: list[tuple[float, float]] = []
         for subindex in settings.subindices:
@@ -177,4 +177,4 @@ class CanTemperature(Thermometer):
         if self.settings.start:
             self.node.start_node()
         self.identify()
-        self._learn()
+        self._read_units()

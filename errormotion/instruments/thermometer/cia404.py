@@ -1,4 +1,4 @@
-"""CiA 404, measuring devices: the objects of an analogue input as a float, and what its unit and status mean.
+"""CiA 404, measuring devices: the objects of an analogue input as a float, the meaning of its unit and status.
 
 All of it is from memory (m) and kept in this one file.
 """
@@ -45,7 +45,7 @@ def to_celsius(unit: int) -> tuple[float, float]:
     Raises
     ------
     InstrumentError
-        No unit of temperature.
+        Not a unit of temperature.
     """
     prefix = (unit >> 24 ^ 0x80) - 0x80  # power of ten, signed
     if unit & 0x00FFFFFF == CELSIUS:
@@ -54,7 +54,7 @@ def to_celsius(unit: int) -> tuple[float, float]:
         return 10.0**prefix, -ZERO_CELSIUS
     raise InstrumentError(
         f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}) or K (0x{KELVIN:08X}), with a prefix. "
-        "If it is one of these all the same, state so in the setting 'unit'."
+        "If the code is wrong, state the unit in the setting 'unit'"
     )
 
 

@@ -1,4 +1,4 @@
-"""Thermocouple modules that speak DCON (ADAM-4018, ICP DAS I-7018): ASCII on RS-485 or behind a serial server.
+"""Thermocouple modules with the DCON protocol (ADAM-4018, ICP DAS I-7018): ASCII on RS-485 or behind a serial server.
 
 All of the protocol is from memory (m) and kept in this one file.
 """
@@ -18,8 +18,8 @@ from errormotion.instruments.transports.reconnecting import discard_input, disco
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
-OPEN_SENSOR = 9999.0  # degC: this and more, either sign, is no temperature but an open or overrun input
-UNDER_RANGE = "-0000"  # the ADAM way to state the same
+OPEN_SENSOR = 9999.0  # degC: this absolute value and more means an open or overrun input
+UNDER_RANGE = "-0000"  # the code of an ADAM for the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
 
 
@@ -47,7 +47,7 @@ def decode(line: bytes, *, with_checksum: bool = False) -> str:
     try:
         text = line.removesuffix(LINE_END).decode("ascii")
     except UnicodeDecodeError:
-        raise ProtocolError(f"Expected a line of ASCII; found {line!r}") from None
+        raise ProtocolError(f"Expected a line in ASCII; found {line!r}") from None
     if not with_checksum:
         return text
     body, check = text[:-2], text[-2:]
@@ -87,7 +87,7 @@ class DconSettings(ThermometerSettings):
     checksum: bool = Field(default=False, description="whether the module is set to use checksums")
     baudrate: int = Field(default=9600, description="of a serial line", gt=0)
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least time between two attempts to connect again", ge=0)
+    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
 
 
 class DconTemperature(Thermometer):
@@ -113,7 +113,7 @@ class DconTemperature(Thermometer):
     settings: DconSettings
 
     def identify(self) -> Identity:
-        """Query the module for its name and firmware."""
+        """Return the name and firmware of the module."""
         name, firmware = (self._query(f"${self._unit}{what}", "!" + self._unit) for what in "MF")
         return Identity(
             manufacturer="DCON",
@@ -125,7 +125,7 @@ class DconTemperature(Thermometer):
         )
 
     def configure(self, settings: DconSettings) -> None:
-        """Use other settings from now on; the module's own are made with the maker's tool."""
+        """Use other settings from now on; the module itself is configured with the maker's tool."""
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:
@@ -143,7 +143,7 @@ class DconTemperature(Thermometer):
         return f"{self.settings.unit:02X}"
 
     def _query(self, request: str, expected: str) -> str:
-        """Send a request and return the answer behind the start that was expected."""
+        """Send a request and return the answer without its expected start."""
         with_checksum = self.settings.checksum
         line = self.transport
         discard_input(line)

@@ -1,4 +1,4 @@
-"""Thermometers that keep their temperatures in Modbus registers: loggers, input modules, transmitters."""
+"""Thermometers with Modbus registers: loggers, input modules, transmitters."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class ModbusTemperature(Thermometer):
 
     @property
     def repeated(self) -> int:
-        """How many damaged answers had to be requested again since the connection was opened."""
+        """Number of repeated requests after damaged answers since the connection was opened."""
         return self.line.repeated
 
     def identify(self) -> Identity:
-        """Request the first register as a check that the device answers; Modbus thermometers have no common name."""
+        """Check that the device answers, by its first register; Modbus thermometers report no name."""
         line, settings = self.line, self.settings
         line.registers(settings.function, min(settings.addresses), SIZES[settings.type])
         return Identity(
@@ -59,7 +59,7 @@ class ModbusTemperature(Thermometer):
         )
 
     def configure(self, settings: ModbusSettings) -> None:
-        """Use other settings from now on; the device's own are made with the maker's tool."""
+        """Use other settings from now on; the device itself is configured with the maker's tool."""
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:

@@ -1,4 +1,4 @@
-"""How temperatures lie in Modbus registers: where, in what form, on what scale, and which codes are none."""
+"""Temperatures in Modbus registers: addresses, number types, scales, and codes of missing temperatures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "S": (500.0, 1750.0),
     "B": (500.0, 1800.0),
 }
-#: Ready maps: settings that a name stands for.
+#: Register maps: the settings that a name stands for.
 MAPS: Mapping[str, Mapping[str, Any]] = {
     "custom": {},
     "adam-6018": {"function": 3, "first": 0, "type": "u16", "open_codes": (65535,)},
@@ -40,16 +40,16 @@ _MAX_CHANNELS = {"adam-6018": 8, "logger-16": 16}
 class ModbusSettings(ThermometerSettings):
     """Settings of a thermometer with Modbus.
 
-    A temperature is ``scale * number + offset``. What is not given is as the ``map`` states.
+    A temperature is ``scale * number + offset``. Settings that are not given are those of the ``map``.
     """
 
     map: Literal["custom", "adam-6018", "logger-16"] = Field(
-        default="custom", description="ready register map whose settings hold where none are given here"
+        default="custom", description="register map with the defaults of the other settings"
     )
     thermocouples: tuple[Thermocouple, ...] = Field(
         default=("K",), description="types, one for all channels or one for each; scale of an ADAM-6018", min_length=1
     )
-    unit: int = Field(default=1, description="address of the device, where its URL names none", ge=0, le=255)
+    unit: int = Field(default=1, description="address of the device, where its URL has none", ge=0, le=255)
     function: Literal[3, 4] = Field(default=3, description="3 reads holding registers, 4 input registers")
     first: int = Field(default=0, description="register of the first channel, from 0", ge=0, le=65535)
     stride: int | None = Field(
@@ -58,36 +58,36 @@ class ModbusSettings(ThermometerSettings):
     registers: tuple[int, ...] = Field(
         default=(), description="register of each channel, where they are not evenly spaced"
     )
-    most: int = Field(default=125, description="registers requested at once", ge=2, le=125)
+    most: int = Field(default=125, description="largest number of registers in one request", ge=2, le=125)
     type: Kind = Field(default="i16", description="u16, i16, u32, i32 or f32")
     word_order: Order = Field(default="big", description="big: the upper 16 bits come first")
-    byte_order: Order = Field(default="big", description="of the two bytes of a register; the standard states big")
+    byte_order: Order = Field(default="big", description="order of the two bytes of a register; big in the standard")
     scale: float | tuple[float, ...] = Field(default=1.0, description="degC for one count; one for all or for each")
     offset: float | tuple[float, ...] = Field(default=0.0, description="degC at the count 0; one for all or for each")
     open_codes: tuple[int, ...] = Field(default=(), description="counts that mean an open sensor")
     open_from: int | None = Field(default=None, description="this count and more mean an open sensor")
     shorted_codes: tuple[int, ...] = Field(default=(), description="counts that mean a shorted sensor")
-    lowest: Temperature = Field(default=-273.15, description="colder is out of range")
-    highest: Temperature = Field(default=2500.0, description="hotter is out of range")
-    baudrate: int = Field(default=9600, description="of a serial line, where its URL names none", gt=0)
+    lowest: Temperature = Field(default=-273.15, description="temperatures below are out of range")
+    highest: Temperature = Field(default=2500.0, description="temperatures above are out of range")
+    baudrate: int = Field(default=9600, description="of a serial line, where its URL has none", gt=0)
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
-    retry: Time = Field(default=1.0, description="least time between two attempts to connect again", ge=0)
-    retries: int = Field(default=1, description="how often a damaged answer is requested again", ge=0, le=10)
+    retry: Time = Field(default=1.0, description="least interval between two attempts to connect again", ge=0)
+    retries: int = Field(default=1, description="number of repeated requests after a damaged answer", ge=0, le=10)
 
     @model_validator(mode="before")
     @classmethod
-    def _as_the_map_says(cls, given: Any) -> Any:
+    def _defaults_of_the_map(cls, given: Any) -> Any:
         name = given.get("map", "custom") if isinstance(given, Mapping) else ""
         if not isinstance(name, str) or not MAPS.get(name):
             return given
-        said = dict(MAPS[name])
+        defaults = dict(MAPS[name])
         if name == "adam-6018":
             types = given.get("thermocouples", ("K",))
             types = [types] if isinstance(types, str) else types
             if all(isinstance(each, str) and each in RANGES for each in types):
-                said["scale"] = tuple((RANGES[each][1] - RANGES[each][0]) / 65535 for each in types)
-                said["offset"] = tuple(RANGES[each][0] for each in types)
-        return {**said, **given}
+                defaults["scale"] = tuple((RANGES[each][1] - RANGES[each][0]) / 65535 for each in types)
+                defaults["offset"] = tuple(RANGES[each][0] for each in types)
+        return {**defaults, **given}
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -104,7 +104,7 @@ class ModbusSettings(ThermometerSettings):
         if self.stride is not None and self.stride < size:
             raise ValueError(f"'stride': a {self.type} fills {size} registers; found {self.stride}")
         if max(self.addresses) + size > 1 << 16:
-            raise ValueError(f"registers end at 65535; the last channel would start at {max(self.addresses)}")
+            raise ValueError(f"expected registers up to 65535; the last channel starts at {max(self.addresses)}")
         return self
 
     @property
@@ -117,8 +117,8 @@ class ModbusSettings(ThermometerSettings):
     def blocks(self) -> Iterator[tuple[int, int]]:
         """Yield first register and number of registers of each request.
 
-        What lies between evenly spaced channels belongs to the device and is read with them; what lies between
-        channels with registers of their own may not exist, and is not.
+        Registers between evenly spaced channels exist and are read with them; registers between
+        channels with explicit addresses may not exist and are not read.
         """
         size, gap = SIZES[self.type], 0 if self.registers else (self.stride or 0)
         begin = end = -1
@@ -146,7 +146,7 @@ class ModbusSettings(ThermometerSettings):
         return value, GOOD if self.lowest <= value <= self.highest else OUT_OF_RANGE
 
     def words(self, channel: int, temperature: float) -> list[int]:
-        """Return the registers that stand for a temperature (degC)."""
+        """Return the registers of a temperature (degC)."""
         number = (temperature - _each(self.offset, channel)) / _each(self.scale, channel)
         return encode_number(number, self.type, self.word_order, self.byte_order)
 
@@ -166,7 +166,7 @@ def decode_number(words: Sequence[int], kind: Kind, word_order: Order = "big", b
 
 
 def encode_number(number: float, kind: Kind, word_order: Order = "big", byte_order: Order = "big") -> list[int]:
-    """Return the registers with a number; a whole one stops at the ends of its type."""
+    """Return the registers of a number; integers are limited to the range of their type."""
     if kind != "f32":
         bits = 16 * SIZES[kind]
         low, high = (0, (1 << bits) - 1) if kind[0] == "u" else (-(1 << bits - 1), (1 << bits - 1) - 1)

@@ -13,7 +13,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.driver import Driver
 from errormotion.plugins import PluginSettings
 
-Place = tuple[Length, Length, Length]
+Position = tuple[Length, Length, Length]
 
 GOOD = ""
 OPEN, SHORTED, OUT_OF_RANGE, NO_ANSWER, NOT_READ = "open", "shorted", "out of range", "no answer", "not read"
@@ -25,26 +25,26 @@ class ThermometerSettings(PluginSettings):
 
     channels: tuple[str, ...] = Field(
         default=("frame", "ambient", "spindle_front", "spindle_rear", "column"),
-        description="what the inputs measure, from the first one on",
+        description="names of the inputs, from the first one on",
         min_length=1,
     )
-    places: dict[str, Place] = Field(
-        default_factory=dict, description="where sensors sit on the machine: name to X, Y, Z; as far as known"
+    places: dict[str, Position] = Field(
+        default_factory=dict, description="positions of sensors on the machine: name to X, Y, Z; as far as known"
     )
 
     @model_validator(mode="after")
     def _names(self) -> Self:
         if double := {name for name in self.channels if self.channels.count(name) > 1}:
-            raise ValueError(f"'channels' names {', '.join(sorted(double))} twice; each sensor needs a name of its own")
+            raise ValueError(f"'channels' has {', '.join(sorted(double))} twice; each sensor needs its own name")
         if unknown := [name for name in self.places if name not in self.channels]:
             raise ValueError(
-                f"'places' has {', '.join(unknown)}, but there are the channels {', '.join(self.channels)}"
+                f"'places' has {', '.join(unknown)}; expected names of the channels {', '.join(self.channels)}"
             )
         return self
 
 
 class Thermometer(Driver):
-    """Base of thermometers: `_measure` returns temperatures and flags, `read` keeps the flags.
+    """Base of thermometers: `_measure` returns temperatures and flags, `read` stores the flags.
 
     Attributes
     ----------
@@ -58,12 +58,12 @@ class Thermometer(Driver):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of what is measured."""
+        """Names of the sensors."""
         return self.settings.channels
 
     @property
     def places(self) -> dict[str, tuple[float, float, float] | None]:
-        """Where each sensor sits on the machine, m; None where unknown."""
+        """Position of each sensor on the machine, m; None where unknown."""
         return {name: self.settings.places.get(name) for name in self.channels}
 
     @property
@@ -78,13 +78,12 @@ class Thermometer(Driver):
         super().open()
 
     def read(self) -> dict[str, float]:
-        """Return the temperatures now, degC by channel; NaN for a sensor without one, whose flag states why.
+        """Return the temperatures now, degC by channel; NaN where missing, with the reason in `flags`.
 
         Raises
         ------
         InstrumentError
-            There is no answer at all, or one that cannot be understood; after a lost connection the next call
-            connects again.
+            No answer, or an invalid one; after a lost connection the next call connects again.
         """
         try:
             found = self._measure()

@@ -1,4 +1,4 @@
-"""A touch probe that a controller moves and reads: straight probing moves, G38.2 and its like."""
+"""A touch probe that a controller moves and reads: straight probing moves such as G38.2."""
 
 from __future__ import annotations
 
@@ -37,20 +37,24 @@ class ControllerProbeSettings(ProbeSettings):
 
     controller: str = Field(default="virtual_controller", description="plugin of the controller at the address")
     controller_settings: dict[str, Any] = Field(default_factory=dict, description="settings of that plugin")
-    approach_feed: Velocity = Field(default=2.0 / 60, description="between touches", gt=0)
-    search_feed: Velocity = Field(default=0.5 / 60, description="of the first contact", gt=0)
-    touch_feed: Velocity = Field(default=0.03 / 60, description="of the contacts that count", gt=0)
-    back_off: Length = Field(default=0.3e-3, description="way back between two contacts", gt=0)
-    repeats: int = Field(default=2, description="slow contacts of a touch; their mean counts", ge=1, le=20)
-    agreement: Length = Field(default=3e-6, description="by how much they may differ", gt=0)
-    free: Length = Field(default=0.2e-3, description="first part of a touch's way, where a trip is a false one", ge=0)
+    approach_feed: Velocity = Field(default=2.0 / 60, description="feed between touches", gt=0)
+    search_feed: Velocity = Field(default=0.5 / 60, description="feed of the first contact", gt=0)
+    touch_feed: Velocity = Field(default=0.03 / 60, description="feed of the slow contacts", gt=0)
+    back_off: Length = Field(default=0.3e-3, description="distance of the retraction between two contacts", gt=0)
+    repeats: int = Field(
+        default=2, description="number of slow contacts of a touch; their mean is the result", ge=1, le=20
+    )
+    agreement: Length = Field(default=3e-6, description="largest difference of slow contacts", gt=0)
+    free: Length = Field(default=0.2e-3, description="first part of a path, in which a trip counts as false", ge=0)
     margin: Length = Field(
-        default=0.1e-3, description="between fast and slow contact, and between contact and straight way", gt=0
+        default=0.1e-3,
+        description="largest distance between fast and slow contact, and from a contact to the path",
+        gt=0,
     )
     clearance: Length = Field(
-        default=30e-3, description="height above the starts of touches at which the tip goes from one to the next", ge=0
+        default=30e-3, description="height above the starts of touches for moves between touches", ge=0
     )
-    attempts: int = Field(default=1, description="how often a false trip, or a stuck probe, is tried again", ge=0, le=9)
+    attempts: int = Field(default=1, description="number of retries after a false trip or a stuck probe", ge=0, le=9)
     settling: Time = Field(default=0.5, description="waiting time for a stuck probe", ge=0)
 
     @property
@@ -62,13 +66,13 @@ class ControllerProbeSettings(ProbeSettings):
 class ControllerProbe:
     """A touch probe at a controller.
 
-    From touch to touch the tip rises by the clearance, goes across and down, on guard all the way: it stops where it
-    touches something. Nothing moves on after an error; the contacts that were made have been passed on by then.
+    Between touches the tip rises by the clearance, moves across and down; all these are probing moves, which stop on
+    contact. After an error nothing moves; the earlier contacts have been delivered.
 
     Parameters
     ----------
     address : str
-        Of the controller; the probe opens a connection of its own.
+        URL of the controller; the probe opens its own connection.
     settings : ControllerProbeSettings, optional
     record : Path, optional
         Recording of the session.
@@ -90,7 +94,7 @@ class ControllerProbe:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         # Faults of the machine show when it moves, not when it is read.
         harmless = ("split", "alarm", "estop", "no_trip", "tripped")
         return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
@@ -114,7 +118,7 @@ class ControllerProbe:
         Raises
         ------
         InstrumentError
-            No device answers, or a controller that cannot probe.
+            No device answers, or the controller cannot probe.
         DatasetError
             The pre-travel map cannot be read.
         """
@@ -127,7 +131,9 @@ class ControllerProbe:
         except (PluginError, ValueError) as error:
             raise InstrumentError(f"The controller '{self.settings.controller}' of the probe: {error}") from error
         if not hasattr(cls, "probe"):
-            raise InstrumentError(f"The controller '{self.settings.controller}' cannot probe; take one that can")
+            raise InstrumentError(
+                f"The controller '{self.settings.controller}' cannot probe; choose one with probing moves"
+            )
         control = cls(self.address, settings, record=self._record)
         control.open()
         self._control = control
@@ -160,7 +166,7 @@ class ControllerProbe:
             )
         return self._control
 
-    # ------------------------------------------------------------------ asking
+    # ------------------------------------------------------------------ state
 
     @property
     def tip_radius(self) -> float:
@@ -187,15 +193,15 @@ class ControllerProbe:
         )
 
     def configure(self, settings: ControllerProbeSettings) -> None:
-        """Use other settings from now on; those of the connection need a new one."""
+        """Use other settings from now on; those of the connection hold for the next one."""
         self._map = settings.pretravel_map()
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return where the tip is and what came of the last touch.
+        """Return the position of the tip and the result of the last touch.
 
-        ``position`` (m) and ``time`` (s) now, by the controller; ``contacts``, how many were good since the driver was
-        made; ``contact`` (m; NaN without one) and ``flag`` of the last touch.
+        ``position`` (m) and ``time`` (s) now, by the controller; ``contacts``, the number of good ones since the driver
+        was made; ``contact`` (m; NaN without one) and ``flag`` of the last touch.
         """
         state = self.control.state()
         return {
@@ -209,24 +215,24 @@ class ControllerProbe:
     # ------------------------------------------------------------------ touching
 
     def measure(self, touches: Sequence[Touch]) -> Iterator[Contact]:
-        """Make touches one after another and yield what came of each, in order.
+        """Make touches one after another and yield the result of each, in order.
 
-        A contact is where the tip was when the probe tripped; with a pre-travel map where it was when it met the
-        surface, for touches along the normal. Where an item is not met at all the rest of its touches are ``not
-        made``; where that happens to two items running, it is the probe. A probe that is tripped at the start, and
-        stays so, gives its flag; then it is an error.
+        A contact is the position of the tip when the probe tripped; with a pre-travel map, for touches along the
+        normal, the position when it met the surface. After a touch without a contact the rest of the item's touches are
+        ``not made``; after two such items in succession the probe is assumed to be defective. A probe that is tripped
+        at the start, and remains so, yields a contact with its flag and then raises.
 
         Raises
         ------
         InstrumentError
-            Touches from a side that the pre-travel map does not know, alarm, emergency stop, a lost connection,
-            something in the way, a probe that never trips or stays tripped. All motion has been stopped then, where
-            the controller still receives.
+            Touches from a direction that the pre-travel map does not cover, alarm, emergency stop, a lost connection,
+            an obstacle, a probe that never trips or remains tripped. All motion has been stopped, as far as the
+            controller is connected.
         """
         touches = list(touches)
         refuse_unmapped(self._map, touches)
         self._refuse_unfit()
-        missed: list[int] = []  # items that were not met, since the last contact
+        missed: list[int] = []  # items without a contact since the last contact
         for number, touch in enumerate(touches):
             if touch.item in missed:
                 yield self._kept(Contact(NOWHERE, float(self.control.state()["time"]), NOT_MADE))
@@ -248,7 +254,7 @@ class ControllerProbe:
                 self._stop()
                 raise InstrumentError(
                     f"Touch {number + 1} of {len(touches)}: the probe did not trip on items {missed[0]} and "
-                    f"{missed[1]}, one after the other. Is it connected and switched on? Nothing moves on"
+                    f"{missed[1]}, one after the other. Is it connected and switched on? All motion has been stopped"
                 )
         if touches:
             self._leave(touches)
@@ -256,15 +262,15 @@ class ControllerProbe:
     def _made(self, touches: Sequence[Touch], number: int) -> Contact:
         touch = touches[number]
         toucher = Toucher(self.control, self.settings.strategy)
-        for place in self._way(touches, number):
-            toucher.travel(place)
+        for position in self._path(touches, number):
+            toucher.travel(position)
         contact = toucher.touch(touch)
         return corrected(self._map, touch, contact)
 
-    def _way(self, touches: Sequence[Touch], number: int) -> list[Any]:
-        """Return the positions on the way to the start of a touch: up, across, down.
+    def _path(self, touches: Sequence[Touch], number: int) -> list[Any]:
+        """Return the positions of the path to the start of a touch: up, across, down.
 
-        Within an item the tip rises above the starts of its touches, else above those of all.
+        Within an item the tip rises above the starts of the item's touches, else above those of all touches.
         """
         here = np.array(self.control.state()["position"], dtype=float)
         start = np.array(touches[number].start, dtype=float)
@@ -274,13 +280,13 @@ class ControllerProbe:
         within = before is not None and before.item == touches[number].item
         passed = [touch for touch in touches if not within or touch.item == touches[number].item]
         height = max(float(here[2]), max(touch.start[2] for touch in passed) + self.settings.clearance)
-        places = [np.array([*here[:2], height]), np.array([*start[:2], height]), start]
+        positions = [np.array([*here[:2], height]), np.array([*start[:2], height]), start]
         return [
-            place for place, last in zip(places, [here, *places], strict=False) if np.abs(place - last).max() > _SAME
+            each for each, last in zip(positions, [here, *positions], strict=False) if np.abs(each - last).max() > _SAME
         ]
 
     def _leave(self, touches: Sequence[Touch]) -> None:
-        """Rise from the last touch."""
+        """Move up from the last touch."""
         here = np.array(self.control.state()["position"], dtype=float)
         height = max(touch.start[2] for touch in touches) + self.settings.clearance
         if here[2] < height - _SAME:
@@ -299,7 +305,7 @@ class ControllerProbe:
                 if state["homed"] is False
                 else "not enabled"
             )
-            raise InstrumentError(f"The machine at {self.address} is {what}; nothing moves")
+            raise InstrumentError(f"The machine at {self.address} is {what}; nothing was moved")
 
     def _kept(self, contact: Contact) -> Contact:
         self.last = contact

@@ -1,4 +1,4 @@
-"""What all touch probes have as settings."""
+"""Settings of all touch probes."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class ProbeSettings(PluginSettings):
         Raises
         ------
         DatasetError
-            There is no such file, it is no map, or it belongs to a probe with another serial number.
+            The file is missing, it is not a map, or it belongs to a probe with another serial number.
         """
         if not self.pretravel:
             return None
-        places = [base / self.pretravel for base in (*folders_beside(), Path.cwd())]
-        found = PretravelMap.load(next((place for place in places if place.exists()), Path(self.pretravel)))
+        paths = [base / self.pretravel for base in (*folders_beside(), Path.cwd())]
+        found = PretravelMap.load(next((path for path in paths if path.exists()), Path(self.pretravel)))
         allowed = self.allow_other_sensor
         for note in compare(self.pretravel, found.serial_number, self.serial_number, allow_other_sensor=allowed):
             log.warning(note)
@@ -63,12 +63,12 @@ def _normals(touches: Sequence[Touch]) -> list[tuple[float, ...]]:
 
 
 def refuse_unmapped(pretravel: PretravelMap | None, touches: Sequence[Touch]) -> None:
-    """Refuse touches from sides that the pre-travel map does not know.
+    """Refuse touches from directions that the pre-travel map does not cover.
 
     Raises
     ------
     InstrumentError
-        Names the first of them.
+        For the first of them.
     """
     if pretravel is None or not touches:
         return
@@ -77,12 +77,13 @@ def refuse_unmapped(pretravel: PretravelMap | None, touches: Sequence[Touch]) ->
         first = touches[int(unknown[0])]
         raise InstrumentError(
             f"The pre-travel map has no touches near the direction of touch {int(unknown[0]) + 1} (item {first.item}); "
-            f"{unknown.size} of {len(touches)} touches are so. Calibrate the probe from there too, or leave the map out"
+            f"it does not cover {unknown.size} of {len(touches)} touches. Calibrate the probe in these directions, "
+            "or use no map"
         )
 
 
 def corrected(pretravel: PretravelMap | None, touch: Touch, contact: Contact) -> Contact:
-    """Return a contact where the tip met the surface, if there is a map and the contact is good; else as it is."""
+    """Return a contact at the position where the tip met the surface; unchanged without a map or with a flag."""
     if pretravel is None or contact.flag:
         return contact
     x, y, z = (float(value) for value in pretravel.met([contact.position], _normals([touch]))[0])

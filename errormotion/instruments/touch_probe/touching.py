@@ -1,4 +1,4 @@
-"""One touch by a controller: search fast, back off, touch slowly, again; and everything that can be wrong with it."""
+"""One touch by a controller: fast search, retraction, slow contacts, and the detection of faults."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from errormotion.plugins import Contact, Touch
 Array = NDArray[np.float64]
 
 NO_TRIP, TRIPPED, DIFFERS, NOT_MADE = "no trip", "tripped at the start", "repeat differs", "not made"
-_TRIPPED_BEFORE = "tripped before it moves"  # what controllers state
+_TRIPPED_BEFORE = "tripped before it moves"  # part of the messages of controllers
 NOWHERE = (float("nan"),) * 3
 
 
 class Prober(Protocol):
-    """What of a controller a touch needs."""
+    """Members of a controller that a touch needs."""
 
     def state(self) -> dict[str, Any]:
-        """Return what the control shows."""
+        """Return the state of the control."""
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> Any:
         """Move in a straight line, m and m/s."""
@@ -39,7 +39,7 @@ class Prober(Protocol):
 
 
 class StuckError(InstrumentError):
-    """The probe is tripped although it touches nothing."""
+    """The probe is tripped without a contact."""
 
 
 @dataclass(frozen=True)
@@ -49,21 +49,21 @@ class Strategy:
     Attributes
     ----------
     approach_feed, search_feed, touch_feed : float
-        Between touches, of the first contact, of those that count.
+        Feed between touches, of the first contact, of the slow contacts.
     back_off : float
-        Between contacts.
+        Distance of the retraction between contacts.
     free : float
-        First part of the way in which a trip is a false one.
+        First part of the path, in which a trip counts as false.
     margin : float
-        How much later or earlier than the fast contact a slow one may be, and how far off the way both.
+        Largest distance between fast and slow contact, and of both from the path.
     repeats : int
-        Slow contacts; their mean counts.
+        Number of slow contacts; their mean is the result.
     agreement : float
-        By how much they may differ.
+        Largest difference of slow contacts.
     attempts : int
-        False trips and stuck probes that are tried again.
+        Retries after false trips and stuck probes.
     settling : float
-        Waiting time for a probe that is stuck.
+        Waiting time for a stuck probe.
     """
 
     approach_feed: float
@@ -92,55 +92,55 @@ class Toucher:
         self._control = control
         self._how = strategy
 
-    def travel(self, place: Array) -> None:
-        """Go somewhere with the probe on guard.
+    def travel(self, position: Array) -> None:
+        """Move to a position by a probing move.
 
         Raises
         ------
         StuckError
             The probe is tripped before it moves.
         InstrumentError
-            It touched something on the way: the machine is at rest there.
+            The probe tripped on the path: the machine rests there.
         """
-        found = self._probe(place, self._how.approach_feed)
+        found = self._probe(position, self._how.approach_feed)
         if found is not None:
             x, y, z = 1e3 * np.asarray(found["position"], dtype=float)
             raise InstrumentError(
-                f"the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} mm, where its way should have been "
-                "free; the machine is at rest there. See what is in the way, or raise the clearance"
+                f"the probe tripped at X {x:.3f} Y {y:.3f} Z {z:.3f} mm, where its path should be free; the machine "
+                "rests there. Remove the obstacle, or raise the clearance"
             )
 
     def touch(self, touch: Touch) -> Contact:
-        """Make one touch from its start, where the tip stands, and return there.
+        """Make one touch from its start, the present position of the tip, and return there.
 
         Raises
         ------
         StuckError
-            The probe is tripped at the start, and stays so.
+            The probe is tripped at the start, and remains so.
         InstrumentError
-            The controller refuses, or states that it tripped off the way.
+            The controller refuses, or reports a trip off the path.
         """
         start, target = np.array(touch.start, dtype=float), np.array(touch.target, dtype=float)
-        way = target - start
-        length = float(np.linalg.norm(way))
+        path = target - start
+        length = float(np.linalg.norm(path))
         if not length > 0:
-            raise InstrumentError("expected a touch whose target is not its start")
-        direction = way / length
-        begin = start
+            raise InstrumentError("expected a touch whose target differs from its start")
+        direction = path / length
+        origin = start
         for _ in range(1 + self._how.attempts):
-            fast = self._search(begin, target, start, direction, length)
+            fast = self._search(origin, target, start, direction, length)
             if fast is None:
                 break
             slow = self._slow(fast, start, direction, length)
             if slow:
                 return self._judged(fast, slow, start, direction)
-            begin = start  # nothing was there: it was a false trip
-            self._control.move_to(begin.tolist(), self._how.approach_feed)
+            origin = start  # no slow contact: a false trip
+            self._control.move_to(origin.tolist(), self._how.approach_feed)
         self._control.move_to(start.tolist(), self._how.approach_feed)
         return Contact(NOWHERE, float(self._control.state()["time"]), NO_TRIP)
 
-    def _search(self, begin: Array, target: Array, start: Array, direction: Array, length: float) -> float | None:
-        """Return how far from the start the probe trips at the fast feed, m; None where it does not."""
+    def _search(self, origin: Array, target: Array, start: Array, direction: Array, length: float) -> float | None:
+        """Return the distance from the start at which the probe trips at the fast feed, m; None without a trip."""
         for _ in range(1 + self._how.attempts):
             found = self._probe(target, self._how.search_feed)
             if found is None:
@@ -148,42 +148,43 @@ class Toucher:
             along = self._along(found, start, direction, length)
             if along >= self._how.free:
                 return along
-            self._control.move_to(begin.tolist(), self._how.approach_feed)  # a jolt at the start, and no contact
-        raise StuckError(f"the probe trips within {1e3 * self._how.free:g} mm of the start, where nothing is")
+            self._control.move_to(origin.tolist(), self._how.approach_feed)  # a false trip at the start
+        raise StuckError(f"the probe trips within {1e3 * self._how.free:g} mm of the start, where its path is free")
 
     def _slow(self, fast: float, start: Array, direction: Array, length: float) -> list[tuple[float, float]]:
-        """Return how far from the start the probe trips at the slow feed, m, and when; empty where it does not."""
+        """Return distance from the start (m) and time (s) of each slow trip; empty without a trip."""
         limit = start + min(fast + self._how.margin, length) * direction
         found: list[tuple[float, float]] = []
-        place = fast
+
+        distance = fast
         for _ in range(self._how.repeats):
-            back = start + max(0.0, place - self._how.back_off) * direction
+            back = start + max(0.0, distance - self._how.back_off) * direction
             self._control.move_to(back.tolist(), self._how.approach_feed)
             tripped = self._probe(limit, self._how.touch_feed)
             if tripped is None:
                 return []
-            place = self._along(tripped, start, direction, length)
-            found.append((place, float(tripped["time"])))
+            distance = self._along(tripped, start, direction, length)
+            found.append((distance, float(tripped["time"])))
         return found
 
     def _judged(self, fast: float, slow: Sequence[tuple[float, float]], start: Array, direction: Array) -> Contact:
         """Return the contact of slow touches, with the tip back at the start."""
-        places, times = np.array(slow).T
+        distances, times = np.array(slow).T
         self._control.move_to(start.tolist(), self._how.approach_feed)
         time = float(times.mean())
-        if np.ptp(places) > self._how.agreement or np.abs(places - fast).max() > self._how.margin:
+        if np.ptp(distances) > self._how.agreement or np.abs(distances - fast).max() > self._how.margin:
             return Contact(NOWHERE, time, DIFFERS)
-        x, y, z = (float(value) for value in start + places.mean() * direction)
+        x, y, z = (float(value) for value in start + distances.mean() * direction)
         return Contact((x, y, z), time)
 
     def _along(self, found: dict[str, Any], start: Array, direction: Array, length: float) -> float:
-        """Return how far along the way the probe tripped, m; refuse a position that is not on the way."""
+        """Return the distance of a trip along the path, m; refuse a position off the path."""
         offset = np.asarray(found["position"], dtype=float) - start
         along = float(offset @ direction)
         aside = float(np.linalg.norm(offset - along * direction))
         if not (aside <= self._how.margin and -self._how.margin <= along <= length + self._how.margin):
             raise InstrumentError(
-                f"expected the probe to trip on its way of {1e3 * length:.3f} mm; the controller states "
+                f"expected the probe to trip on its path of {1e3 * length:.3f} mm; the controller reports "
                 f"{1e3 * along:.3f} mm along it and {1e3 * aside:.3f} mm aside. Does it use machine coordinates?"
             )
         return along
@@ -197,7 +198,7 @@ class Toucher:
                 if _TRIPPED_BEFORE not in str(error):
                     raise
                 if attempt == self._how.attempts:
-                    raise StuckError(f"the probe is tripped before it moves, and stays so: {error}") from error
+                    raise StuckError(f"the probe is tripped before it moves, and remains so: {error}") from error
                 self._control.elapse(self._how.settling)
                 continue
             return found if found["tripped"] else None

@@ -1,4 +1,6 @@
-"""Transports of bytes: serial lines, TCP, buses, simulators, recordings. Only this package uses ``serial`` and ``socket``.
+"""Transports of bytes: serial lines, TCP, buses, simulators, recordings.
+
+Only this package uses ``serial`` and ``socket``.
 
 ``open_transport(url)`` returns a `Transport`:
 

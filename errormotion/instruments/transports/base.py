@@ -74,7 +74,8 @@ class Transport(ABC):
             except InstrumentTimeoutError:
                 received = f"{data[:64]!r}" if data else "nothing"
                 raise InstrumentTimeoutError(
-                    f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; received {received}"
+                    f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; "
+                    f"received {received}"
                 ) from None
         head, found, tail = data.partition(terminator)
         self._rest = tail + self._rest

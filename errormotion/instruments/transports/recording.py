@@ -11,8 +11,8 @@ A recording is a text file: a header line with the address, then one line per fr
 bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: changed bytes and
 missing or moved frames are detected.
 
-In playback each write must be the next recorded one, byte for byte; a frame that followed a write is returned only after
-that write; and at the end no frame may remain. Everything else is a `ReplayError`.
+In playback each write must be the next recorded one, byte for byte; a frame that followed a write is returned only
+after that write; and at the end no frame may remain. Everything else is a `ReplayError`.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
     ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of the further ones,
-    by name.
+    machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of the further
+    ones, by name.
     """
 
     simulated = True

@@ -1,8 +1,8 @@
 """Packets of an emScon server: little-endian structures, packed, over TCP port 700.
 
 Every packet starts with its size in bytes (i32, header included) and its type (u32). A command is the header, its
-number, and parameters; the answer repeats the number and adds a status, then values where the status is 0. Between the
-answers come packets that nobody requested: reflector positions, levels, status changes, errors such as a broken beam.
+number, and parameters; the answer repeats the number and adds a status, then values where the status is 0. Unsolicited
+packets arrive between the answers: reflector positions, levels, status changes, errors such as a broken beam.
 
 The layouts are those of the interface's C definitions, versions 3.6 and 3.8. ``long``, ``int`` and enumerations have
 four bytes; names are 32 characters of UTF-16. Results of measurements have a status behind the header and no number of
@@ -20,7 +20,7 @@ from typing import Any
 from errormotion.errors import ProtocolError
 
 HEADER = struct.Struct("<iI")
-MAX_PACKET_BYTES = 1 << 20  # bytes; 4 points a millisecond for 7 s
+MAX_PACKET_BYTES = 1 << 20  # 4 points per millisecond for 7 s
 NAME = "64s"
 
 # ---------------------------------------------------------------------- types of packets
@@ -48,7 +48,7 @@ METEO_OFF, METEO_READ, METEO_REFRACTION = 0, 1, 2
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and `struct` codes of the fields of a packet behind its header."""
+    """Names and `struct` codes of the fields of a packet after its header."""
 
     fields: tuple[tuple[str, str], ...]
 
@@ -214,31 +214,31 @@ def decode_header(data: bytes | bytearray) -> tuple[int, int]:
     Raises
     ------
     ProtocolError
-        This is no header: bytes were lost or added on the way.
+        Not a header: bytes were lost or added.
     """
     size, kind = HEADER.unpack(data)
     known = kind in RESULTS or kind in (COMMAND, ERROR, CHANGE) or kind in UNUSED_TYPES
     if not (HEADER.size + 4 <= size <= MAX_PACKET_BYTES and known):
         raise ProtocolError(
-            f"Expected the header of an emScon packet; found {data.hex(' ')}, that is {size} bytes of type {kind}. Is "
-            "it an emScon server that answers here?"
+            f"Expected the header of an emScon packet; found {data.hex(' ')}, {size} bytes of type {kind}. Check "
+            "that the address is that of an emScon server"
         )
     return size - HEADER.size, kind
 
 
 def decode_packet(kind: int, body: bytes) -> Packet:
-    """Return a packet from its type and what follows the header.
+    """Return a packet from its type and the bytes after its header.
 
     Raises
     ------
     ProtocolError
-        The size does not go with the type.
+        The size does not match the type.
     """
     try:
         return _decode(kind, body)
     except struct.error:
         raise ProtocolError(
-            f"An emScon packet of type {kind} is too short: {len(body) + HEADER.size} bytes came, {body[:16].hex(' ')}"
+            f"An emScon packet of type {kind} is too short: {len(body) + HEADER.size} bytes, {body[:16].hex(' ')}"
         ) from None
 
 
@@ -262,7 +262,7 @@ def _points(kind: int, body: bytes, start: int, count: int) -> Iterator[Mapping[
     size = layout.packed.size
     if not 0 <= count == (len(body) - start) // size:
         raise ProtocolError(
-            f"Expected a packet of {count} points with {size} bytes each; {len(body) - start} bytes came"
+            f"Expected a packet of {count} points with {size} bytes each; found {len(body) - start} bytes"
         )
     for place in range(start, start + count * size, size):
         yield layout.unpack(body, place)
@@ -272,26 +272,26 @@ def _points(kind: int, body: bytes, start: int, count: int) -> Iterator[Mapping[
 
 
 def decode_command(data: bytes) -> tuple[int, dict[str, Any]]:
-    """Return number and parameters of a whole command; of one that is not known here, no parameters.
+    """Return number and parameters of a complete command; no parameters for an unknown one.
 
     Raises
     ------
     ProtocolError
-        No command, or too short.
+        Not a command, or too short.
     """
     try:
         _, kind = HEADER.unpack_from(data)
         (number,) = struct.unpack_from("<I", data, HEADER.size)
         values = COMMANDS[number].request.unpack(data, HEADER.size + 4) if number in COMMANDS else {}
     except struct.error:
-        raise ProtocolError(f"This is no whole command: {data.hex(' ')}") from None
+        raise ProtocolError(f"Expected a complete command; found {data.hex(' ')}") from None
     if kind != COMMAND:
         raise ProtocolError(f"Expected a command, that is type {COMMAND}; found type {kind}")
     return number, values
 
 
 def encode_answer(number: int, status: int = 0, /, **values: Any) -> bytes:
-    """Return the answer to a command; a status other than 0 has no values behind it."""
+    """Return the answer to a command; with a status other than 0 it has no values."""
     body = struct.pack("<II", number, status)
     return _packet(
         COMMAND, body + (COMMANDS[number].answer.pack(values) if status == 0 and number in COMMANDS else b"")
@@ -304,7 +304,7 @@ def encode_error(number: int, status: int) -> bytes:
 
 
 def encode_change(change: int) -> bytes:
-    """Return the news of a status change."""
+    """Return the message of a status change."""
     return _packet(CHANGE, struct.pack("<I", change))
 
 

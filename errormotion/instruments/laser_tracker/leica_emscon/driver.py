@@ -22,7 +22,7 @@ from errormotion.plugins.readings import Environment, Measurement
 MILLIBAR = 100.0  # Pa
 METEO = {"manual": codec.METEO_OFF, "read": codec.METEO_READ, "refraction": codec.METEO_REFRACTION}
 MEASURING_TIMEOUT_FACTOR = 20.0
-"""Times the measuring time that a result may take beyond the time limit of an answer: the tracker repeats by itself."""
+"""Allowed duration of a measurement beyond the timeout, in measuring times: the tracker repeats measurements."""
 
 __all__ = ["Event", "LeicaEmScon"]
 
@@ -54,7 +54,7 @@ class LeicaEmScon(Driver):
     _connection: Link | None = None
     _streaming = False
     _refraction = math.nan
-    _set_anew = 0
+    _resets = 0
     _last: tuple[float, float, float] | None = None
 
     # ------------------------------------------------------------------ identity and state
@@ -66,23 +66,23 @@ class LeicaEmScon(Driver):
 
     @property
     def distance_is_displacement(self) -> bool:
-        """Whether distances count from where the beam was last set, and not from the tracker's centre.
+        """Whether distances count from an unknown dead path, and not from the tracker's centre.
 
-        Of an interferometer all readings of one `dead_path` share an unknown constant; only their differences are
-        as good as its ``noise``. An AT4xx reports absolute distances. Multilateration takes ``Measurement.distance`` of
-        either, with the dead path of each station unknown.
+        Of an interferometer all readings of one `dead_path` share an unknown constant; only their differences
+        have the uncertainty ``noise``. An AT4xx reports absolute distances. Multilateration takes
+        ``Measurement.distance`` of either, with the dead path of each station unknown.
         """
         return self.settings.tracker != "AT4xx"
 
     @property
     def beam_broken(self) -> bool:
-        """Whether the beam has lost its reflector, as far as the tracker has reported by now."""
+        """Whether the beam has lost its reflector, as far as the tracker has reported."""
         return self._link.broken
 
     @property
     def dead_path(self) -> int:
-        """How often the distance was lost or set again since opening; always 0 where distances are absolute."""
-        return self._link.breaks + self._set_anew if self.distance_is_displacement else 0
+        """Number of times the distance was lost or set again since opening; 0 where distances are absolute."""
+        return self._link.breaks + self._resets if self.distance_is_displacement else 0
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -108,11 +108,11 @@ class LeicaEmScon(Driver):
         )
 
     def environment(self) -> Environment:
-        """Return the air that the tracker reckons with: of its weather station, or as set."""
+        """Return the air that the tracker uses: of its weather station, or as set."""
         return _environment(self._query(codec.GET_ENVIRONMENT).values)
 
     def set_environment(self, environment: Environment) -> None:
-        """Set the state of the air; takes effect where no weather station overrules it."""
+        """Set the state of the air; without effect where the weather station sets it."""
         self._query(
             codec.SET_ENVIRONMENT,
             temperature=environment.temperature,
@@ -133,7 +133,7 @@ class LeicaEmScon(Driver):
         self._link.stale_refraction = True
 
     def reflectors(self) -> tuple[Reflector, ...]:
-        """Return the reflectors that the tracker knows."""
+        """Return the reflectors that are defined in the tracker."""
         found = self._link.query_all(codec.GET_REFLECTORS, total=lambda first: int(first.values["total"]))
         return tuple(
             Reflector(
@@ -147,35 +147,35 @@ class LeicaEmScon(Driver):
         )
 
     def set_reflector(self, name: str) -> None:
-        """Choose a reflector by its name; InstrumentError names those that there are."""
+        """Choose a reflector by its name; InstrumentError lists the defined ones."""
         known = {each.name: each.number for each in self.reflectors()}
         if name not in known:
-            raise InstrumentError(f"{self.address} knows the reflectors {', '.join(known) or 'none'}; found '{name}'")
+            raise InstrumentError(f"{self.address} has the reflectors {', '.join(known) or 'none'}; found '{name}'")
         self._query(codec.SET_REFLECTOR, number=known[name])
 
     def direction(self) -> tuple[float, float]:
-        """Return where the tracker points: azimuth and zenith angle, rad."""
+        """Return the direction of the beam: azimuth and zenith angle, rad."""
         found = self._query(codec.GET_DIRECTION).values
         return float(found["azimuth"]), float(found["zenith"])
 
     # ------------------------------------------------------------------ moving
 
     def initialise(self) -> None:
-        """Let the tracker initialise: it moves, and takes a minute."""
+        """Initialise the tracker: it moves, for about a minute."""
         self._query(codec.INITIALIZE, limit=self.settings.initialise_timeout)
 
     def home(self, *, clockwise: bool = True) -> None:
-        """Go to the nest at the tracker and take up the reflector there: the interferometer has its distance again.
+        """Point at the nest of the tracker and lock on to its reflector, which sets the interferometer's distance.
 
         Raises
         ------
         BeamBrokenError
-            No reflector is there.
+            No reflector in the nest.
         """
         self._move(codec.GO_BIRD_BATH2, clockwise=int(clockwise))
 
     def go_to(self, target: tuple[float, float, float]) -> None:
-        """Point at a position and take up the reflector near it; the absolute distance meter sets the distance.
+        """Point at a position and lock on to the reflector near it; the absolute distance meter sets the distance.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class LeicaEmScon(Driver):
         self._move(codec.GO_POSITION, val1=azimuth, val2=zenith, val3=distance, use_adm=1)
 
     def find_reflector(self, distance: float) -> None:
-        """Look for a reflector around the present direction.
+        """Search for a reflector around the present direction.
 
         Raises
         ------
@@ -205,42 +205,43 @@ class LeicaEmScon(Driver):
         except RefusedError as error:
             if error.status not in statuses.NO_TARGET and not self._link.broken:
                 raise
-            raise BeamBrokenError(f"{error}; is the reflector where it should be, and nothing in between?") from error
+            raise BeamBrokenError(f"{error}; check the position of the reflector and the line of sight") from error
         self._link.broken = False
-        self._set_anew += 1
+        self._resets += 1
 
     # ------------------------------------------------------------------ measuring
 
     def measure(self, target: tuple[float, float, float] | None = None) -> Measurement:
         """Measure a reflector.
 
-        A tracker with an interferometer that follows its reflector to the target keeps its count: it goes there only
-        where it does not point there already, and `dead_path` then goes up. An AT4xx goes in any case. A broken beam
-        is no error here: the reflector is looked for ``reacquire`` times, and where that fails the measurement states
-        why it is not valid.
+        A tracker with an interferometer that follows its reflector to the target keeps its count: it is moved only
+        if it does not already point to the target, and `dead_path` then increases. An AT4xx is always moved. A broken
+        beam is not an error: the reflector is searched ``reacquire`` times, and where that fails the measurement is
+        not valid and states the reason.
 
         Parameters
         ----------
         target : (3,), optional
-            Roughly where it is, m, in the tracker's frame; default: where the beam is now.
+            Approximate position, m, in the tracker's frame; default: the present direction of the beam.
 
         Raises
         ------
         InstrumentError
-            The tracker refuses for another reason, does not answer or stays busy, or the connection is gone.
+            The tracker refuses for another reason, does not answer or remains busy, or the connection is lost.
         """
         self._not_streaming()
         goal = None if target is None else polar(target)
-        goes_itself = goal is not None and self.settings.tracker == "AT4xx"
+
+        always_moves = goal is not None and self.settings.tracker == "AT4xx"
         found = Measurement(reason="beam broken", dead_path=self.dead_path)
         for attempt in range(self.settings.reacquire + 1):
             try:
-                if self._link.broken and not goes_itself:
+                if self._link.broken and not always_moves:
                     if attempt == self.settings.reacquire == 0:
                         break
                     self._reacquire(goal)
-                found = self._measure(goal if goes_itself else None)
-                if found.valid and goal is not None and not goes_itself and not self._near(found, goal):
+                found = self._measure(goal if always_moves else None)
+                if found.valid and goal is not None and not always_moves and not self._near(found, goal):
                     self._go(goal)
                     found = self._measure(None)
             except BeamBrokenError as error:
@@ -250,7 +251,7 @@ class LeicaEmScon(Driver):
         return found
 
     def read(self) -> float:
-        """Return the distance now, m; NaN where the beam is broken and stays so."""
+        """Return the distance now, m; NaN where the beam stays broken."""
         return self.measure().distance
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
@@ -279,8 +280,8 @@ class LeicaEmScon(Driver):
         self._not_streaming()
         if self.settings.tracker == "AT4xx":
             raise InstrumentError(
-                "An AT4xx measures point by point, it has no stream of distances; use measure(), or state "
-                'tracker = "AT901" where it is another tracker'
+                "An AT4xx measures point by point and has no stream of distances; use measure(), or set "
+                'tracker = "AT901" for another tracker'
             )
         if self._link.broken:
             self._reacquire()
@@ -309,9 +310,9 @@ class LeicaEmScon(Driver):
         self._query(codec.SET_MODE, mode=codec.STATIONARY)
 
     def _reacquire(self, goal: tuple[float, float, float] | None = None) -> None:
-        """Find the reflector again: where it should be, where it was last, or around where the beam points."""
-        if (place := goal or self._last) is not None:
-            self._go(place)
+        """Search for the reflector: at the goal, at its last position, or around the present direction."""
+        if (position := goal or self._last) is not None:
+            self._go(position)
         else:
             self.find_reflector(0.0)
 
@@ -384,15 +385,15 @@ class LeicaEmScon(Driver):
 
     def _not_streaming(self) -> None:
         if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; leave the stream first")
+            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
 
     def configure(self, settings: EmSconSettings) -> None:
-        """Set the server up: units, coordinates, weather station, measuring time, search radius, reflector.
+        """Configure the server: units, coordinates, weather station, measuring time, search radius, reflector.
 
         Raises
         ------
         InstrumentError
-            The tracker refuses, or does not know the reflector.
+            The tracker refuses, or the reflector is not defined.
         """
         self._not_streaming()
         self._query(
@@ -429,7 +430,7 @@ class LeicaEmScon(Driver):
         )
 
     def _start_session(self) -> None:
-        self._last, self._set_anew = None, 0
+        self._last, self._resets = None, 0
         self._streaming = False
         self._connection = Link(self.transport, self.settings.timeout, self.settings.busy_timeout)
         self.configure(self.settings)

@@ -1,4 +1,4 @@
-"""Asking an emScon server: commands and their answers, with everything that comes unrequested in between."""
+"""Connection to an emScon server: commands and their answers, with the unsolicited messages between them."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import (
 from errormotion.instruments.transports import Transport
 
 BUSY_INTERVAL = 0.1  # s between two requests to a busy server
-MAX_EVENTS = 1000
-MAX_EARLY_PACKETS = 100
+MAX_EVENTS = 1000  # largest number of stored events
+MAX_EARLY_PACKETS = 100  # largest number of stored packets of points
 
 
 class RefusedError(InstrumentError):
-    """The server refuses a command; ``status`` is its number for why."""
+    """The server refuses a command; ``status`` is the number of the reason."""
 
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
@@ -48,9 +48,9 @@ class Event:
     kind : str
         ``error`` or ``change``.
     number : int
-        Its number for it.
+        Number of the message.
     text : str
-        What it means.
+        Meaning of the number.
     host_time : float
         ``time.monotonic()`` when it was read, s.
     """
@@ -68,18 +68,18 @@ class Link:
     ----------
     transport : Transport
     timeout, busy_timeout : float
-        Time limits of an answer, and of a server that states that it is busy, s.
+        Time limit of an answer, and of retries with a busy server, s.
 
     Attributes
     ----------
     events : deque of Event
         The last messages that were not requested.
     early : deque of Packet
-        Points of a continuous measurement that came before the answer to the command that starts it.
+        Points of a continuous measurement received before the answer to the command that starts it.
     broken : bool
         Whether the beam has lost its reflector, as far as the server has reported.
     breaks : int
-        How often it has.
+        Number of broken beams.
     stale_refraction : bool
         Whether the refraction index may have changed since it was last read.
     """
@@ -97,14 +97,14 @@ class Link:
         self.stale_refraction = True
 
     def query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
-        """Send a command and return its answer; a busy server is queried again.
+        """Send a command and return its answer; retry while the server is busy.
 
         Raises
         ------
         RefusedError
             The server refuses.
         InstrumentTimeoutError, ProtocolError
-            No answer in time, or none that can be read: the connection has to be opened again.
+            No answer in time, or an invalid one: the connection must be opened again.
         """
         return next(self.query_all(number, limit=limit, **values))
 
@@ -119,7 +119,7 @@ class Link:
     ) -> Iterator[Packet]:
         """Send a command and yield its answers; ``total(first)`` states how many there are, see `ask`."""
         allowed = self._timeout if limit is None else limit
-        patience = time.monotonic() + self._busy_timeout
+        end = time.monotonic() + self._busy_timeout
         while True:
             self._check()
             self._transport.write(encode_command(number, **values))
@@ -128,8 +128,8 @@ class Link:
                 raise self._refusal(number, packet.status)
             if packet.status == statuses.OK:
                 break
-            if time.monotonic() >= patience:
-                raise self._refusal(number, packet.status, f", for {self._busy_timeout:g} s by now")
+            if time.monotonic() >= end:
+                raise self._refusal(number, packet.status, f", for {self._busy_timeout:g} s")
             time.sleep(BUSY_INTERVAL)
         yield packet
         for _ in range(total(packet) - 1):
@@ -141,18 +141,18 @@ class Link:
         )
 
     def await_packet(self, wanted: Callable[[Packet], bool], limit: float, what: str) -> Packet:
-        """Return the next packet that is wanted; take note of the others.
+        """Return the next packet that fulfils ``wanted``; record the others.
 
         Raises
         ------
         InstrumentTimeoutError
-            It does not come within ``limit`` s. As it may come later, the connection can no longer be used.
+            No such packet within ``limit`` s. As it may arrive later, the connection can no longer be used.
         """
         end = time.monotonic() + limit
         while True:
             packet = self.next_packet(max(end - time.monotonic(), 0.0))
             if packet is None:
-                self._lost = f"expected an answer to {what} within {limit:g} s; none came"
+                self._lost = f"no answer to {what} within {limit:g} s"
                 raise InstrumentTimeoutError(f"{self._transport.url}: {self._lost}")
             if wanted(packet):
                 return packet
@@ -160,12 +160,12 @@ class Link:
                 self.early.append(packet)
 
     def next_packet(self, limit: float) -> Packet | None:
-        """Return the next packet, whatever it is, noted; None where none comes within ``limit`` s.
+        """Return the next packet of any type; None without one within ``limit`` s.
 
         Raises
         ------
         ProtocolError
-            What comes is no packet; the connection can no longer be used.
+            The bytes are not a packet; the connection can no longer be used.
         """
         self._check()
         end = time.monotonic() + limit
@@ -182,7 +182,7 @@ class Link:
         return packet
 
     def _take(self) -> Packet | None:
-        """Return the first whole packet of what has come."""
+        """Return the first complete packet of the received bytes."""
         if len(self._waiting) < HEADER.size:
             return None
         size, kind = decode_header(self._waiting[: HEADER.size])
@@ -196,8 +196,8 @@ class Link:
     def _check(self) -> None:
         if self._lost:
             raise InstrumentError(
-                f"The connection to {self._transport.url} is out of step since this: {self._lost}. Close it and open "
-                "it again"
+                f"The connection to {self._transport.url} cannot be used after this error: {self._lost}. Close it and "
+                "open it again"
             )
 
     def _note(self, packet: Packet) -> None:
@@ -210,7 +210,7 @@ class Link:
                 self.stale_refraction = True
             self._remember("change", packet.status, statuses.CHANGES.get(packet.status, "unknown change"))
         elif packet.kind == ERROR:
-            if packet.command == UNKNOWN:  # about no command: the tracker itself has a problem
+            if packet.command == UNKNOWN:  # not related to a command: an error of the tracker itself
                 self._break()
             self._remember("error", packet.status, statuses.result_text(packet.status))
         elif packet.kind == REFLECTOR:

@@ -18,33 +18,39 @@ class EmSconSettings(PluginSettings):
         description="AT901: LT or AT901, with an interferometer; AT4xx: absolute distances, point by point",
     )
     reflector: str | None = Field(
-        default=None, description="name of the reflector, as the tracker knows it; the one that is set where not given"
+        default=None, description="name of the reflector at the tracker; default: the one that is set"
     )
     initialise: Literal["if_needed", "always", "never"] = Field(
-        default="if_needed", description="whether the tracker initialises when it is opened: it moves, for a minute"
+        default="if_needed", description="whether the tracker is initialised when it is opened: it moves, for a minute"
     )
     meteo: Literal["refraction", "read", "manual"] = Field(
         default="refraction",
         description="weather station: sets the refraction index, is read only, or is absent and the values are given",
     )
-    temperature: Temperature = Field(default=20.0, description="of the air, with meteo = manual", ge=0, le=50)
-    pressure: float = Field(default=101325.0, description="of the air in Pa, with meteo = manual", ge=5e4, le=1.1e5)
-    humidity: float = Field(default=50.0, description="relative, in %, with meteo = manual", ge=0, le=100)
+    temperature: Temperature = Field(
+        default=20.0, description="temperature of the air, with meteo = manual", ge=0, le=50
+    )
+    pressure: float = Field(
+        default=101325.0, description="pressure of the air in Pa, with meteo = manual", ge=5e4, le=1.1e5
+    )
+    humidity: float = Field(default=50.0, description="relative humidity in %, with meteo = manual", ge=0, le=100)
     refraction_index: float | None = Field(
         default=None,
-        description="by which the tracker divides the optical path; its own where not given. 1: distances in vacuum",
+        description="refraction index that the tracker uses; default: its own. 1: distances in vacuum",
         ge=1.0,
         le=1.0005,
     )
-    measuring_time: Time = Field(default=0.5, description="of a single measurement", ge=0.1, le=100.0)
+    measuring_time: Time = Field(default=0.5, description="duration of a single measurement", ge=0.1, le=100.0)
     rate: Frequency = Field(default=100.0, description="points per second of a stream", gt=0, le=1000.0)
-    search_radius: Length = Field(default=0.05, description="around a target, in which a reflector is looked for", gt=0)
-    reacquire: int = Field(default=1, description="times that a reflector is looked for after a broken beam", ge=0)
+    search_radius: Length = Field(
+        default=0.05, description="radius of the search for a reflector around a target", gt=0
+    )
+    reacquire: int = Field(default=1, description="number of searches for the reflector after a broken beam", ge=0)
     noise: Length = Field(default=0.5e-6, description="standard deviation of a single distance", ge=0)
     timeout: Time = Field(default=3.0, description="time limit of an answer", gt=0)
     motion_timeout: Time = Field(default=30.0, description="time limit of a motion or a search", gt=0)
     initialise_timeout: Time = Field(default=180.0, description="time limit of the initialisation", gt=0)
-    busy_timeout: Time = Field(default=5.0, description="how long a busy tracker is queried again", ge=0)
+    busy_timeout: Time = Field(default=5.0, description="time limit of retries with a busy tracker", ge=0)
 
     @property
     def interval(self) -> int:

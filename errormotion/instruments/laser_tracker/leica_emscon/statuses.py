@@ -14,7 +14,7 @@ NOT_READY, NO_RESULT, SYSTEM_NOT_READY = 10004, 10009, 10014
 
 _PARAMETER = {
     **{number: f"wrong parameter {number - 3}" for number in range(4, 11)},
-    **{11 + 2 * k: f"parameter {k + 1} outside its range, yet accepted" for k in range(6)},
+    **{11 + 2 * k: f"parameter {k + 1} outside its range, but accepted" for k in range(6)},
     **{12 + 2 * k: f"parameter {k + 1} outside its range" for k in range(6)},
     **{number: f"wrong parameter {number - 39}" for number in range(47, 56)},
 }
@@ -22,7 +22,7 @@ _PARAMETER = {
 RESULTS: Mapping[int, str] = {
     **_PARAMETER,
     BUSY: "the server is busy",
-    NOT_IMPLEMENTED: "this tracker does not know the command",
+    NOT_IMPLEMENTED: "the command is not implemented in this tracker",
     3: "wrong parameter",
     23: "wrong current reflector",
     26: "no tracker processor found",
@@ -32,7 +32,7 @@ RESULTS: Mapping[int, str] = {
     30: "no absolute distance meter",
     31: "no level",
     32: "wrong firmware of the tracker processor",
-    35: "the command does not go with the present mode",
+    35: "the command is not possible in the present mode",
     36: "an unknown error",
     NO_DISTANCE: "no distance is set: the interferometer has lost its count",
     38: "no tracker is connected",
@@ -49,7 +49,7 @@ RESULTS: Mapping[int, str] = {
     96: "no humidity from the weather station",
     98: "invalid input",
     10002: "no valid compensation of the distance meter",
-    10003: "the pressure sensor has a problem",
+    10003: "fault of the pressure sensor",
     NOT_READY: "not ready to measure: no reflector in the beam, or not initialised",
     10005: "the distance meter is starting",
     10007: "no target recognition",

@@ -1,4 +1,4 @@
-"""The points of a continuous measurement, put where the tracker's clock states that they belong."""
+"""The points of a continuous measurement, ordered by the tracker's clock."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBroke
 from errormotion.plugins import Samples
 
 BLOCK_SECONDS = 0.5
-MAX_GAP = 600.0  # s
+MAX_GAP = 600.0  # s between two points
 LOST, BROKEN = "lost", "beam broken"
 _WARNINGS = frozenset({0, 1})
 
 
 def points(link: Link, settings: EmSconSettings, block: int | None = None) -> Iterator[Samples]:
-    """Yield blocks of distances from the packets that come on a link.
+    """Yield blocks of distances from the packets of a link.
 
     A point's index is its time since the first one over the interval that was set. Indices without a point are NaN,
     ``lost``; or ``beam broken`` where the tracker has reported so since the last point.
@@ -31,15 +31,15 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
     Raises
     ------
     InstrumentTimeoutError
-        Silence for the settings' ``timeout``.
+        No data for the settings' ``timeout``.
     BeamBrokenError
         The same after a broken beam.
     ProtocolError
-        The tracker's clock goes back or leaps.
+        The tracker's clock decreases or jumps.
     """
     size = block or max(1, round(BLOCK_SECONDS * settings.rate))
     interval = 1000 * settings.interval  # us
-    waiting: deque[tuple[float, str]] = deque()  # value, and why it is none
+    waiting: deque[tuple[float, str]] = deque()  # value, and the reason where it is missing
     start: int | None = None
     expected = first = 0
     breaks = link.breaks
@@ -47,14 +47,14 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
         for point in _next_points(link, settings.timeout):
             clock = 1_000_000 * int(point["seconds"]) + int(point["microseconds"])
             start = clock if start is None else start
-            place = round((clock - start) / interval)
-            if not 0 <= place - expected <= MAX_GAP * settings.rate:
+            index = round((clock - start) / interval)
+            if not 0 <= index - expected <= MAX_GAP * settings.rate:
                 raise ProtocolError(
-                    f"The tracker's clock goes from point {expected - 1} to point {place}: expected one after the "
-                    f"other, {settings.interval} ms apart. Is another client measuring?"
+                    f"The tracker's clock jumps from point {expected - 1} to point {index}: expected steps of one, "
+                    f"{settings.interval} ms apart. Is another client measuring?"
                 )
-            waiting.extend([(np.nan, BROKEN if link.breaks > breaks else LOST)] * (place - expected))
-            expected, breaks = place + 1, link.breaks
+            waiting.extend([(np.nan, BROKEN if link.breaks > breaks else LOST)] * (index - expected))
+            expected, breaks = index + 1, link.breaks
             status = int(point["status"])
             if status in _WARNINGS:
                 waiting.append((float(point["val3"]), ""))
@@ -76,5 +76,5 @@ def _next_points(link: Link, timeout: float) -> Sequence[Mapping[str, Any]]:
         if packet.kind in codec.POINTS:
             return packet.points
     if link.broken:
-        raise BeamBrokenError(f"The beam is broken, and stayed so for {timeout:g} s")
-    raise InstrumentTimeoutError(f"Expected points of a continuous measurement; none came for {timeout:g} s")
+        raise BeamBrokenError(f"The beam has been broken for {timeout:g} s")
+    raise InstrumentTimeoutError(f"No points of a continuous measurement for {timeout:g} s")

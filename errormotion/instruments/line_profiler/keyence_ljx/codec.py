@@ -49,7 +49,7 @@ RETURN_CODES: Mapping[int, str] = {  # (m)
     0xA0: "no connection for the stream",
     0xA1: "the stream is running already, or was not prepared",
     0xA3: "another start code was expected",
-    0xA4: "the profiles to be sent were deleted meanwhile",
+    0xA4: "the profiles to be sent have been deleted",
 }
 
 
@@ -73,7 +73,7 @@ def parse_request(frame: bytes) -> tuple[int, bytes, str]:
     length, variant, _, size = struct.unpack_from("<I4sII", frame)
     names = [name for name, number in GENERATIONS.items() if variant == bytes((number, 0, 0xF0, 0))]
     if not names or length + 4 != len(frame) or size != len(frame) - REQUEST_HEAD:
-        raise ProtocolError(f"This is no request: {frame[:32].hex(' ')}")
+        raise ProtocolError(f"Expected a request; found {frame[:32].hex(' ')}")
     return frame[REQUEST_HEAD], frame[REQUEST_HEAD + 4 :], names[0]
 
 
@@ -91,7 +91,7 @@ class Reply:
             return struct.unpack_from("<" + layout, self.data, place)
         except struct.error:
             raise ProtocolError(
-                f"Expected a reply with {place + struct.calcsize('<' + layout)} bytes of data; {len(self.data)} came"
+                f"Expected a reply with {place + struct.calcsize('<' + layout)} bytes of data; found {len(self.data)}"
             ) from None
 
 
@@ -108,7 +108,7 @@ def reply_length(head: bytes) -> int:
 def parse_reply(frame: bytes) -> Reply:
     """Return a reply taken apart; ProtocolError where its length is wrong."""
     if len(frame) < REPLY_HEAD or reply_length(frame[:4]) != len(frame):
-        raise ProtocolError(f"This is no reply: {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")
+        raise ProtocolError(f"Expected a reply; found {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")
     return Reply(frame[RETURN_CODE], frame[PROGRAM], frame[REPLY_HEAD:])
 
 
@@ -161,7 +161,7 @@ HEADER_WORDS = 6
 TRIGGER_WORD, ENCODER_WORD = 1, 2
 INTENSITY = 0x40  # bit of the kind
 HEIGHT_BITS, INTENSITY_BITS, WORD_BITS = 20, 10, 32
-SMALLEST_HEIGHT = -(1 << 19) + 4  # below lie the codes of points without height
+SMALLEST_HEIGHT = -(1 << 19) + 4  # smaller numbers are codes of points without height
 MAX_POINTS = 3200
 
 NOTIFY = 0xFFFFFFFF

@@ -1,4 +1,4 @@
-"""A stream's decoder: keeps what a split left over, checks, follows the trigger count, fills gaps."""
+"""Decoder of a stream: joins split data, checks profiles, follows the trigger count, fills gaps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from errormotion.instruments.streaming import Chunk
 Array = np.ndarray[Any, Any]
 WORD = 4
 UNSYNCHRONISED_PROFILES = 8
-"""Profiles' worth of bytes without a sound one among them after which the stream is given up."""
+"""Amount of data without a valid profile after which the stream ends with an error, in profiles."""
 
 
 class StreamEndedError(InstrumentError):
@@ -33,23 +33,23 @@ class StreamEndedError(InstrumentError):
 class StreamDecoder:
     """Turns the bytes of one stream, however they are split, into profiles without gaps, still packed.
 
-    A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. Which it is:
-    lost where the trigger count leaps between sound profiles, garbled where damaged bytes lie between them. After
+    A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. They are
+    LOST where the trigger count jumps between valid profiles, GARBLED where damaged bytes are between them. After
     damaged bytes the next position is searched at which checksum and trigger count are right.
 
     Parameters
     ----------
     layout : StreamLayout
     late_notice : bool
-        The notice that ends the stream before this one has not arrived. One notice ahead of the first profile is then
-        taken as that one and ignored.
+        The notice of the end of the previous stream has not arrived. One notice ahead of the first profile is then
+        ignored.
     """
 
     def __init__(self, layout: StreamLayout, *, late_notice: bool = False) -> None:
         self._size = layout.words
         self._late_notice = late_notice
         self._rest = b""
-        self._trigger = -1  # count to be expected next; -1: any
+        self._trigger = -1  # expected next count; -1: any
         self._searching = False
         self.first_trigger = 0
         self.stray_bytes = 0
@@ -57,8 +57,8 @@ class StreamDecoder:
     def __call__(self, data: bytes) -> Chunk:
         """Return the profiles that the next bytes complete; the chunk's ``end`` states why nothing follows.
 
-        Its ``end`` is a ProtocolError where no profile is found in many bytes, or the trigger count is no
-        continuation; a StreamEndedError where the profiler ends the stream.
+        Its ``end`` is a ProtocolError where many bytes contain no profile, or the trigger count is
+        inconsistent; a StreamEndedError where the profiler ends the stream.
         """
         self._rest += data
         values: list[Array] = []
@@ -68,8 +68,8 @@ class StreamDecoder:
             if self._searching and not self._found():
                 if len(self._rest) > UNSYNCHRONISED_PROFILES * self._size * WORD:
                     end = ProtocolError(
-                        f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: did its "
-                        "settings change while it streams? Start the stream again"
+                        f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: were "
+                        "settings changed during the stream? Start the stream again"
                     )
                 break
             words = np.frombuffer(self._rest, dtype="<u4", count=len(self._rest) // WORD)
@@ -83,7 +83,7 @@ class StreamDecoder:
             elif why == kernels.LEAP:
                 count = int(words[n * self._size + TRIGGER_WORD])
                 end = ProtocolError(
-                    f"The trigger count goes from {self._trigger - 1} to {count}: was it reset, or the profiler "
+                    f"The trigger count jumps from {self._trigger - 1} to {count}: was it reset, or the profiler "
                     "restarted? Start the stream again"
                 )
             if why == kernels.NOTICE:
@@ -95,7 +95,7 @@ class StreamDecoder:
         return self._chunk(values, reasons, end)
 
     def _found(self) -> bool:
-        """Go on to the next sound profile; False where there is none yet."""
+        """Skip to the next valid profile; False where there is none yet."""
         places = []
         for shift in range(WORD):
             rest = self._rest[shift:]
@@ -149,7 +149,7 @@ class HeightDecoder:
 
     def __init__(self, layout: StreamLayout) -> None:
         self._layout = layout
-        self._encoder: int | None = None  # the last one, its overflow undone
+        self._encoder: int | None = None  # the last one, corrected for overflow
 
     def heights(self, profiles: Array, reasons: Array, heights: Array, counts: Array) -> None:
         """Unpack the heights (m) of profiles into (n, point); ``counts`` by `codec.REASONS` grow."""
@@ -161,9 +161,9 @@ class HeightDecoder:
         kernels.unpack_intensities(profiles, first, reasons, intensities)
 
     def encoder(self, readings: Array, reasons: Array) -> Array:
-        """Return encoder counts of the next profiles (n,), float64, with the overflow of their 32 bits undone.
+        """Return encoder counts of the next profiles (n,), float64, corrected for the overflow of their 32 bits.
 
-        NaN where the profile was lost. Between two profiles that came, the encoder must have moved by less than half
+        NaN where the profile was lost. Between two received profiles the encoder must move by less than half
         of its 2**32.
         """
         there = reasons == 0
@@ -177,7 +177,7 @@ class HeightDecoder:
         return counts
 
     def warm_up(self) -> None:
-        """Compile everything now, so that the first profiles find it ready."""
+        """Compile all loops before the first profiles arrive."""
         blank = bytes(4 * self._layout.words)  # its checksum is right
         trial = StreamDecoder(self._layout)
         chunk = trial(blank + notice(STOPPED))

@@ -39,7 +39,7 @@ SMALLEST_QUEUE = 64
 BATCH_PROFILES = 64
 """Profiles unpacked at once: their packed form stays in the processor's cache."""
 QUIET_INTERVAL = 0.3
-"""Silence after which a stopped stream is taken as ended, where no notice has come, s."""
+"""Time without data after which a stopped stream has ended, where no notice was received, s."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ class KeyenceLJX(Driver):
     # ------------------------------------------------------------------ commands
 
     def identify(self) -> Identity:
-        """Query the controller for the models and serial numbers of itself and its head."""
+        """Return the models and serial numbers of the controller and its head."""
         units = codec.parse_description(self.command(codec.DESCRIBE))
         if not units:
-            raise InstrumentError(f"The controller at {self.address} names no unit, not even itself")
+            raise InstrumentError(f"Expected the description of the controller at {self.address}; found none")
         model, serial = zip(*units, strict=True)
         return Identity(
             manufacturer="Keyence",
@@ -146,7 +146,7 @@ class KeyenceLJX(Driver):
         return {name: value * TEMPERATURE for name, value in zip(("sensor", "processor", "case"), values, strict=True)}
 
     def errors(self) -> list[int]:
-        """Request the codes of the errors that it shows."""
+        """Request the codes of the displayed errors."""
         return codec.parse_errors(self.command(codec.GET_ERROR))
 
     def clear_error(self, code: int) -> None:
@@ -163,15 +163,15 @@ class KeyenceLJX(Driver):
         Raises
         ------
         InstrumentError
-            The profiler refuses; an earlier reply went wrong, so that this one could be its.
+            The profiler refuses, or an earlier reply failed, so that replies cannot be assigned.
         InstrumentTimeoutError
             It does not answer.
         ProtocolError
-            What came is no reply.
+            The bytes are not a reply.
         """
         transport = self.transport
         if self._lost is not None:
-            raise InstrumentError(f"{self.name} is lost ({self._lost}); close and open it again")
+            raise InstrumentError(f"The connection to {self.name} is lost ({self._lost}); close and open it again")
         try:
             transport.write(codec.request(opcode, arguments, generation=self.settings.generation))
             head = transport.read_exactly(4, self.settings.timeout)
@@ -189,7 +189,7 @@ class KeyenceLJX(Driver):
     def read(self) -> np.ndarray[Any, Any]:
         """Take one profile and return its heights, m, (point,); NaN where there is none.
 
-        A profiler that waits for its encoder is triggered by command; one that runs freely may refuse that.
+        A profiler that waits for its encoder is triggered by command; a free-running one may refuse it.
 
         Raises
         ------
@@ -201,12 +201,12 @@ class KeyenceLJX(Driver):
             with closing(self._stream(1, lambda: refused.extend(self._refusals()))) as stream:
                 return np.asarray(next(stream).heights[0])
         except InstrumentTimeoutError as error:
-            if self._lost is not None:  # it answers no command either
+            if self._lost is not None:  # it does not answer commands either
                 raise
             raise InstrumentTimeoutError(self._untriggered(refused)) from error
 
     def _refusals(self) -> list[InstrumentError]:
-        """Trigger one profile; return why that is refused."""
+        """Trigger one profile; return the refusal, if any."""
         try:
             self.trigger()
         except InstrumentError as error:
@@ -218,18 +218,20 @@ class KeyenceLJX(Driver):
     def _untriggered(self, refused: list[InstrumentError]) -> str:
         try:
             counts = self.counts()
-            counted = f" (it has counted {counts.trigger} triggers, its encoder is at {counts.encoder})"
+            counted = f" (trigger count {counts.trigger}, encoder {counts.encoder})"
         except InstrumentError:
             counted = ""
-        by_command = f"the one by command was refused: {refused[0]}" if refused else "one by command brought none"
+        by_command = (
+            f"the trigger by command was refused: {refused[0]}" if refused else "a trigger by command had no effect"
+        )
         return (
-            f"{self.name}: expected a profile within {self.settings.timeout:g} s, none came: the profiler waits for "
-            f"its trigger{counted}, and {by_command}. Move the axis whose encoder triggers it, or have its program "
-            "take profiles continuously; check that its laser is on and that it measures."
+            f"{self.name}: no profile within {self.settings.timeout:g} s: the profiler waits for its trigger{counted}, "
+            f"and {by_command}. Move the axis whose encoder triggers it, or set its program to continuous measurement; "
+            "check that its laser is on."
         )
 
     def stream(self, block: int | None = None) -> Iterator[Profiles]:
-        """Yield blocks of profiles until the caller stops; leaving the loop stops the stream.
+        """Yield blocks of profiles until the caller stops; the end of the loop stops the stream.
 
         Parameters
         ----------
@@ -246,14 +248,14 @@ class KeyenceLJX(Driver):
         InstrumentTimeoutError
             No answer within the time limit.
         ProtocolError
-            No profile can be found in what comes, or the trigger count makes no sense.
+            No profile in the received bytes, or an inconsistent trigger count.
         InstrumentError
             The profiler ends the stream.
         """
         yield from self._stream(block)
 
-    def _stream(self, block: int | None, begun: Callable[[], None] | None = None) -> Generator[Profiles]:
-        """Yield blocks as `stream`; ``begun`` is called once the profiler streams."""
+    def _stream(self, block: int | None, on_start: Callable[[], None] | None = None) -> Generator[Profiles]:
+        """Yield blocks as `stream`; ``on_start`` is called once the profiler streams."""
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder, StreamDecoder
         from errormotion.instruments.streaming import Reader
 
@@ -268,12 +270,12 @@ class KeyenceLJX(Driver):
         self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)
         try:
             self.command(codec.START_STREAM, struct.pack("<Ii", codec.PREPARE_STREAM, layout.start_code))
-            if begun is not None:
-                begun()
+            if on_start is not None:
+                on_start()
             first = 0
             while True:
                 if self._reader is not reader:
-                    raise InstrumentError(f"{self.name}: this stream is over, it was closed; start another one")
+                    raise InstrumentError(f"{self.name}: this stream was closed; start another one")
                 parts = self._block(reader, unpack, layout, size)
                 yield Profiles(
                     first=first,
@@ -311,7 +313,7 @@ class KeyenceLJX(Driver):
         }
 
     def _stop(self) -> None:
-        """Stop the stream and its thread; a profiler that does not confirm it has to be opened again."""
+        """Stop the stream and its thread; a profiler that does not confirm this must be opened again."""
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamEndedError
 
         reader, self._reader = self._reader, None
@@ -348,7 +350,7 @@ class KeyenceLJX(Driver):
             self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
             self._notice_pending = True
         except InstrumentError:
-            if self._lost is not None:  # else it only states that there was nothing to stop
+            if self._lost is not None:  # else there was no stream to stop
                 raise
         self.configure(self.settings)
 
@@ -357,4 +359,4 @@ class KeyenceLJX(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._reader is not None:
-            raise InstrumentError(f"{self.name} is streaming; leave the stream first")
+            raise InstrumentError(f"{self.name} is streaming; close the stream first")

@@ -1,4 +1,4 @@
-"""Scans in files, as if a profiler took them now."""
+"""Recorded scans in files, with the interface of a profiler."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ BLOCK = 100
 
 
 class ProfileFiles:
-    """Scans that exist already, each a file: PLY, PCD, XYZ (with Open3D), CSV height maps, NetCDF.
+    """Recorded scans, one per file: PLY, PCD, XYZ (with Open3D), CSV height maps, NetCDF.
 
     Parameters
     ----------
     address : str
-        A file, or a pattern such as ``scans/*.ply``, whose files come in the order of their names. ``replay://file``
-        is a recording: a list of files with their hashes, all of which must still be the same.
+        A file, or a pattern such as ``scans/*.ply``, whose files are read in the order of their names. ``replay://file``
+        is a recording: a list of files with their hashes, all of which must be unchanged.
     settings : ProfileFileSettings, optional
     record : Path, optional
         List that is written.
@@ -46,7 +46,7 @@ class ProfileFiles:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         from errormotion.instruments.line_profiler.profile_files.conformance import scan_file
 
         return InstrumentSubject(cls, str(scan_file()))
@@ -82,14 +82,14 @@ class ProfileFiles:
             raise InstrumentError(f"Expected a file or a pattern such as scans/*.ply; found '{self.address}'")
         paths = [Path(rest)] if Path(rest).is_file() else [Path(name) for name in sorted(glob(rest))]
         if not paths:
-            raise InstrumentError(f"There is no file '{rest}'; expected scans of {', '.join(sorted(READERS))}")
+            raise InstrumentError(f"Expected scans of {', '.join(sorted(READERS))}; there is no file '{rest}'")
         files = {path: _hash(path) for path in paths}
         if self._record is not None:
             _write_list(self._record, files)
         self._files = files
 
     def close(self) -> None:
-        """Forget the files; idempotent."""
+        """Close the files; idempotent."""
         self._files = None
 
     def __enter__(self) -> Self:
@@ -144,7 +144,7 @@ class ProfileFiles:
     def _opened(self) -> dict[Path, str]:
         if self._files is None:
             raise InstrumentError(
-                f"The profile_files at {self.address} are not open: use it in a 'with' block, or call open() first"
+                f"The profile_files at {self.address} are not open: use them in a 'with' block, or call open() first"
             )
         return self._files
 
@@ -163,7 +163,7 @@ def _write_list(path: Path, files: dict[Path, str]) -> None:
         with path.open("x", encoding="utf-8") as out:
             out.write("\n".join(lines) + "\n")
     except OSError as error:
-        raise InstrumentError(f"The recording {path} cannot be made: {error.strerror}") from None
+        raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
 
 
 def _read_list(path: Path) -> dict[Path, str]:
@@ -173,7 +173,7 @@ def _read_list(path: Path) -> dict[Path, str]:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
     pairs = [line.partition(" ") for line in lines[1:]]
     if not pairs or lines[0] != FORMAT or not all(name for _, _, name in pairs):
-        raise ReplayError(f"{path} is no list of scans: expected a first line '{FORMAT}' and at least one file")
+        raise ReplayError(f"{path} is not a list of scans: expected a first line '{FORMAT}' and at least one file")
     files = {path.parent / name: digest for digest, _, name in pairs}
     for file, digest in files.items():
         if _hash(file) != digest:

@@ -17,7 +17,7 @@ Array = np.ndarray[Any, Any]
 
 MAX_HEIGHT = 0.5  # m; a larger one is a mistaken unit
 FULL = 0.25
-"""Share of the cells of a height map that a point cloud must fill to be one."""
+"""Smallest share of the cells of a height map that a point cloud must fill."""
 
 
 def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
@@ -27,32 +27,32 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
     ------
     InstrumentError
         Unknown kind of file, not readable, cut off, no unit, no height map, heights of more than half a metre, profiles
-        that lie not one behind the other.
+        that are not in order along the feed.
     """
     suffix = path.suffix.lower()
     if suffix not in READERS:
         raise InstrumentError(f"{path}: expected a file of one of {', '.join(sorted(READERS))}")
     if not path.is_file():
-        raise InstrumentError(f"{path}: there is no such file")
+        raise InstrumentError(f"{path}: file not found")
     heights, x, y = READERS[suffix](path, settings)
     if not np.isfinite(heights).any():
-        raise InstrumentError(f"{path}: not a single height in it; is it the whole file?")
+        raise InstrumentError(f"{path}: expected heights; found none. Is the file complete?")
     highest = float(np.nanmax(np.abs(heights)))
     if highest > MAX_HEIGHT:
-        raise InstrumentError(f"{path}: a height of {highest:.4g} m; is its unit really '{settings.unit or 'm'}'?")
-    for name, places in (("y", y), ("x", x)):
-        steps = np.diff(places)
-        if not (np.isfinite(places).all() and ((steps > 0).all() or (steps < 0).all())):
+        raise InstrumentError(f"{path}: found a height of {highest:.4g} m; check its unit '{settings.unit or 'm'}'")
+    for name, positions in (("y", y), ("x", x)):
+        steps = np.diff(positions)
+        if not (np.isfinite(positions).all() and ((steps > 0).all() or (steps < 0).all())):
             raise InstrumentError(
-                f"{path}: {name} does not go one way only: expected one profile behind the other, and each point "
-                "beside the last; cut the file where the feed turns"
+                f"{path}: {name} is not monotonic: expected profiles and points in order; cut the file where the feed "
+                "reverses"
             )
     return Scan(path, np.ascontiguousarray(heights), x, y)
 
 
 def _unit(path: Path, settings: ProfileFileSettings) -> str:
     if settings.unit is None:
-        raise InstrumentError(f"{path} does not name the unit of its lengths: give 'unit', one of m, mm, um, inch")
+        raise InstrumentError(f"{path} has no unit of lengths: set 'unit' to m, mm, um or inch")
     return settings.unit
 
 
@@ -61,11 +61,11 @@ def _cleared(values: Array, settings: ProfileFileSettings) -> Array:
 
 
 def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
-    """Read rows of heights, a profile each; an empty cell is no height. Lines that start with # are ignored."""
+    """Read rows of heights, a profile each; an empty cell is a missing height. Lines that start with # are ignored."""
     unit = _unit(path, settings)
     if settings.x_pitch is None or settings.y_pitch is None:
         raise InstrumentError(
-            f"{path} has heights only: give 'x_pitch' and 'y_pitch', the distances of its columns and rows"
+            f"{path} has heights only: set 'x_pitch' and 'y_pitch', the distances of its columns and rows"
         )
     rows: list[list[float]] = []
     try:
@@ -85,7 +85,7 @@ def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
     except OSError as error:
         raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
     if not rows:
-        raise InstrumentError(f"{path}: no heights in it")
+        raise InstrumentError(f"{path}: expected heights; found none")
     heights = _in_metres(_cleared(np.array(rows), settings), unit)
     n, points = heights.shape
     return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
@@ -106,7 +106,7 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
         variable = dataset[name].transpose(*dims)
         unit = str(variable.attrs.get("units", ""))
         if not unit:
-            raise InstrumentError(f"{path}: the variable {name} names no 'units'")
+            raise InstrumentError(f"{path}: the variable {name} has no attribute 'units'")
         values = np.asarray(variable.values, dtype=np.float64)
         found.append(_in_metres(_cleared(values, settings) if name == "height" else values, unit))
     heights, x, y = found
@@ -122,21 +122,21 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     if "positions" not in cloud.point or not len(cloud.point.positions):
-        raise InstrumentError(f"{path} cannot be read: Open3D finds no points in it; is it the whole file?")
+        raise InstrumentError(f"{path} cannot be read: Open3D finds no points. Is the file complete?")
     points = cloud.point.positions.numpy().astype(np.float64)
     points[:, 2] = _cleared(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
 
 
 def _open3d(path: Path) -> Any:
-    """Return the package; it brings a TBB of its own, too old for numba, which is therefore set to try it last."""
+    """Return the package. Its TBB is too old for numba, which is therefore set to use it last."""
     import numba
 
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined, unused-ignore]
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise InstrumentError(f"Reading {path} takes Open3D, which does not load: {error}") from None
+        raise InstrumentError(f"Reading {path} requires Open3D, which cannot be loaded: {error}") from None
     return open3d
 
 
@@ -149,12 +149,12 @@ _PLY_SIZES = {
 
 
 def check_complete(path: Path) -> None:
-    """Refuse a PLY or PCD file that holds fewer points than its head announces: Open3D makes up the others.
+    """Refuse a PLY or PCD file that holds fewer points than its header announces: Open3D invents the others.
 
     Raises
     ------
     InstrumentError
-        Cut off, or without a head.
+        Incomplete, or without a header.
     """
     announced, width, text = -1, 0, False
     with path.open("rb") as file:
@@ -176,14 +176,14 @@ def check_complete(path: Path) -> None:
                     text, width = kind == "ascii", width if kind == "binary" else 0
                     break
         else:
-            raise InstrumentError(f"{path} cannot be read: its head has no end; is it the whole file?")
+            raise InstrumentError(f"{path} cannot be read: its header has no end. Is the file complete?")
         there = announced
         if text:
             there = _whole_lines(file)
         elif width:
             there = (path.stat().st_size - file.tell()) // width
     if there < announced:
-        raise InstrumentError(f"{path} cannot be read: it announces {announced} points and is cut off after {there}")
+        raise InstrumentError(f"{path} cannot be read: its header announces {announced} points; found {there}")
 
 
 def _whole_lines(file: Iterable[bytes]) -> int:
@@ -201,18 +201,18 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
     Raises
     ------
     InstrumentError
-        They do not lie on lines of equal x and equal y, or two lie at one position.
+        The points are not on lines of equal x and equal y, or two have the same position.
     """
     points = points[np.isfinite(points[:, :2]).all(axis=1)]
     (x, column), (y, row) = (_lines(points[:, axis]) for axis in (0, 1))
     if x.size * y.size * FULL > len(points):
         raise InstrumentError(
-            f"{path} is no height map: {len(points)} points have {x.size} different x and {y.size} different y; "
+            f"{path} is not a height map: {len(points)} points have {x.size} different x and {y.size} different y; "
             "expected profiles of equal y, with the same x on each"
         )
     cells = row * x.size + column
     if np.unique(cells).size < cells.size:
-        raise InstrumentError(f"{path} is no height map: several points have the same x and y")
+        raise InstrumentError(f"{path} is not a height map: several points have the same x and y")
     heights = np.full(x.size * y.size, np.nan)
     heights[cells] = points[:, 2]
     return heights.reshape(y.size, x.size), x, y

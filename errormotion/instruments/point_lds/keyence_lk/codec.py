@@ -1,6 +1,6 @@
 """Protocol of LK-G and LK-H controllers over RS-232C: lines of ASCII that end with a carriage return.
 
-A request is a command and its identifiers, joined by commas; the answer starts with the request and goes on with
+A request is a command and its identifiers, separated by commas; the answer starts with the request, followed by
 the value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,command,code``. One request at a time. A value
 has eight characters: a sign and seven digits with their point, or one of three texts that mean no value. The text
 does not state whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
@@ -34,13 +34,13 @@ _NUMBER = re.compile(r"[+-](?=.{7}\Z)[0-9]+\.([0-9]+)")
 COMMAND_ERROR, STATE_ERROR, LENGTH_ERROR, COUNT_ERROR, PARAMETER_ERROR = "00", "01", "20", "21", "22"
 TIMEOUT_ERROR, OTHER_ERROR = "88", "99"
 ERRORS: Mapping[str, str] = {
-    COMMAND_ERROR: "it does not know this command; is it the controller that the settings name?",
-    STATE_ERROR: "not in this state: measuring and setting are two modes of it",
+    COMMAND_ERROR: "unknown command; check the setting 'controller'",
+    STATE_ERROR: "not possible in this mode: measuring and setting are different modes",
     LENGTH_ERROR: "wrong length of the command",
     COUNT_ERROR: "wrong number of parameters",
-    PARAMETER_ERROR: "a parameter out of its range; has it the output that the settings name?",
-    TIMEOUT_ERROR: "it ran into its own time limit; retry",
-    OTHER_ERROR: "another error; see its display",
+    PARAMETER_ERROR: "a parameter is out of range; check the setting 'output'",
+    TIMEOUT_ERROR: "timeout in the controller; retry",
+    OTHER_ERROR: "another error; see the display of the controller",
 }
 
 
@@ -58,7 +58,7 @@ class Controller:
         return self.measure + self.output.format(output)
 
     def zero_off_request(self, output: int) -> str:
-        """Return the request that takes a zero back that was set on the panel."""
+        """Return the request that cancels a zero set on the panel."""
         return self.zero_off + self.output.format(output)
 
 
@@ -143,7 +143,7 @@ def decode(line: bytes) -> str:
 
 
 def parse_answer(request: str, text: str, header: str | None = None) -> str:
-    """Return what an answer states behind its header; empty where it states no more.
+    """Return the part of an answer after its header; may be empty.
 
     Parameters
     ----------
@@ -159,10 +159,10 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
     InstrumentError
         The controller refuses; the message names the error.
     ProtocolError
-        This is not the answer to that request.
+        Not the answer to that request.
     """
     if (code := error_code(request, text)) is not None:
-        meaning = ERRORS.get(code, "this code is in no manual known here")
+        meaning = ERRORS.get(code, "unknown code")
         raise InstrumentError(f"The controller refuses '{request}' with error {code}: {meaning}")
     expected = request if header is None else header
     if text == expected:
@@ -179,8 +179,8 @@ def error_code(request: str, text: str) -> str | None:
     """
     match text.split(","):
         case [word, command, code] if word == ERROR and command and code:
-            asked = request.split(",")
-            return code if command in (request, *asked[:2]) else None
+            words = request.split(",")
+            return code if command in (request, *words[:2]) else None
     return None
 
 
@@ -199,14 +199,14 @@ def parse_value(text: str, display: Display) -> tuple[float, int]:
         return float("nan"), GARBLED
     if len(number[1]) != display.decimals:
         raise ProtocolError(
-            f"Expected a value with {display.decimals} decimals, as in the settings; found '{text}'. Make the setting "
-            "'display' and the smallest displayed unit of the controller the same"
+            f"Expected a value with {display.decimals} decimals, as in the settings; found '{text}'. The setting "
+            "'display' must be the smallest displayed unit of the controller"
         )
     return float(text) * display.unit, 0
 
 
 def format_value(value: float, display: Display) -> str:
-    """Return a value (m) as the controller sends it; NaN is no value, and what the digits do not hold out of range."""
+    """Return a value (m) as the controller sends it; NaN as no value, too many digits as out of range."""
     if value != value:
         return NO_VALUE
     text = f"{value / display.unit:+z08.{display.decimals}f}"
@@ -221,13 +221,13 @@ def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
     Raises
     ------
     InstrumentError
-        With the arithmetic.
+        With the calculation.
     """
     request = len(encode(controller.measure_request(1)))
     answer = request + 1 + WIDTH
     needed = rate * (request + answer) * BITS_PER_BYTE
     if needed > baudrate:
         raise InstrumentError(
-            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes to query and {answer} "
-            f"to answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
+            f"{rate:g} readings/s do not fit through {baudrate} baud: each takes {request} bytes of request and "
+            f"{answer} of answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
         )

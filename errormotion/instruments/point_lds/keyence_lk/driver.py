@@ -46,7 +46,7 @@ class KeyenceLK(Driver):
     """A Keyence LK-G or LK-H laser displacement sensor over RS-232C.
 
     Readings are in m from the middle of the measuring range along the beam: negative nearer to the head, positive
-    beyond, whichever way round the controller shows them; NaN where the sensor has none.
+    beyond, whatever sign the controller shows; NaN where the sensor has none.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class KeyenceLK(Driver):
     Attributes
     ----------
     no_value : str
-        Why the last reading was NaN, one of `codec.REASONS`; empty where it was a number.
+        Reason of the last reading where it is NaN, one of `codec.REASONS`; else empty.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -72,7 +72,7 @@ class KeyenceLK(Driver):
     Settings: ClassVar[type[LKSettings]] = LKSettings
     settings: LKSettings
     no_value: str = ""
-    _in_step = False
+    _synchronised = False
     _streaming = False
 
     @property
@@ -103,7 +103,7 @@ class KeyenceLK(Driver):
         )
 
     def configure(self, settings: LKSettings) -> None:
-        """Check the settings against the line and the controller, or send them, see ``set_up``.
+        """Compare the settings with the line and the controller, or send them, see ``set_up``.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class KeyenceLK(Driver):
             The rate does not fit through the line; the controller has another display unit or an offset, or refuses.
         """
         if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; leave the stream first")
+            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
         self._line_speed(settings)
         output = CONTROLLERS[settings.controller].output.format(settings.output)
         unit = str(DISPLAYS[settings.display].number)
@@ -124,7 +124,7 @@ class KeyenceLK(Driver):
                 else:
                     self._check_controller(output, unit, settings)
             except InstrumentError:
-                self._in_step = False  # the next request leaves the setting mode first
+                self._synchronised = False  # the next request leaves the setting mode first
                 raise
             self._enter(MEASURING)
         if settings.set_up == "set":
@@ -132,7 +132,7 @@ class KeyenceLK(Driver):
         self.settings = settings
 
     def read(self) -> float:
-        """Return one reading now, m; NaN where the sensor has none, and ``no_value`` then states why.
+        """Return one reading now, m; NaN where the sensor has none, with the reason in ``no_value``.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class KeyenceLK(Driver):
         return value
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of readings, requested one by one in the rhythm of ``rate``, until the caller stops.
+        """Yield blocks of readings, requested one by one at ``rate``, until the caller stops.
 
         The clock is this computer's. A simulated sensor is queried as fast as it answers: its clock is a virtual one.
 
@@ -174,9 +174,9 @@ class KeyenceLK(Driver):
             while True:
                 values = np.empty((1, size))
                 invalid: Counter[str] = Counter()
-                for place in range(size):
-                    self._keep_pace(start, first + place)
-                    values[0, place], reason = self._measure()
+                for k in range(size):
+                    self._wait_for_interval(start, first + k)
+                    values[0, k], reason = self._measure()
                     if reason:
                         invalid[REASONS[reason]] += 1
                 yield Samples(values, first, self.rate, time.monotonic(), invalid=dict(invalid))
@@ -191,55 +191,55 @@ class KeyenceLK(Driver):
         except ProtocolError:
             return float("nan"), GARBLED
         value, reason = parse_value(text, DISPLAYS[settings.display])
-        self._in_step = reason != GARBLED
+        self._synchronised = reason != GARBLED
         return SIGNS[settings.positive] * value, reason
 
     def _query(self, request: str, header: str | None = None) -> str:
-        """Send a request and return what the answer states behind its header."""
-        if not self._in_step:
+        """Send a request and return the part of the answer after its header."""
+        if not self._synchronised:
             self._enter(MEASURING)
-        self._in_step = False
+        self._synchronised = False
         self.transport.write(encode(request))
         text = decode(self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES))
-        self._in_step = error_code(request, text) is not None  # a refusal is an answer as well
+        self._synchronised = error_code(request, text) is not None  # a refusal is an answer as well
         answer = parse_answer(request, text, header)
-        self._in_step = True
+        self._synchronised = True
         return answer
 
     def _enter(self, mode: str) -> None:
-        """Bring the controller into a mode, if it is not in it.
+        """Set the mode of the controller.
 
-        Late answers to earlier requests, and what is left of damaged ones, are ignored: afterwards the next answer
+        Late answers and remains of damaged answers are discarded: afterwards the next answer
         belongs to the next request.
         """
-        self._in_step = False
+        self._synchronised = False
         self.transport.write(encode(mode))
         for _ in range(MAX_LATE_LINES):
             line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
             if text.endswith((mode, f"{ERROR},{mode},{STATE_ERROR}")):  # an error where it was in this mode already
-                self._in_step = True
+                self._synchronised = True
                 return
             if error_code(mode, text) is not None:
                 parse_answer(mode, text)
-        raise ProtocolError(f"{self.address}: expected '{mode}' as an answer; {MAX_LATE_LINES} other lines came")
+        raise ProtocolError(f"{self.address}: expected the answer '{mode}'; found {MAX_LATE_LINES} other lines")
 
     def _check_controller(self, output: str, unit: str, settings: LKSettings) -> None:
         request = f"SR,{DISPLAY_SETTING},{output}"
         if (found := self._query(request)) != unit:
             names = {str(display.number): name for name, display in DISPLAYS.items()}
             raise InstrumentError(
-                f"In the settings the controller at {self.address} shows units of {settings.display}; it answers "
-                f"'{request}' with {names.get(found, found)!r}. Change one of them, or have it set: set_up = \"set\""
+                f"The setting 'display' is {settings.display}; the controller at {self.address} answers "
+                f"'{request}' with {names.get(found, found)!r}. Change one of them, or use set_up = \"set\""
             )
         request = f"SR,{OFFSET_SETTING},{output}"
         if set(found := self._query(request)) & set("123456789"):
             raise InstrumentError(
                 f"The controller at {self.address} has an offset of {found}, so that 0 is not the middle of the range. "
-                'Clear it, or have it cleared: set_up = "set"'
+                'Clear it, or use set_up = "set"'
             )
 
-    def _keep_pace(self, start: float, number: int) -> None:
+    def _wait_for_interval(self, start: float, number: int) -> None:
         if self.transport.simulated:
             return
         ahead = start + number / self.rate - time.monotonic()

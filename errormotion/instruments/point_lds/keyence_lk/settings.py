@@ -30,10 +30,10 @@ class LKSettings(PluginSettings):
     )
     set_up: Literal["check", "set", "trust"] = Field(
         default="check",
-        description="whether the display unit and the offset of the controller are checked, set, or left unrequested",
+        description="check, set, or do not request (trust) the display unit and the offset of the controller",
     )
     rate: Frequency = Field(default=100.0, description="readings per second of a stream, requested one by one", gt=0)
-    baudrate: int = Field(default=115200, description="of a serial line", gt=0)
+    baudrate: int = Field(default=115200, description="baud rate of a serial line", gt=0)
     noise: Length = Field(default=0.1e-6, description="standard deviation of a single reading", ge=0)
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
 

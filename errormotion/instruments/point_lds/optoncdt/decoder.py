@@ -61,8 +61,8 @@ class StreamDecoder:
         size = int(numbers[-1]) + 1 - self._next
         if size - raws.size > MAX_GAP_SAMPLES:
             raise ProtocolError(
-                f"The sample counter leaps by {size - raws.size}, more than half of its {COUNTER_BITS} bits: "
-                "the sensor was restarted, or these are no samples; start the stream again"
+                f"The sample counter jumps by {size - raws.size}, more than half of its {COUNTER_BITS} bits: "
+                "the sensor was restarted, or the data are not samples; start the stream again"
             )
         distances, reasons = np.empty(size), np.empty(size, dtype=np.uint8)
         kernels.convert(raws, numbers, self._next, self._range, distances, reasons)

@@ -115,12 +115,12 @@ class OptoNCDT(Driver):
         return {key.strip().lower(): value.strip() for key, mark, value in parts if mark}
 
     def on_for(self) -> float:
-        """Return for how long the sensor states that it has been on, s; 0 where it does not state."""
+        """Return the operating time that the sensor reports, s; 0 where it reports none."""
         stated = re.match(r"([\d.]+)", self._facts().get(ON_FOR, ""))
         return float(stated[1]) if stated else 0.0
 
     def configure(self, settings: OptoSettings) -> None:
-        """Check settings against the line and the sensor, and send them.
+        """Compare settings with the line and the sensor, and send them.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class OptoNCDT(Driver):
             It does not answer.
         """
         if self._lost is not None:
-            raise InstrumentError(f"{self.name} is lost ({self._lost}); close and open it again")
+            raise InstrumentError(f"The connection to {self.name} is lost ({self._lost}); close and open it again")
         request = text.encode("ascii") + LINE_END
         timeout = self.settings.timeout
         if self._reader is not None:
@@ -162,7 +162,7 @@ class OptoNCDT(Driver):
         raise InstrumentError(f"{self.name}: the stream ended before its first sample")
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
-        """Yield blocks of samples until the caller stops; leaving the loop stops the sensor.
+        """Yield blocks of samples until the caller stops; the end of the loop stops the sensor.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ class OptoNCDT(Driver):
         InstrumentTimeoutError
             No answer within the time limit.
         ProtocolError
-            The counter makes no sense.
+            The counter is inconsistent.
         """
         size = block or max(1, round(BLOCK_SECONDS * self.rate))
         self.start(size)
@@ -196,9 +196,9 @@ class OptoNCDT(Driver):
             self.stop()
 
     def start(self, block: int, sync: Sync = "NONE") -> None:
-        """Start the stream; samples are then taken with ``fill``, at most ``block`` at once.
+        """Start the stream; samples are then read with ``fill``, at most ``block`` at once.
 
-        With ``SLAVE`` nothing comes until the master starts, and the counter of the first sample is known to be 0.
+        With ``SLAVE`` no data arrive until the master starts, and the counter of the first sample is 0.
         """
         from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
         from errormotion.instruments.streaming import Reader
@@ -224,19 +224,19 @@ class OptoNCDT(Driver):
 
     @property
     def host_time(self) -> float:
-        """``time.monotonic()`` when the last samples that ``fill`` gave had come off the wire."""
+        """``time.monotonic()`` when the last samples that ``fill`` returned were received."""
         return 0.0 if self._reader is None else self._reader.host_time
 
     def drain(self) -> None:
-        """Throw away what comes, so that the sensor is not held back until ``stop``."""
+        """Discard all samples until ``stop``, so that the sensor need not wait."""
         if self._reader is not None:
             self._reader.drain()
 
     def stop(self, timeout: float | None = None) -> None:
         """Stop the stream and its thread; idempotent.
 
-        A sensor that does not confirm it within ``timeout`` s is no error here (``fill`` reports it, now or
-        at the next start), but it has to be opened again.
+        A sensor that does not confirm the stop within ``timeout`` s must be opened again; the next
+        command raises the error.
         """
         reader, self._reader = self._reader, None
         if reader is None:
@@ -272,13 +272,13 @@ class OptoNCDT(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._reader is not None:
-            raise InstrumentError(f"{self.name} is streaming; leave the stream first")
+            raise InstrumentError(f"{self.name} is streaming; close the stream first")
 
     def _check_sensor(self, settings: OptoSettings) -> None:
         identity = self.identify()
         if settings.model not in identity.model.replace(" ", ""):
             raise InstrumentError(
-                f"The settings state model {settings.model}; at {self.address} answers a '{identity.model}'"
+                f"The settings state model {settings.model}; the sensor at {self.address} is a '{identity.model}'"
             )
         stated = re.match(r"([\d.]+)\s*mm", str(identity.details.get("range", "")))
         if stated and not np.isclose(float(stated[1]) * 1e-3, settings.range):

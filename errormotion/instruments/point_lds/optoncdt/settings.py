@@ -42,10 +42,10 @@ class SensorSettings(PluginSettings):
             raise ValueError(f"the {self.model} measures at {known} kHz; found {self.rate / 1000:g} kHz")
         if not any(math.isclose(self.range, length, rel_tol=1e-6) for length in model.ranges):
             known = ", ".join(f"{length * 1000:g}" for length in model.ranges)
-            raise ValueError(f"the {self.model} is made for ranges of {known} mm; found {self.range * 1000:g} mm")
+            raise ValueError(f"the {self.model} has ranges of {known} mm; found {self.range * 1000:g} mm")
         if self.baudrate is not None and self.baudrate not in model.baudrates:
             known = ", ".join(str(rate) for rate in model.baudrates)
-            raise ValueError(f"the {self.model} speaks at {known} baud; found {self.baudrate}")
+            raise ValueError(f"the {self.model} has the baud rates {known}; found {self.baudrate}")
         if self.baudrate is not None:
             self._check_line(self.baudrate)
 

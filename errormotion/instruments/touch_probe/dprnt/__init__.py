@@ -1,4 +1,4 @@
-"""Contacts as lines of text that a machine's own probing program prints."""
+"""Contacts that a probing program of the machine prints as lines of text."""
 
 from errormotion.instruments.touch_probe.dprnt.driver import Dprnt
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings

@@ -1,7 +1,7 @@
 """Lines that macros of FANUC controls print with DPRNT, one for each touch.
 
 ``DPRNT[N12*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]`` prints ``N12 X   12.345 Y -  3.210 Z  100.000 T   45210``:
-mm, and milliseconds. Leading zeros are blanks or left out, the sign stands before the blanks (from memory, kept here).
+mm, and milliseconds. Leading zeros are blanks or omitted, the sign precedes the blanks (from memory).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ PATTERN = (
     r"(?:N\s*(?P<number>\d+)\s*|[A-MO-W]\w*\s+)?"
     rf"X\s*(?P<x>{_NUMBER})\s*Y\s*(?P<y>{_NUMBER})\s*Z\s*(?P<z>{_NUMBER})\s*(?:T\s*(?P<time>{_NUMBER}))?"
 )
-"""What a line is, by default: the number of the touch or a label, the position, the time."""
+"""Default pattern of a line: number of the touch or a label, position, time."""
 
-_CONTROL = bytes(range(32)) + b"\x7f%"  # what POPEN and PCLOS send around the lines
+_CONTROL = bytes(range(32)) + b"\x7f%"  # characters of POPEN and PCLOS around the lines
 MM, MILLISECONDS = 1e-3, 1e-3
 
 
@@ -53,14 +53,14 @@ def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time:
     ----------
     text : str
     pattern : compiled pattern
-        Has the groups x, y, z, and perhaps number and time; the whole line must follow it.
+        Has the groups x, y, z, and optionally number and time; the whole line must match.
     length, time : float
-        What printed lengths and times are multiplied by to be m and s.
+        Factors from printed lengths and times to m and s.
 
     Raises
     ------
     ProtocolError
-        The line does not follow the pattern.
+        The line does not match the pattern.
     """
     found = pattern.fullmatch(text.strip())
     if found is None:

@@ -1,4 +1,4 @@
-"""Driver of contacts that a machine's own program prints; it listens only."""
+"""Driver of contacts that a program of the machine prints; read-only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.touch_probe.dprnt.codec import Line, parse_line, text_of
-from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, place_of
+from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
@@ -44,7 +44,7 @@ class Dprnt(Driver):
     last : Contact or None
         The last one.
     unreadable, repeated, missing : int
-        Lines that were none, lines printed twice, touches without a line; since the driver was made.
+        Number of unreadable lines, lines printed twice, and touches without a line since the driver was made.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -59,10 +59,8 @@ class Dprnt(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
-        return InstrumentSubject(
-            cls, "sim://cframe/printer", faults=()
-        )  # they show in lines, and no program prints any
+        """Return the subject of the conformance kit."""
+        return InstrumentSubject(cls, "sim://cframe/printer", faults=())  # faults affect lines, and no program runs
 
     def __init__(self, address: str, settings: DprntSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
@@ -104,9 +102,9 @@ class Dprnt(Driver):
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return what came so far: ``contacts``, ``unreadable``, ``repeated``, ``missing``, and the last ``contact``.
+        """Return counts so far: ``contacts``, ``unreadable``, ``repeated``, ``missing``, and the last ``contact``.
 
-        The contact is X, Y, Z in m, NaN without one, with its ``time`` and ``flag``. Only `measure` takes lines.
+        The contact is X, Y, Z in m, NaN without one, with its ``time`` and ``flag``. Only `measure` reads lines.
         """
         _ = self.transport
         return {
@@ -120,19 +118,20 @@ class Dprnt(Driver):
         }
 
     def measure(self, touches: Sequence[Touch]) -> Iterator[Contact]:
-        """Yield what the machine prints of each touch, in order, while its program makes them.
+        """Yield the printed contact of each touch, in order, while the machine's program makes them.
 
-        A touch whose line is missing, as those after it show, is ``not made``. Lines that came twice, or cannot be
-        read, are ignored and counted. Where the lines of the next cycle start, the rest of this one is missing.
+        A touch whose line is missing, as later lines show, is ``not made``. Repeated and unreadable lines are
+        ignored and counted. Where the lines of the next cycle start, the rest of this one is missing.
 
         Raises
         ------
         InstrumentTimeoutError
-            No line for too long; the message states at which touch.
+            No line within the time limit; the message states the touch.
         ProtocolError
             Too many lines that cannot be read.
         InstrumentError
-            A position that belongs to no touch, touches from a side that the pre-travel map does not know, a lost line.
+            A position that belongs to no touch, touches from a direction that the pre-travel map does not cover, a lost
+            connection.
         """
         touches = list(touches)
         refuse_unmapped(self._map, touches)
@@ -141,24 +140,24 @@ class Dprnt(Driver):
             where = f"Touch {due + 1} of {len(touches)} (item {touches[due].item})"
             try:
                 line = self._next(self.settings.timeout if due else self.settings.start_timeout, unreadable)
-                place = place_of(line, touches, due, self._before, self.settings.first_number, self.settings.margin)
+                index = touch_of(line, touches, due, self._before, self.settings.first_number, self.settings.margin)
             except InstrumentError as error:
                 raise type(error)(f"{where}: {error}") from error
-            if place == REPEATED:
+            if index == REPEATED:
                 self.repeated += 1
                 continue
-            if place < due:
-                self._ahead, place = line, len(touches)
+            if index < due:
+                self._ahead, index = line, len(touches)
             else:
                 self._before = line
-            for _ in range(due, place):
+            for _ in range(due, index):
                 self.missing += 1
                 yield self._kept(Contact(NOWHERE, float("nan"), NOT_MADE))
-            if place < len(touches):
-                touch = touches[place]
+            if index < len(touches):
+                touch = touches[index]
                 contact = contact_of(line, touch, self.settings.free, self.settings.at_target)
                 yield self._kept(corrected(self._map, touch, contact))
-            due = place + 1
+            due = index + 1
 
     def _next(self, timeout: float, unreadable: int) -> Line:
         """Return the next line that states a position."""
@@ -178,15 +177,15 @@ class Dprnt(Driver):
                     return parse_line(text, pattern, length=units[0], time=units[1])
             except InstrumentTimeoutError as error:
                 raise InstrumentTimeoutError(
-                    f"no line for {timeout:g} s; has the program stopped, or is the cable off? {error}"
+                    f"no line for {timeout:g} s; check the program and the cable. {error}"
                 ) from error
             except ProtocolError as error:
                 self.unreadable += 1
                 log.warning("%s: %s", self.address, error)
                 if self.unreadable - unreadable > self.settings.most_unreadable:
                     raise ProtocolError(
-                        f"{self.unreadable - unreadable} lines cannot be read. The last one: {error} Are baud rate and "
-                        "pattern right?"
+                        f"{self.unreadable - unreadable} lines cannot be read; check baud rate and pattern. "
+                        f"The last one: {error}"
                     ) from error
 
     def _kept(self, contact: Contact) -> Contact:

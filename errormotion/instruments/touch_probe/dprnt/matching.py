@@ -1,4 +1,4 @@
-"""Which touch a printed position belongs to, and what it states of it."""
+"""Assignment of printed positions to touches."""
 
 from __future__ import annotations
 
@@ -10,45 +10,45 @@ from errormotion.instruments.touch_probe.touching import NO_TRIP, NOWHERE, TRIPP
 from errormotion.plugins import Contact, Touch
 
 REPEATED = -1
-"""Instead of a touch: the line was printed twice."""
+"""Result for a line that was printed twice."""
 
 
-def place_of(line: Line, touches: list[Touch], due: int, last: Line | None, first: int, margin: float) -> int:
+def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, first: int, margin: float) -> int:
     """Return the number of the touch (from 0) that a line belongs to, or `REPEATED`.
 
-    A printed number decides, and goes on counting or starts again from cycle to cycle. Without one it is the next touch
-    whose way the position lies on; a number before the one that is due then belongs to the next cycle.
+    A printed number determines the touch; numbers continue or start again from cycle to cycle. Without a number it is
+    the next touch on whose path the position is. A touch before ``due`` belongs to the next cycle.
 
     Raises
     ------
     InstrumentError
-        The position lies on the way of no touch, or not on that of its number.
+        The position is on the path of no touch, or not on that of its number.
     """
     if line.number is not None:
         if last is not None and last.number == line.number and last.position == line.position:
             return REPEATED
-        place: int = (line.number - first) % len(touches)
-        if not lies_on(line, touches[place], margin):
+        index: int = (line.number - first) % len(touches)
+        if not is_on_path(line, touches[index], margin):
             raise InstrumentError(
-                f"touch {line.number} was printed at {_told(line)}, which is not on the way of touch {place + 1}; are "
-                "program and touches the same, and the lengths in the right unit?"
+                f"touch {line.number} was printed at {_shown(line)}, which is not on the path of touch {index + 1}; "
+                "check that program and touches agree, and the unit of lengths"
             )
-        return place
+        return index
     candidates = [*range(due, len(touches)), *range(due)]
-    found: list[int] = [place for place in candidates if lies_on(line, touches[place], margin)]
+    found: list[int] = [index for index in candidates if is_on_path(line, touches[index], margin)]
     repeated = last is not None and last.position == line.position
     if repeated and (not found or found[0] != due):
         return REPEATED
     if not found:
         raise InstrumentError(
-            f"a contact was printed at {_told(line)}, which is on the way of no touch; are program and touches the "
-            "same, and the lengths in the right unit?"
+            f"a contact was printed at {_shown(line)}, which is on the path of no touch; check that program and "
+            "touches agree, and the unit of lengths"
         )
     return found[0]
 
 
-def lies_on(line: Line, touch: Touch, margin: float) -> bool:
-    """Whether a position lies on the way of a touch, to a margin (m)."""
+def is_on_path(line: Line, touch: Touch, margin: float) -> bool:
+    """Whether a position is on the path of a touch, to a margin (m)."""
     start, way = np.array(touch.start), np.subtract(touch.target, touch.start)
     offset = np.array(line.position) - start
     along = np.clip(offset @ way / (way @ way), 0.0, 1.0)
@@ -56,7 +56,7 @@ def lies_on(line: Line, touch: Touch, margin: float) -> bool:
 
 
 def contact_of(line: Line, touch: Touch, free: float, at_target: float) -> Contact:
-    """Return what a printed position states of its touch: a skip move that nothing stopped ends at its target."""
+    """Return the contact of a printed position; a skip move without a contact ends at its target."""
     way = np.subtract(touch.target, touch.start)
     length = float(np.linalg.norm(way))
     along = float(np.subtract(line.position, touch.start) @ way) / length
@@ -67,6 +67,6 @@ def contact_of(line: Line, touch: Touch, free: float, at_target: float) -> Conta
     return Contact(line.position, line.time)
 
 
-def _told(line: Line) -> str:
+def _shown(line: Line) -> str:
     x, y, z = (1e3 * value for value in line.position)
     return f"X {x:.3f} Y {y:.3f} Z {z:.3f} mm"

@@ -16,23 +16,23 @@ class DprntSettings(ProbeSettings):
     """Settings of contacts that a machine prints."""
 
     pattern: str = Field(
-        default=PATTERN, description="regular expression of a line, with groups x, y, z, and perhaps number and time"
+        default=PATTERN, description="regular expression of a line, with groups x, y, z, and optionally number and time"
     )
     length_unit: Literal["mm", "in"] = Field(default="mm", description="unit of printed positions")
     time_unit: Literal["ms", "s"] = Field(default="ms", description="unit of printed times")
     first_number: int = Field(default=1, description="number of the first touch, where touches are numbered", ge=0)
-    margin: Length = Field(
-        default=1e-3, description="how far off the straight way of its touch a position may be", gt=0
-    )
-    free: Length = Field(default=0.2e-3, description="first part of a touch's way, where a trip is a false one", ge=0)
+    margin: Length = Field(default=1e-3, description="largest distance of a position from the path of its touch", gt=0)
+    free: Length = Field(default=0.2e-3, description="first part of a path, in which a trip counts as false", ge=0)
     at_target: Length = Field(
-        default=5e-6, description="so near to the target the touch has ended there without a trip", ge=0
+        default=5e-6, description="distance from the target within which a touch ended without a trip", ge=0
     )
     start_timeout: Time = Field(default=600.0, description="time limit of the first line of a cycle", gt=0)
     timeout: Time = Field(default=60.0, description="time limit from line to line", gt=0)
-    most_unreadable: int = Field(default=10, description="unreadable lines in one cycle that are put up with", ge=0)
+    most_unreadable: int = Field(
+        default=10, description="largest accepted number of unreadable lines in one cycle", ge=0
+    )
     baudrate: int = Field(default=4800, description="of a serial line", gt=0)
-    control: str = Field(default="FANUC", description="what control prints, for the record")
+    control: str = Field(default="FANUC", description="name of the control, for the record")
 
     @field_validator("pattern")
     @classmethod

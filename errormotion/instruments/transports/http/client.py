@@ -140,8 +140,8 @@ class HttpTransport(Transport):
     ) -> Iterator[bytes]:
         """Request a stream of many parts, and yield the body of each as it arrives.
 
-        An answer of one part only is yielded as one body. The connection is closed with the iterator; the next request opens
-        another one.
+        An answer of one part only is yielded as one body. The connection is closed with the iterator; the next request
+        opens another one.
 
         Raises
         ------

@@ -92,7 +92,7 @@ class HttpServer:
 
 
 def _request(handler: socketserver.StreamRequestHandler) -> tuple[str, dict[str, str]] | None:
-    """Return path and query of the next request; None where the client has closed the connection or sends something else."""
+    """Return path and query of the next request; None where the client has closed or sent something else."""
     words = handler.rfile.readline(_MAX_LINE_BYTES).decode("latin-1").split()
     for _ in range(_MAX_HEADERS):
         if handler.rfile.readline(_MAX_LINE_BYTES) in (b"\r\n", b"\n", b""):
