@@ -37,8 +37,8 @@ class Campaign:
 
     def __init__(self, cycles: int) -> None:
         from errormotion.twin import VirtualMachine
-        from errormotion.twin.artefacts import swept
-        from errormotion.twin.profiler import Disturbances, Profiler
+        from errormotion.twin.artefacts.pieces import swept
+        from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
         beam = VirtualMachine("gantry", seed=3).crossbeam
         profiler, artefact = Profiler(POINTS, PITCH, disturbances=Disturbances.none()), swept()

@@ -19,9 +19,9 @@ from errormotion.methods.crossbeam_scan.identification.registrations import boun
 from errormotion.methods.crossbeam_scan.identification.strain import FEED as FEED_NAMES
 from errormotion.methods.crossbeam_scan.settings import Layout, PoseSettings, Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import swept
+from errormotion.twin.artefacts.pieces import swept
 from errormotion.twin.crossbeam import LEVER, LIFT
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 TITLE = "Crossbeam scan"
 SEEDS = 150

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import circular_pocket, swept
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import circular_pocket, swept
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 BLUE, ORANGE, GREEN, PURPLE, RED, GREY = "#1f5a96", "#d9822b", "#2e8b57", "#7b4fa3", "#c0392b", "#8a8f98"
 COLOURS = {"EX": BLUE, "EY": ORANGE, "EZ": GREEN, "EA": PURPLE, "EB": RED, "EC": GREY}

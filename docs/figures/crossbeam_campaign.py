@@ -15,7 +15,7 @@ from errormotion.datasets import DOF
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 COLOURS = {7: "#7fb0dd", 30: "#2e8b57", 180: "#d9822b"}  # drawn, by minutes
 GREY = "#8a8f98"

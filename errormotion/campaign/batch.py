@@ -31,7 +31,7 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.raw_paths import is_runs_folder, raw_of
 from errormotion.campaign.runner import Progress, Quiet, settings_hash
 from errormotion.datasets import provenance
-from errormotion.datasets.hashing import has_hash
+from errormotion.datasets.files.hashing import has_hash
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import PluginSettings

@@ -1,4 +1,4 @@
-"""A bench with its instruments opened, as a method sees it."""
+"""A bench with opened instruments, for use by methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
+from errormotion.campaign.journal import cause_of
 from errormotion.errors import BenchError
+from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
 
 log = logging.getLogger(__name__)
@@ -18,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Answer:
-    """What one instrument of a bench said when it was opened: who it is, or why it did not come up."""
+    """Result of opening one instrument of a bench: its identity, or the cause of the failure."""
 
     instrument: BenchInstrument
     driver: Any = None
@@ -26,7 +28,7 @@ class Answer:
     error: str = ""
 
     def line(self) -> str:
-        """Return the answer in one line, for a person."""
+        """Return the result as one line of text."""
         what = f"{self.instrument.name} ({self.instrument.driver.info.id}"
         what += f", {self.instrument.address})" if self.instrument.address else ")"
         if self.identity is None:
@@ -36,7 +38,7 @@ class Answer:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return the answer for the provenance."""
+        """Return the result for the provenance."""
         info = self.instrument.driver.info
         return {
             "name": self.instrument.name,
@@ -51,15 +53,15 @@ class Answer:
 
 
 class OpenBench:
-    """The instruments of a bench, opened together and closed together.
+    """The instruments of a bench, opened and closed together.
 
     Parameters
     ----------
     plan : BenchPlan
-        What to open.
+        The bench.
     ask : callable, optional
-        How to ask the operator for something: it gets the message, and returns when it is done. Not called where all
-        instruments are simulated. Without it, a method that asks gets a BenchError.
+        Sends a request to the operator and returns when it is done. Not called if all instruments are simulated.
+        Without it, a request of a method raises BenchError.
 
     Attributes
     ----------
@@ -80,7 +82,7 @@ class OpenBench:
         Raises
         ------
         BenchError
-            The tree of what came up and what did not, and why. All instruments are tried; none stays open.
+            The tree of opened and failed instruments with causes. All instruments are tried; none remains open.
         """
         try:
             self.try_open()
@@ -90,11 +92,12 @@ class OpenBench:
         failed = [answer for answer in self.answers if answer.identity is None]
         if failed:
             self.close()
-            head = f"Bench '{self.plan.name}': {len(failed)} of {len(self.answers)} instruments did not come up."
+            head = f"Bench '{self.plan.name}': {len(failed)} of {len(self.answers)} instruments could not be opened."
             raise BenchError("\n".join([head, *tree([answer.line() for answer in self.answers])]))
 
     def try_open(self) -> None:
-        """Open what can be opened; ``answers`` says what could not."""
+        """Open all instruments; ``answers`` contains the failures."""
+        describe(self.description)
         for instrument in self.plan.instruments:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)
@@ -105,20 +108,20 @@ class OpenBench:
                     driver.close()
                     raise
             except Exception as error:
-                log.exception("instrument %s did not come up", instrument.name)
-                self.answers.append(Answer(instrument, error=f"{type(error).__name__}: {error}"))
+                log.exception("instrument %s could not be opened", instrument.name)
+                self.answers.append(Answer(instrument, error=cause_of(error)))
             else:
                 self.answers.append(Answer(instrument, driver, identity))
 
     def close(self) -> None:
-        """Close every instrument, the last opened first; one that fails to close does not keep the others open."""
+        """Close every instrument in reverse order, also if one of them fails."""
         for answer in reversed(self.answers):
             if answer.driver is None:
                 continue
             try:
                 answer.driver.close()
             except Exception:
-                log.exception("instrument %s did not close", answer.instrument.name)
+                log.exception("instrument %s could not be closed", answer.instrument.name)
 
     def __enter__(self) -> Self:
         self.open()
@@ -131,7 +134,7 @@ class OpenBench:
 
     @property
     def virtual(self) -> bool:
-        """Whether every instrument is a simulated one."""
+        """Return whether every instrument is simulated."""
         return all(answer.identity is not None and answer.identity.simulated for answer in self.answers)
 
     def chosen(self, choice: Mapping[str, str]) -> OpenBench:
@@ -144,7 +147,7 @@ class OpenBench:
         return found
 
     def has_kind(self, kind: str) -> bool:
-        """Whether the bench has an instrument of this kind."""
+        """Return whether the bench has an instrument of this kind."""
         return any(answer.instrument.driver.info.kind == kind for answer in self.answers)
 
     def of_kind(self, kind: str) -> Any:
@@ -170,22 +173,24 @@ class OpenBench:
         )
 
     def all_of_kind(self, kind: str) -> dict[str, Any]:
-        """Return every instrument of this kind by its name on the bench; none where there is none."""
+        """Return all instruments of this kind by their names on the bench."""
         return {a.instrument.name: a.driver for a in self.answers if a.instrument.driver.info.kind == kind}
 
     def ask(self, message: str) -> None:
-        """Ask the operator for something and wait until it is done; passes at once on a virtual bench."""
+        """Send a request to the operator and wait until it is done; returns immediately on a virtual bench."""
         if self.virtual:
             return
         if self._ask is None:
-            raise BenchError(f"The operator is needed ({message}), and nobody can be asked here. Run in a terminal.")
-        log.info("asked the operator: %s", message)
+            raise BenchError(
+                f"A request to the operator is necessary ({message}). Run the command in a terminal, or with --yes."
+            )
+        log.info("request to the operator: %s", message)
         self._ask(message)
-        log.info("the operator has done it")
+        log.info("request done")
 
 
 def tree(lines: list[str]) -> list[str]:
-    """Return lines with the branches of a tree before them; further lines of one entry are indented."""
+    """Return lines with the branches of a tree as prefix; further lines of an entry are indented."""
     drawn = []
     for number, line in enumerate(lines):
         last = number == len(lines) - 1

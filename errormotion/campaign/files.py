@@ -1,7 +1,7 @@
-"""Bench and campaign files: TOML that a person writes, checked against the plugins that it names.
+"""Bench and campaign files in TOML, checked against the plugins that they name.
 
-A bench file says which instruments there are; a campaign file says which tests to make with them. Every mistake of a
-file is told at once, with its key, what was expected and what was found, plugin settings included.
+A bench file lists the instruments, a campaign file the tests. All errors of a file, including plugin settings, are
+reported in one message, each with its key, the expected and the found value.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
-from errormotion.campaign.machine import limits_within, read_machine
-from errormotion.datasets import tomlfile
-from errormotion.datasets.folders import looking_beside
+from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
+from errormotion.datasets.files import tomlfile
+from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 from errormotion.kinematics.description import MachineDescription
@@ -28,7 +28,7 @@ NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
 
 class InstrumentTable(BaseModel):
-    """``[instruments.NAME]``: the driver, its address, and the driver's own settings beside them."""
+    """``[instruments.NAME]``: the driver, its address, and the settings of the driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
     driver: str = Field(description="the id of an instrument plugin; 'errormotion plugins list' shows them")
@@ -49,7 +49,7 @@ class BenchTable(BaseModel):
 class TestTable(BaseModel):
     """``[[test]]``: one measurement."""
 
-    __test__ = False  # pytest: this is no test
+    __test__ = False  # not a test of pytest
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     name: str = Field(pattern=NAME, description="a name of letters, digits, - and _")
@@ -105,12 +105,12 @@ class BenchPlan:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of instruments on offer."""
+        """Kinds of the instruments."""
         return tuple(sorted({instrument.driver.info.kind for instrument in self.instruments}))
 
     @property
     def settings_by_kind(self) -> dict[str, Any]:
-        """Settings of the instruments by their kind; of several of a kind, the first."""
+        """Settings of the instruments by kind; of several of a kind, the first."""
         return {each.driver.info.kind: each.settings for each in reversed(self.instruments)}
 
     def chosen(self, choice: Mapping[str, str]) -> BenchPlan:
@@ -146,11 +146,11 @@ class CampaignPlan:
     source: Path
     text: str
     folder: Path
-    """Where files are looked for that its settings name."""
+    """Folder of the files that the settings name."""
 
     @property
     def sha256(self) -> str:
-        """Hash of what is to be done: the texts of campaign and bench."""
+        """Hash of the texts of campaign and bench."""
         return hashlib.sha256(f"{self.text}\0{self.bench.text}".encode()).hexdigest()
 
 
@@ -160,7 +160,7 @@ def load_bench(path: str | Path) -> BenchPlan:
     Raises
     ------
     BenchError
-        The file cannot be read, or holds mistakes: all of them in one message.
+        The file cannot be read, or contains errors; all in one message.
     """
     path = Path(path)
     tomlfile.read_toml(path, error=BenchError)
@@ -173,30 +173,30 @@ def load_campaign(path: str | Path) -> CampaignPlan:
     Raises
     ------
     BenchError
-        One of the files cannot be read, or holds mistakes: all of a file's mistakes in one message.
+        A file cannot be read, or contains errors; all errors of a file in one message.
     """
     path = Path(path)
     data = tomlfile.read_toml(path, error=BenchError)
     bench = data.get("bench")
-    plan, trouble = None, None
+    plan, bench_error = None, None
     if isinstance(bench, str):
         try:
             plan = load_bench(path.parent / bench)
         except BenchError as error:
-            trouble = error
+            bench_error = error
     try:
         campaign = parse_campaign(path.read_text(encoding="utf-8-sig"), path, plan)
     except BenchError as error:
-        if trouble is None:
+        if bench_error is None:
             raise
-        raise trouble if not str(error).strip() else BenchError(f"{error}\n{trouble}") from None
+        raise bench_error if not str(error).strip() else BenchError(f"{error}\n{bench_error}") from None
     if mistakes := list(_missing(campaign)):
         raise BenchError(tomlfile.report(path, mistakes))
     return campaign
 
 
 def _missing(campaign: CampaignPlan) -> Iterator[str]:
-    """Tell which files that settings name are not there, or are not what they should be."""
+    """Yield the errors that methods find in their settings, such as missing files."""
     for number, test in enumerate(campaign.tests):
         check = getattr(test.method, "check", None)
         if check is not None:
@@ -236,7 +236,7 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
     """Check the text of a campaign file against its bench; ``source`` is for the messages.
 
-    Without a bench the text has at least the mistake that it names none, and BenchError tells it with all others.
+    Without a bench, BenchError reports the missing bench with all other errors.
     """
     data = tomllib.loads(text)
     table, mistakes = tomlfile.check(data, CampaignTable)
@@ -251,17 +251,12 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         raise BenchError(tomlfile.report(source, mistakes))
     if bench is None:
         raise BenchError("")
-    tests = tuple(
-        TestPlan(
-            test.name,
-            plugins.get("methods", test.method),
-            _settings("methods", test.method, test.settings, ())[0],
-            test.inputs,
-            test.instruments,
-        )
-        for test in table.test
-    )
-    return CampaignPlan(table.name, bench, tests, Path(table.runs), source, text, source.parent.resolve())
+    tests = []
+    for test in table.test:
+        method = plugins.get("methods", test.method)
+        settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
+    return CampaignPlan(table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve())
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:
@@ -280,7 +275,7 @@ def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) ->
 
 
 def _tables(value: Any) -> list[tuple[str | int, dict[str, Any]]]:
-    """Return the tables below a key with their keys or numbers, whatever else may be wrong with the file."""
+    """Return the tables below a key with their keys or numbers, also of a file with errors."""
     pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     return [(key, entry) for key, entry in pairs if isinstance(entry, dict)]
 
@@ -309,21 +304,17 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
                     f"{tomlfile.dotted(place)}: the method '{entry['method']}' needs one {kind}; the bench "
                     f'{bench.source} offers {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
                 )
-        mistakes += _machine_mistakes(entry["method"], found, bench, place)
+        method = plugins.get("methods", entry["method"])
+        found = completed(method, found, bench.description)
+        for key, text in contradictions(method, found, bench.description).items():
+            where = tomlfile.dotted((*place, "settings", *([key] if key else [])))
+            mistakes.append(f"{where}: {text} ([machine] of {bench.source})")
         mistakes += _limit_mistakes(entry["method"], found, bench, place)
     return mistakes
 
 
-def _machine_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> Iterator[str]:
-    """Yield which settings contradict the machine of the bench."""
-    check = getattr(plugins.get("methods", method)(), "check_machine", None)
-    if check is not None and bench.description is not None:
-        for key, text in check(settings, bench.description).items():
-            yield f"{tomlfile.dotted((*place, 'settings', key))}: {text} ([machine] of {bench.source})"
-
-
 def _choice_mistakes(choice: Any, place: tuple[str | int, ...], bench: BenchPlan) -> list[str] | None:
-    """Return which chosen instruments are not on the bench; None where the choice is no table of names."""
+    """Return the selected instruments that are not on the bench; None if the selection is not a table of names."""
     if not isinstance(choice, dict) or not all(isinstance(name, str) for name in choice.values()):
         return None
     mistakes = []
@@ -344,7 +335,7 @@ def _choice_mistakes(choice: Any, place: tuple[str | int, ...], bench: BenchPlan
 
 
 def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[str | int, ...]) -> list[str]:
-    """Return what the test would do beyond the limits of the bench."""
+    """Return the violations of the limits of the bench by a test."""
     where = tomlfile.dotted(place)
     try:
         steps = steps_of(plugins.get("methods", method), settings, bench.settings_by_kind)
@@ -358,7 +349,7 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
 def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[str]) -> list[str]:
     mistakes = []
     if test.name in earlier:
-        mistakes.append(f"{tomlfile.dotted((*place, 'name'))}: expected a name of its own; found '{test.name}' again")
+        mistakes.append(f"{tomlfile.dotted((*place, 'name'))}: expected a unique name; found '{test.name}' again")
     for key, name in test.inputs.items():
         if name not in earlier:
             where = tomlfile.dotted((*place, "inputs", key))
@@ -370,7 +361,7 @@ def _name_mistakes(test: TestTable, place: tuple[str | int, ...], earlier: list[
 def _settings(
     group: plugins.Group, plugin_id: str, data: Mapping[str, Any], place: tuple[str | int, ...]
 ) -> tuple[Any, list[str]]:
-    """Return a plugin's checked settings, or None and the mistakes."""
+    """Return the checked settings of a plugin, or None and the errors."""
     try:
         cls = plugins.get(group, plugin_id)
     except PluginError as error:

@@ -9,7 +9,14 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from errormotion.errors import ErrormotionError
+
 ROOT = "errormotion"
+
+
+def cause_of(error: BaseException) -> str:
+    """Return an error as text for the operator; with its class if it is a defect of a program."""
+    return str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
 
 
 class JsonLines(logging.Formatter):

@@ -1,4 +1,4 @@
-"""``[machine]`` of a bench file: the table, read into the description of a machine."""
+"""``[machine]`` of a bench file: read into the description of a machine, and compared with limits and settings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from errormotion.campaign.limits import AXES, Limits
-from errormotion.datasets import tomlfile
+from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import Angle, Length, format_quantity
 from errormotion.kinematics.description import DescriptionError, MachineDescription
 
@@ -80,6 +80,21 @@ def read_machine(data: Mapping[str, Any], *, key: str = "machine") -> tuple[Mach
     except DescriptionError as error:
         return None, [f"{key}.{name}: {text}" for name, text in error.mistakes.items()]
     return description, []
+
+
+def completed(method: Any, settings: Any, machine: MachineDescription | None) -> Any:
+    """Return the settings of a method with the values that the machine gives to those that are not stated."""
+    defaults = getattr(method(), "machine_defaults", None)
+    if defaults is None or machine is None:
+        return settings
+    given = {key: value for key, value in defaults(machine).items() if key not in settings.model_fields_set}
+    return settings.model_copy(update=given)
+
+
+def contradictions(method: Any, settings: Any, machine: MachineDescription | None) -> Mapping[str, str]:
+    """Return what contradicts the machine in the settings of a method, by setting."""
+    check = getattr(method(), "check_machine", None)
+    return {} if check is None or machine is None else dict(check(settings, machine))
 
 
 def limits_within(limits: Limits, machine: MachineDescription) -> tuple[Limits, list[str]]:

@@ -25,12 +25,12 @@ from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import RunFolder, list_runs, now
-from errormotion.campaign.journal import journal
+from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
-from errormotion.datasets.folders import looking_beside
-from errormotion.errors import ErrormotionError, RunError
+from errormotion.datasets.files.folders import looking_beside
+from errormotion.errors import RunError
 
 log = logging.getLogger(__name__)
 
@@ -272,6 +272,8 @@ class _Session:
         log.info("acquire", extra={"data": {"test": test.name, "method": method.info.id, "samples": before}})
         self.progress.stage("measuring", expected)
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
+        if bench.description is not None:
+            attrs["chain"] = bench.description.moving_chain
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
@@ -327,7 +329,7 @@ class _Session:
             path = self.report(folder.path)
         except Exception as error:
             log.exception("the report failed")
-            folder.step("report", "failed", reason=f"{type(error).__name__}: {error}")
+            folder.step("report", "failed", reason=cause_of(error))
         else:
             folder.step("report", "done")
             folder.data["report"] = path.relative_to(folder.path).as_posix()
@@ -360,7 +362,7 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
     except Exception as error:
-        reason = str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
+        reason = cause_of(error)
         log.exception("failed")
         marked = f"disk full: {reason}" if isinstance(error, DiskFullError) else reason
         folder.step("stop", "failed", reason=marked)

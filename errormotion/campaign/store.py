@@ -103,10 +103,15 @@ class RawStore:
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(_plain(first.attrs))
         encoding: dict[str, dict[str, Any]] = {}
-        for name, stored in skeleton.variables.items():
-            if stored.dtype.kind == "U":
-                skeleton[name] = stored.astype(np.dtypes.StringDType())
-            skeleton[name].encoding = {}
+        # Objects become texts of free length with every version of xarray; an empty array of objects has no type.
+        texts = {
+            name: variable.astype(object if variable.size else np.dtypes.StringDType())
+            for name, variable in skeleton.variables.items()
+            if variable.dtype.kind == "U"
+        }
+        coordinates = [name for name in texts if name in skeleton.coords]
+        skeleton = skeleton.drop_indexes([name for name in coordinates if name in skeleton.xindexes])
+        skeleton = skeleton.assign(texts).set_coords(coordinates).drop_encoding()
         for name, variable in growing.items():
             chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]

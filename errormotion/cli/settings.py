@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from errormotion.datasets import tomlfile
+from errormotion.datasets.files import tomlfile
 from errormotion.errors import MethodError
 
 

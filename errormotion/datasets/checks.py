@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.sampling import sample, steps
+from errormotion.datasets.files.sampling import sample, steps
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError

@@ -12,7 +12,7 @@ from typing import Any, cast
 import xarray as xr
 from pydantic import BaseModel
 
-from errormotion.datasets.hashing import hash_dataset, plain
+from errormotion.datasets.files.hashing import hash_dataset, plain
 
 __all__ = ["hash_dataset", "make", "of", "plain"]
 
@@ -42,7 +42,7 @@ def make(
     steps : sequence
         What was done, in order.
     raw_hash : str, optional
-        The hash of ``raw`` if it is known already, from `errormotion.datasets.hashing.DatasetHasher`.
+        The hash of ``raw`` if it is known already, from `errormotion.datasets.files.hashing.DatasetHasher`.
 
     Returns
     -------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import os
@@ -131,7 +132,9 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
         else:
             # Composed in memory: HDF5 crashes the process when the disk fills up under an open file.
             ready = storable(ds)
-            part.write_bytes(ready.to_netcdf(engine="h5netcdf", encoding=_compression(ready)))
+            composed = io.BytesIO()  # ours: Python 3.13 complains of one that is closed while its contents are in use
+            ready.to_netcdf(composed, engine="h5netcdf", encoding=_compression(ready))
+            part.write_bytes(composed.getvalue())
         _sync(part)
         _refuse_existing(path, overwrite)
         _replace(part, path)

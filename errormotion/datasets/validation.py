@@ -8,9 +8,9 @@ import xarray as xr
 
 from errormotion import plugins
 from errormotion.datasets.error_checks import error_violations
+from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.raw import raw_violations, variant_of
 from errormotion.datasets.schemas import SCHEMA, RawSchema, known_schemas
-from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 
 

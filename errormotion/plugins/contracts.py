@@ -299,9 +299,12 @@ class Method(Protocol):
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 
+    ``machine_defaults(machine)`` : mapping of str to value
+        Settings that follow from the machine of the bench (a `MachineDescription`), for a campaign that does not state
+        them.
     ``check_machine(settings, machine)`` : mapping of str to str
-        Which settings contradict the machine of the bench (a `MachineDescription`), by setting, with what was expected
-        and what was found; used when a campaign is read.
+        What contradicts the machine, by setting (an empty text for the whole), with what was expected and what was
+        found; used when a campaign is read.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
 

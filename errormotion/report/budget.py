@@ -1,4 +1,4 @@
-"""The uncertainty budget at one instant, by group of sources, and the twist that it belongs to."""
+"""Uncertainty budget at one instant by group of sources, and the corresponding errors."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _INDEPENDENT = "sensor noise, independent from instant to instant"
 
 
 def groups_at(errors: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return the standard uncertainty (n,) of every group of sources at one place, the independent rest last.
+    """Return the standard uncertainty (n,) of every group of sources at one position or time, the independent last.
 
     Parameters
     ----------
     errors : Dataset
-        An error dataset without dims of place left (``isel`` it first).
+        An error dataset without dims of position or time (apply ``isel`` first).
     """
     budget = errors.em.budget()
     return {str(name): budget.sel(group=name).values for name in budget["group"].values}
@@ -34,13 +34,13 @@ def sigma(errors: xr.Dataset) -> np.ndarray:
 
 
 def table(errors: xr.Dataset, when: str) -> Table:
-    """Return the budget table at one place; ``errors`` has no dims of place left."""
+    """Return the budget table at one position or time; ``errors`` has no such dims."""
     groups = groups_at(errors)
     names = errors.em.names
     units = [UM if i < 3 else SECOND_OF_ARC for i in range(len(names))]
     sizes = np.array([size for _, size in units])
     combined = sigma(errors)
-    reason = "not observed by this method"
+    reason = "not determined by this method"
     decimals = [decimals_of(value, 3) for value in combined / sizes]
 
     def row(name: str, values: np.ndarray) -> list[Cell | str]:
@@ -62,12 +62,12 @@ def table(errors: xr.Dataset, when: str) -> Table:
 
 
 def readable(group: str) -> str:
-    """Return the name of a group of sources in words."""
+    """Return the readable name of a group of sources."""
     return _INDEPENDENT if group == "independent" else group.replace("_", " ")
 
 
 def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:
-    """Return the group with the largest share in the variance of one freedom, and that share; None where unknown."""
+    """Return the group with the largest share in the variance of one error, and this share; None if unknown."""
     index = FREEDOMS.index(freedom)
     shares = {name: float(values[index] ** 2) for name, values in groups_at(errors).items()}
     total = sum(share for share in shares.values() if math.isfinite(share))
@@ -78,12 +78,12 @@ def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:
 
 
 def twist_table(errors: xr.Dataset, places: dict[str, xr.Dataset], names: dict[str, str]) -> Table:
-    """Return the six error motions at a few places; a freedom that the method does not see is a dash."""
+    """Return the table of the six errors at a few positions; an undetermined error is a dash."""
     rows: list[list[Cell | str]] = []
     for i, freedom in enumerate(errors.em.names):
         unit, size = UM if i < 3 else SECOND_OF_ARC
         unseen = not np.isfinite(errors[freedom].values).any()
-        reason = "not observed by this method" if unseen else "no valid reading at this place"
+        reason = "not determined by this method" if unseen else "no valid reading at this position"
         cells = []
         for place in places.values():
             cells.append(estimate(float(place[freedom]) / size, 2 * sigma(place)[i] / size, reason=reason))

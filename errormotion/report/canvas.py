@@ -1,4 +1,4 @@
-"""Drawing for the page: one style, curves thinned to what the eye sees, and SVG that can stand inside HTML."""
+"""Drawings of the page: common style, curves reduced to the visible resolution, and SVG for HTML."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-#: After Okabe and Ito, told apart with every kind of colour vision; the light ones darkened, to be read as text.
+#: After Okabe and Ito, distinguishable with any colour vision; light colours are darkened so that text is legible.
 BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
     "#0072B2",
     "#3291C8",
@@ -29,7 +29,7 @@ BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE, BLACK = (
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE, BLACK)
 DASHES: tuple[tuple[float, ...] | None, ...] = (None, (5, 2), (1.5, 1.5), (6, 2, 1.5, 2))
 WIDTH = 6.9  # inch: the text width of an A4 page
-LEFT, RIGHT, TOP, BOTTOM, GAP = 0.52, 0.36, 0.24, 0.4, 0.26  # inch: room around and between panels
+LEFT, RIGHT, TOP, BOTTOM, GAP = 0.52, 0.36, 0.24, 0.4, 0.26  # inch: margins around and between panels
 _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "errormotion",
@@ -63,14 +63,14 @@ _STYLE: Any = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Hold the report's style; foreign glyphs and mathematics in names are shown as they are."""
+    """Apply the style of the report; special characters in names are shown unchanged."""
     with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
         yield
 
 
 def draw(paint: Callable[[Figure], None], key: str, height: float, width: float = WIDTH) -> Markup:
-    """Return the SVG of a figure that ``paint`` fills; ``key`` keeps its identifiers apart from other figures'."""
+    """Return the SVG of a figure that ``paint`` fills; ``key`` makes its identifiers unique."""
     with style():
         figure = Figure(figsize=(width, height))
         paint(figure)
@@ -80,9 +80,9 @@ def draw(paint: Callable[[Figure], None], key: str, height: float, width: float 
 
 
 def stack(figure: Figure, heights: Sequence[float], right: float = RIGHT) -> list[Axes]:
-    """Return panels above one another with one time axis, at fixed places: figures on a page line up.
+    """Return stacked panels with one time axis at fixed positions, so that figures on a page are aligned.
 
-    ``heights`` are those of the panels in inches; the figure is `stack_height` high.
+    ``heights`` of the panels are in inches; the height of the figure is `stack_height`.
     """
     wide, high = figure.get_size_inches()
     made: list[Axes] = []
@@ -102,12 +102,12 @@ def stack_height(heights: Sequence[float]) -> float:
 
 
 def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.ndarray, np.ndarray]:
-    """Return (t, y) with at most two points a bin, the lowest and the highest in their order.
+    """Return (t, y) with at most two points for each bin, the lowest and the highest in chronological order.
 
     Parameters
     ----------
     time, values : ndarray, (n,)
-        ``values`` may hold NaN; a bin of nothing else stays as one NaN, so that the gap is seen.
+        ``values`` may contain NaN; a bin of NaN alone gives one NaN, so that the gap is visible.
     """
     if values.size <= 2 * bins:
         return time, values
@@ -126,7 +126,7 @@ def decimate(time: np.ndarray, values: np.ndarray, bins: int = 450) -> tuple[np.
 def envelope(
     time: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int = 300
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (t, lowest, highest) of a band in each bin; NaN where a bin holds nothing."""
+    """Return (t, lowest, highest) of a band in each bin; NaN in empty bins."""
     if time.size <= bins:
         return time, low, high
     parts = np.array_split(np.arange(time.size), bins)
@@ -148,7 +148,7 @@ def curve(
     dash: tuple[float, ...] | None = None,
     width: float = 1.1,
 ) -> None:
-    """Draw one curve and, where an expanded uncertainty is given, its band."""
+    """Draw one curve, with a band if an expanded uncertainty is given."""
     if expanded is not None and np.isfinite(expanded).any():
         t, low, high = envelope(time, values - expanded, values + expanded)
         axes.fill_between(t, low, high, color=colour, alpha=0.22, linewidth=0)
@@ -157,7 +157,7 @@ def curve(
 
 
 def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
-    """Write the names of curves at their right ends, kept apart from one another.
+    """Write the names of curves at their right ends without overlap.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def label_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
 
 
 def inline(svg: str, key: str) -> Markup:
-    """Return an SVG file as an element for HTML: no namespaces, metadata, style sheet, foreign fonts or loose ids."""
+    """Return an SVG file as an element for HTML: no namespaces, metadata, style sheet, font families or unused ids."""
     root = ElementTree.fromstring(svg)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -219,11 +219,11 @@ def inline(svg: str, key: str) -> Markup:
 
 
 def _short(path: str) -> str:
-    """Path data with a hundredth of a point, which is finer than any printer."""
+    """Return path data with a resolution of 0.01 points."""
     numbers = re.sub(r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), path)
     return re.sub(r"\s+", " ", numbers).strip()
 
 
 def _font(text: str) -> str:
-    """Return a style whose font family is left to the page."""
+    """Return a style without font family, which is that of the page."""
     return re.sub(r"font-family: [^;]*;? ?", "", text)

@@ -1,6 +1,6 @@
-"""What a report is made of: parts, sections and blocks, free of any look.
+"""Elements of a report: parts, sections and blocks, independent of layout.
 
-Builders make these from datasets; the templates turn them into a page. Text is plain text: the template escapes it.
+Chapters build them from datasets; templates render them. Text is plain text, which the templates escape.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from errormotion.report.text import DASH, rounded
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell of a table: text, perhaps an expanded uncertainty, or the reason why there is nothing."""
+    """One cell of a table: text, an optional expanded uncertainty, and the reason of a missing value."""
 
     text: str | Markup
     uncertainty: str = ""
@@ -27,7 +27,7 @@ class Cell:
 def estimate(
     value: float, expanded: float, *, reason: str = "", signed: bool = True, unit: str = "", digits: int = 4
 ) -> Cell:
-    """Return a value with its expanded uncertainty, both rounded together; a dash with its reason where it is NaN."""
+    """Return a value with its expanded uncertainty, rounded consistently; a dash with its reason for NaN."""
     text, uncertainty = rounded(value, expanded, signed=signed, digits=digits)
     if text == DASH:
         return Cell(DASH, reason=reason or "not determined")
@@ -38,7 +38,7 @@ def estimate(
 
 
 def or_dash(text: str, reason: str) -> Cell:
-    """Return a cell of this text; where the text is a dash, with the reason for it."""
+    """Return a cell of this text; if the text is a dash, with its reason."""
     return Cell(text, reason=reason if text == DASH else "")
 
 
@@ -63,7 +63,7 @@ class Table:
 
     @property
     def footnotes(self) -> dict[str, str]:
-        """Mark of every reason that stands in a cell, in reading order: a, b, c ..."""
+        """Marks of all reasons in cells, in reading order: a, b, c ..."""
         reasons = (cell.reason for row in self.rows for cell in row if isinstance(cell, Cell) and cell.reason)
         return {reason: _mark(i) for i, reason in enumerate(dict.fromkeys(reasons))}
 
@@ -76,7 +76,7 @@ def _mark(index: int) -> str:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing as inline SVG, with a caption and with words for those who cannot see it."""
+    """A drawing as inline SVG, with a caption and a description for readers who cannot see it."""
 
     svg: Markup
     caption: str
@@ -85,7 +85,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """One of the few numbers that matter, for the head of the report."""
+    """One of the most important numbers, for the head of the report."""
 
     label: str
     value: Cell
@@ -98,7 +98,7 @@ Block = Text | Table | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A titled run of blocks; ``name`` is its anchor in the page."""
+    """A titled sequence of blocks; ``name`` is its anchor in the page."""
 
     name: str
     title: str
@@ -109,8 +109,8 @@ class Section:
 class Part:
     """One chapter of a report.
 
-    ``kind`` is the title line of a report whose first chapter this is. ``stated`` is whether the chapter states errors
-    with their uncertainty; a log does not.
+    ``kind`` is the title line of a report that starts with this chapter. ``stated`` is whether the chapter states
+    errors with their uncertainty; a log does not.
     """
 
     title: str
@@ -124,7 +124,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Source:
-    """What a chapter is made from: one dataset, and what else is known of the measurement.
+    """Source of a chapter: one dataset, and other data of the measurement.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Source:
     raw : Dataset, optional
         The raw dataset that the errors come from.
     run : mapping
-        The content of ``run.json``, as far as there is one.
+        The content of ``run.json``, if there is one.
     provenance : mapping
         The provenance of the errors, read from its JSON.
     key : str
@@ -148,6 +148,6 @@ class Source:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Effective settings of the method, as the provenance holds them; empty where it holds none."""
+        """Effective settings of the method from the provenance; empty if there are none."""
         settings = self.provenance.get("settings")
         return settings if isinstance(settings, Mapping) else {}

@@ -1,4 +1,4 @@
-"""Maps in vector graphics: coloured cells and filled contours, with zero in the middle of a diverging scale."""
+"""Maps in vector graphics: coloured cells and filled contours; a diverging scale has zero in its middle."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from matplotlib.ticker import MaxNLocator
 from errormotion.arrays import Array
 from errormotion.report.canvas import BLUE, VERMILLION
 
-#: Blue below zero, white at it, vermillion above: told apart with every kind of colour vision.
+#: Blue below zero, white at zero, vermillion above: distinguishable with any colour vision.
 DIVERGING = LinearSegmentedColormap.from_list(
     "diverging", ["#00305A", BLUE, "#9CCBE8", "#FFFFFF", "#F5BE98", VERMILLION, "#6B2A00"]
 )
 
 
 def scale_of(values: Array, most: int, colours: Colormap = DIVERGING) -> ScalarMappable:
-    """Return a scale of at most some ``most`` round bands over the finite values.
+    """Return a scale of about ``most`` bands with round limits over the finite values.
 
-    A diverging one has its middle at zero and as much colour a unit on either side, and shows the bands in use only.
+    A diverging scale has its middle at zero, is symmetric, and shows only the used bands.
     """
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (-1.0, 1.0)
@@ -40,15 +40,15 @@ def scale_of(values: Array, most: int, colours: Colormap = DIVERGING) -> ScalarM
 
 
 def cells(axes: Axes, x: Array, y: Array, values: Array, scale: ScalarMappable) -> None:
-    """Draw a cell for each value; a NaN stays empty.
+    """Draw a cell for each value; NaN is empty.
 
-    Equal neighbours in a row become one rectangle, and all rectangles of a colour one path: a map of 40 x 40 cells
-    takes some 50 kB.
+    Equal neighbours in a row are joined to one rectangle, and all rectangles of one colour to one path: a map of
+    40 x 40 cells has about 50 kB.
 
     Parameters
     ----------
     x, y : (u,), (v,)
-        Middles of the cells, increasing.
+        Centres of the cells, increasing.
     values : (v, u)
     scale : ScalarMappable
         From `scale_of`.
@@ -66,7 +66,7 @@ def cells(axes: Axes, x: Array, y: Array, values: Array, scale: ScalarMappable) 
                 rectangles.append([(left, low), (right, low), (right, high), (left, high), (left, low)])
         codes = [Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY] * len(rectangles)
         colour = scale.to_rgba((bounds[number] + bounds[number + 1]) / 2)
-        # The thin outline hides the seams through which the page would show.
+        # The thin outline hides gaps between the rectangles.
         axes.add_patch(PathPatch(Path(np.concatenate(rectangles), codes), facecolor=colour, edgecolor=colour, lw=0.3))
     axes.set_xlim(across[0], across[-1])
     axes.set_ylim(up[0], up[-1])
@@ -80,7 +80,7 @@ def contours(axes: Axes, x: Array, y: Array, values: Array, scale: ScalarMappabl
     x, y : (u,), (v,)
         Increasing.
     values : (v, u)
-        Where one is NaN, the triangles that touch it stay empty.
+        Triangles with a NaN are empty.
     scale : ScalarMappable
         From `scale_of`.
     """
@@ -89,12 +89,12 @@ def contours(axes: Axes, x: Array, y: Array, values: Array, scale: ScalarMappabl
     axes.contourf(x, y, masked, levels=bounds, cmap=scale.cmap, norm=scale.norm, corner_mask=True)
     inside = bounds[(bounds > masked.min()) & (bounds < masked.max())]
     for levels, colour, width in ((inside, "#ffffff", 0.4), (inside[inside == 0], "#444444", 0.8)):
-        if levels.size:  # the white lines also hide the seams between the bands
+        if levels.size:  # the white lines also hide gaps between the bands
             axes.contour(x, y, masked, levels=levels, colors=colour, linewidths=width, corner_mask=True)
 
 
 def edges(middles: Array) -> Array:
-    """Return the bounds (n + 1,) of cells by their middles (n,), which increase."""
+    """Return the bounds (n + 1,) of cells from their increasing centres (n,)."""
     if middles.size < 2:
         half = 0.5 if not middles.size or middles[0] == 0 else 0.05 * abs(float(middles[0]))
         return np.concatenate([middles - half, middles + half])
@@ -103,10 +103,9 @@ def edges(middles: Array) -> Array:
 
 
 def colour_bar(axes: Axes, scale: ScalarMappable, place: tuple[float, float, float, float], label: str) -> None:
-    """Draw a colour bar at a place (left, bottom, width, height) in fractions of the figure."""
+    """Draw a colour bar at ``place`` (left, bottom, width, height), fractions of the figure."""
     figure = axes.figure
-    room = figure.add_axes(place)
-    bar = figure.colorbar(scale, cax=room, spacing="proportional", drawedges=False)
+    bar = figure.colorbar(scale, cax=figure.add_axes(place), spacing="proportional", drawedges=False)
     bar.outline.set_linewidth(0.4)
     bounds = np.asarray(scale.norm.boundaries)  # type: ignore[attr-defined]
     every = max(1, int(np.ceil((bounds.size - 1) / 8)))

@@ -1,4 +1,4 @@
-"""Where the numbers come from: instruments, settings, software, hashes; and whether any of it was simulated."""
+"""Provenance: instruments, settings, software, hashes; and whether data were simulated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _INSTRUMENT = ("name", "manufacturer", "model", "serial_number", "firmware", "ad
 
 
 def read(errors: xr.Dataset) -> dict[str, Any]:
-    """Return the provenance of a dataset; what is no JSON object comes back under ``text``."""
+    """Return the provenance of a dataset; text that is not a JSON object is returned under ``text``."""
     text = errors.attrs.get("provenance", "{}")
     if isinstance(text, Mapping):
         return dict(text)
@@ -30,7 +30,7 @@ def read(errors: xr.Dataset) -> dict[str, Any]:
 
 
 def simulated(*sources: Any) -> str:
-    """Return why the data count as simulated, from anything nested; empty where nothing says so."""
+    """Return why nested data are considered simulated; empty if they are not."""
     for source in sources:
         for path, value in walk(source):
             address = _address(value, "sim://", "twin://")
@@ -42,14 +42,14 @@ def simulated(*sources: Any) -> str:
 
 
 def replayed(*sources: Any) -> str:
-    """Return the address of a recording that was played back; empty where there is none."""
+    """Return the address of a replayed recording; empty if there is none."""
     return next(
         (found for source in sources for _, value in walk(source) if (found := _address(value, "replay://"))), ""
     )
 
 
 def _address(leaf: Any, *schemes: str) -> str:
-    """Return the first address with one of these schemes in a leaf, JSON text included; empty where there is none."""
+    """Return the first address with one of these schemes in a leaf, including JSON text; empty if there is none."""
     entries = leaf if isinstance(leaf, (list, tuple)) else [leaf]
     pattern = rf'(?:^\s*|")((?:{"|".join(schemes)})[^"]*)'
     found = (re.search(pattern, entry, re.IGNORECASE) for entry in entries if isinstance(entry, str))
@@ -69,7 +69,7 @@ def walk(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ..
 
 
 def instruments(provenance: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the instruments as flat rows of text; channels of a frame follow the frame itself."""
+    """Return the instruments as flat rows of text."""
     entries = provenance.get("instruments")
     if isinstance(entries, Mapping):
         entries = [{"name": name, **entry} for name, entry in entries.items() if isinstance(entry, Mapping)]
@@ -86,7 +86,7 @@ def instruments(provenance: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def instrument_table(provenance: Mapping[str, Any]) -> Table | None:
-    """Return the table of instruments; None where the provenance names none."""
+    """Return the table of instruments; None if the provenance has none."""
     rows = instruments(provenance)
     if not rows:
         return None
@@ -100,17 +100,17 @@ def instrument_table(provenance: Mapping[str, Any]) -> Table | None:
 
 
 def blocks(source: Source) -> list[Block]:
-    """Return the provenance as tables: instruments, settings, and the rest."""
+    """Return the provenance as tables: instruments, settings, and other items."""
     errors, provenance = source.errors, source.provenance
     run = {name: _brief(source.run[name]) for name in _RUN if source.run.get(name)}
     found: list[Block] = []
     table = instrument_table(provenance)
-    found.append(table if table is not None else Text("The provenance names no instrument.", "note"))
+    found.append(table if table is not None else Text("The provenance lists no instruments.", "note"))
     settings = [[name, value] for name, value in _flat(provenance.get("settings", {}))]
     if settings:
         found.append(
             Table(
-                "Effective settings of the method, defaults included, in SI units.",
+                "Effective settings of the method, including defaults, in SI units.",
                 ["setting", "value"],
                 settings,
                 numeric=False,
@@ -130,7 +130,7 @@ def blocks(source: Source) -> list[Block]:
 
 
 def _brief(value: Any) -> Any:
-    """Return an entry of ``run.json`` without the full text of a file, whose hash stands beside it."""
+    """Return an entry of ``run.json`` without the full text of a file, which is represented by its hash."""
     return {name: entry for name, entry in value.items() if name != "text"} if isinstance(value, Mapping) else value
 
 
@@ -139,7 +139,7 @@ def _flat(value: Any) -> list[tuple[str, str]]:
 
 
 def text(value: Any) -> str:
-    """Return a leaf of the provenance in words; an absent one as a dash."""
+    """Return a leaf of the provenance as text; a missing one as a dash."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if value is None or value == "" or (isinstance(value, (list, tuple, dict)) and not value):

@@ -1,4 +1,4 @@
-"""Data quality: what share of the samples was valid, what is missing, and where the gaps are."""
+"""Data quality: valid and missing samples, and gaps."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import numpy as np
 import xarray as xr
 
 from errormotion.report.document import Block, Cell, Table, Text
+from errormotion.report.fields import remarks
 from errormotion.report.series import minutes_of
 from errormotion.report.text import DASH, finite, fixed, integer, listed, minutes, percent
 
 
 def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
-    """Return the number of gaps and the length of the longest in the unit of time.
+    """Return the number of gaps and the duration of the longest one in the unit of time.
 
     Parameters
     ----------
     valid : ndarray of bool, (n,)
-        Whether an instant has any valid sample.
+        Whether an instant has a valid sample.
     time : ndarray, (n,)
     """
     if valid.size < 2 or valid.all():
@@ -34,7 +35,7 @@ def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
 
 
 def table(errors: xr.Dataset) -> Table | None:
-    """Return the table of validity and residuals by channel; None where the dataset holds neither."""
+    """Return the table of validity and residuals by channel; None if the dataset has neither."""
     if "valid_fraction" not in errors and "fit_residual" not in errors:
         return None
     holder = errors["valid_fraction" if "valid_fraction" in errors else "fit_residual"]
@@ -43,8 +44,8 @@ def table(errors: xr.Dataset) -> Table | None:
     for i, name in enumerate(holder["channel"].values):
         rows.append([str(name), *_validity(errors, i, time), *_residual(errors, i)])
     return Table(
-        "Validity of the samples and residuals of the fit, by channel. A gap is a run of instants without one valid "
-        "sample. Residual: reading minus the reading that the fitted bar predicts.",
+        "Validity of the samples and residuals of the fit, by channel. A gap is a sequence of instants without a valid "
+        "sample. Residual: reading minus the reading predicted from the fitted bar.",
         ["channel", "valid samples", "lowest instant", "gaps", "longest gap", "rms / µm", "largest / µm"],
         rows,
         [("", 1), ("validity", 4), ("residual", 2)],
@@ -75,22 +76,21 @@ def _residual(errors: xr.Dataset, i: int) -> list[Cell | str]:
 
 
 def notes(errors: xr.Dataset) -> list[Block]:
-    """Return what the method itself remarked."""
-    found = np.atleast_1d(np.asarray(errors.attrs.get("notes", []), dtype=object))
-    return [Text(str(note), "warning") for note in found if str(note).strip()]
+    """Return the notes of the method."""
+    return [Text(note, "warning") for note in remarks(errors)]
 
 
 def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
-    """Return what is to be said of completeness: instants, gaps in time, and what the raw dataset counted."""
+    """Return the completeness: instants, gaps in time, and the counts in the raw dataset."""
     blocks: list[Block] = []
     time = np.asarray(errors["time"].values, float) if "time" in errors.coords else np.array([])
     if time.size > 2:
         step = np.diff(time)
-        usual = float(np.median(step))
-        holes = np.flatnonzero(step > 1.5 * usual)
-        words = f"{integer(time.size)} instants, one every {fixed(usual, 3).rstrip('0').rstrip('.')} s"
-        if holes.size:
-            words += f"; the time axis has {len(holes)} gap(s), the longest {minutes(float(step[holes].max()))}"
+        interval = float(np.median(step))
+        missing = np.flatnonzero(step > 1.5 * interval)
+        words = f"{integer(time.size)} instants, one every {fixed(interval, 3).rstrip('0').rstrip('.')} s"
+        if missing.size:
+            words += f"; the time axis has {len(missing)} gap(s), the longest {minutes(float(step[missing].max()))}"
         blocks.append(Text(f"{words}."))
     seen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if np.isfinite(errors[name].values).any()]
     shares: dict[float, list[str]] = {}
@@ -103,12 +103,12 @@ def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
     counted = counts(errors, raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())
-        blocks.append(Text(f"Counted while measuring: {words}."))
+        blocks.append(Text(f"Counts of the measurement: {words}."))
     return blocks
 
 
 def counts(errors: xr.Dataset, raw: xr.Dataset | None) -> dict[str, str]:
-    """Return what result and raw dataset say of dropped and invalid samples, by name."""
+    """Return the counts of dropped and invalid samples in result and raw dataset, by name."""
     found = {}
     attributes = {} if raw is None else raw.attrs
     for name in ("dropped", "dropped_samples", "invalid_samples"):
@@ -123,7 +123,7 @@ def counts(errors: xr.Dataset, raw: xr.Dataset | None) -> dict[str, str]:
 
 
 def _reasons(invalid: Any) -> Mapping[str, Any]:
-    """Return reason to count, from a mapping or its JSON text."""
+    """Return counts by reason, from a mapping or its JSON text."""
     if isinstance(invalid, str):
         try:
             invalid = json.loads(invalid)

@@ -1,4 +1,4 @@
-"""The seven quantities of a spindle test as curves: displacements at two levels, Z, and two tilts."""
+"""The seven quantities of a spindle test over time: displacements at two levels, Z, and two tilts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LOOK: dict[str, tuple[str, tuple[float, ...] | None]] = {
 
 @dataclass(frozen=True)
 class Curve:
-    """One quantity over time in SI, with its standard uncertainty; both (time,), NaN where not determined."""
+    """One quantity over time in SI, with its standard uncertainty; both (time,), NaN if not determined."""
 
     name: str
     values: np.ndarray
@@ -48,17 +48,17 @@ class Curve:
 
     @property
     def unit(self) -> tuple[str, float]:
-        """Field unit and its size in SI."""
+        """Unit on the page, and its size in SI."""
         return unit_of(self.name)
 
 
 def unit_of(quantity: str) -> tuple[str, float]:
-    """Return the field unit of an ISO 230-3 quantity and its size in SI."""
+    """Return the unit of an ISO 230-3 quantity on the page, and its size in SI."""
     return SECOND_OF_ARC if quantity in ("A", "B") else UM
 
 
 def curves(errors: xr.Dataset) -> dict[str, Curve]:
-    """Return the seven quantities by name; NaN where the dataset does not hold one."""
+    """Return the seven quantities by name; NaN if the dataset does not contain one."""
     n = errors.sizes.get("time", 0)
     nothing = np.full(n, np.nan)
     found = dict.fromkeys(QUANTITIES, (nothing, nothing))
@@ -82,7 +82,7 @@ def minutes_of(errors: xr.Dataset) -> np.ndarray:
 
 
 def running(errors: xr.Dataset) -> np.ndarray | None:
-    """Return where the spindle turns, bool (time,); None where the speed is not known."""
+    """Return whether the spindle turns, bool (time,); None if the speed is unknown."""
     if "spindle_speed" not in errors or errors["spindle_speed"].dims != ("time",):
         return None
     speed = np.asarray(errors["spindle_speed"].values, float)
@@ -90,13 +90,13 @@ def running(errors: xr.Dataset) -> np.ndarray | None:
 
 
 def end_of_running(errors: xr.Dataset) -> int | None:
-    """Return the index of the last instant of running; None where the spindle never turns or it is not known.
+    """Return the index of the last instant with turning spindle; None if there is none or it is unknown.
 
-    The setting ``running_end`` of the method goes before the recorded speed.
+    The setting ``running_end`` of the method has priority over the recorded speed.
     """
     stated = read(errors).get("settings", {}).get("running_end")
     if isinstance(stated, (int, float)):
-        # Stated from the record's start; the dataset's time counts from the reference state.
+        # Relative to the start of the record; the time of the dataset is relative to the reference state.
         end = stated - float(errors.attrs.get("reference_time", 0.0))
         before = np.flatnonzero(errors["time"].values <= end + 1e-6)
         return int(before[-1]) if before.size else None
@@ -105,14 +105,14 @@ def end_of_running(errors: xr.Dataset) -> int | None:
 
 
 def last_known(values: np.ndarray, index: int | None = None) -> int | None:
-    """Return the last index at or before ``index`` with a finite value; None where there is none."""
+    """Return the last index at or before ``index`` with a finite value; None if there is none."""
     known = np.flatnonzero(np.isfinite(values[: None if index is None else index + 1]))
     return int(known[-1]) if known.size else None
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that was done to the machine, at a time in minutes; ``axes`` had their compensation changed."""
+    """A command to the machine, at a time in minutes; the compensation of ``axes`` was changed."""
 
     minute: float
     what: str
@@ -120,7 +120,7 @@ class Event:
 
 
 def events(source: Source) -> list[Event]:
-    """Return what the schedule in the settings says was done within the record, in order of time."""
+    """Return the commands of the schedule in the settings within the record, in chronological order."""
     schedule = source.settings.get("schedule")
     zero = float(source.errors.attrs.get("reference_time", 0.0))
     if not isinstance(schedule, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Numbers as a metrologist writes them (JCGM 100:2008, 7.2.6): uncertainty to two digits, value to the same place."""
+"""Format of numbers (JCGM 100:2008, 7.2.6): uncertainty with two digits, value with the same resolution."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 DASH = "—"
 ARCSEC = math.pi / 180 / 3600
 
-#: Field unit of a quantity: name, and its size in SI.
+#: Unit on the page: name, and size in SI.
 UM = ("µm", 1e-6)
 MM = ("mm", 1e-3)
 SECOND_OF_ARC = ("arcsec", ARCSEC)
@@ -54,17 +54,17 @@ def _decimal(value: float, place: int, signed: bool) -> str:
 
 
 def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
-    """Return a number with so many decimals and a true minus; a dash for NaN."""
+    """Return a number with this number of decimals and a typographic minus; a dash for NaN."""
     return _decimal(value, -decimals, signed) if math.isfinite(value) else DASH
 
 
 def decimals_of(value: float, digits: int) -> int:
-    """Return how many decimals show so many significant digits of a value; 0 for NaN."""
+    """Return the number of decimals for this number of significant digits; 0 for NaN."""
     return max(-_place(value, digits), 0) if math.isfinite(value) else 0
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """Return a number with so many significant digits, without an exponent; a dash for NaN."""
+    """Return a number with this number of significant digits, without exponent; a dash for NaN."""
     return _decimal(value, _place(value, digits), signed=False) if math.isfinite(value) else DASH
 
 
@@ -74,7 +74,7 @@ def integer(value: float) -> str:
 
 
 def percent(fraction: float) -> str:
-    """Return a share in per cent that never rounds up to 100 while something is missing."""
+    """Return a fraction in per cent that is not rounded to 0 or 100 unless it is exact."""
     if not math.isfinite(fraction):
         return DASH
     if fraction in (0.0, 1.0):
@@ -90,11 +90,11 @@ def minutes(seconds: float) -> str:
 
 
 def listed(words: list[str]) -> str:
-    """Return words as a list in a sentence: ``a, b and c``."""
+    """Return words as an enumeration: ``a, b and c``."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else ""
 
 
 def finite(reduce: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:
-    """Return a reduction over the finite values; NaN where there is none."""
+    """Return a reduction over the finite values; NaN if there are none."""
     kept = values[np.isfinite(values)]
     return float(reduce(kept)) if kept.size else math.nan

@@ -1,4 +1,4 @@
-"""Panels above one another over one time axis: errors with their bands, temperatures, spindle speed, feed."""
+"""Stacked panels over one time axis: errors with their bands, temperatures, spindle speed, feed."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from errormotion.report.series import Event
 from errormotion.report.text import DASH, SECOND_OF_ARC, UM, finite, fixed, integer
 
 DOTTED = 80
-"""Up to so many instants each gets its dot: these were measured, and what lies between was not."""
+"""Largest number of instants that are drawn as dots: values between them were not measured."""
 
 UNKNOWN = "#B3261E"
 _HOUR, _DAY = 3600.0, 86400.0
 _SHADE = "#f3c9a8"
-_LEAST = 1.0  # K: no axis of temperatures spans less, and its noise does not look like warming
+_SMALLEST_SPAN = 1.0  # K; smallest span of the axis of temperatures, so that noise does not resemble warming
 _LEGEND_ROW = 0.135  # inch
 _LOOKS = tuple((colour, dash) for dash in canvas.DASHES for colour in canvas.COLOURS)
 
 
 @dataclass(frozen=True)
 class Line:
-    """A curve (n,) in its field unit, with its expanded uncertainty where there is one."""
+    """A curve (n,) in the unit of the page, with its expanded uncertainty if known."""
 
     name: str
     values: Array
@@ -43,17 +43,17 @@ class Line:
 
     @property
     def last(self) -> float:
-        """Last known value; NaN where none is."""
+        """Last known value; NaN if there is none."""
         known = np.flatnonzero(np.isfinite(self.values))
         return float(self.values[known[-1]]) if known.size else math.nan
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves with one ordinate; named at their ends, or in a legend at the right where they are many.
+    """Curves with one ordinate; named at their ends, or in a legend.
 
-    ``strip`` panels are low, and filled from 0: what was done to the machine. ``held`` says whether each value acted
-    since the instant before, as a mean does, or from its instant on.
+    ``strip`` panels are low and filled from 0, for working parameters. ``held`` states whether each value applies since
+    the previous instant, like a mean, or from its own instant on.
     """
 
     title: str
@@ -71,19 +71,19 @@ class Panel:
         return f"{self.title} / {unit}" if self.unit else self.title
 
     def in_words(self) -> str:
-        """Say what a sighted reader takes from the curves."""
+        """Return a description of the curves for readers who cannot see them."""
         words = [
             f"{line.name} {fixed(finite(np.min, line.values), 2)} to {fixed(finite(np.max, line.values), 2)}, "
             f"last {fixed(line.last, 2)} {self.unit}"
             for line in self.lines
             if np.isfinite(line.values).any()
         ]
-        return f"{self.title}: {'; '.join(words) or 'nothing known'}"
+        return f"{self.title}: {'; '.join(words) or 'unknown'}"
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Instants (n,) in the unit that suits their span: ``size`` is the unit in seconds."""
+    """Instants (n,) in a unit suitable for their span; ``size`` is the unit in seconds."""
 
     values: Array
     unit: str
@@ -100,7 +100,7 @@ def clock(seconds: Array) -> Clock:
 
 
 def errors(dataset: xr.Dataset) -> list[Panel]:
-    """Return displacements and rotations of an error dataset over time; what is nowhere known has no curve."""
+    """Return displacements and rotations of an error dataset over time; unknown errors have no curve."""
     panels = []
     for title, first, (unit, size) in (("Displacements", 0, UM), ("Rotations", 3, SECOND_OF_ARC)):
         lines = []
@@ -121,9 +121,9 @@ def sigma(dataset: xr.Dataset, index: int) -> Array:
 
 
 def table(dataset: xr.Dataset, caption: str, reasons: Mapping[str, str] | None = None) -> Table:
-    """Return the six errors over time as numbers: spans, the largest, the last that is known.
+    """Return the table of the six errors over time: range, largest value, last known value.
 
-    ``reasons`` says why a freedom is nowhere known.
+    ``reasons`` states why an error is unknown at all times.
     """
     time = np.asarray(dataset["time"].values, float)
     rows: list[list[Cell | str]] = []
@@ -133,7 +133,7 @@ def table(dataset: xr.Dataset, caption: str, reasons: Mapping[str, str] | None =
         known = np.flatnonzero(np.isfinite(values))
         count = f"{integer(known.size)} of {integer(values.size)}"
         if not known.size:
-            lost = Cell(DASH, reason=(reasons or {}).get(name, "not observed by this method"))
+            lost = Cell(DASH, reason=(reasons or {}).get(name, "not determined by this method"))
             rows.append([name, unit, *[lost] * 5, count])
             continue
         most, last = int(np.nanargmax(np.abs(values))), int(known[-1])
@@ -145,7 +145,7 @@ def table(dataset: xr.Dataset, caption: str, reasons: Mapping[str, str] | None =
 
 
 def sensor_names(dataset: xr.Dataset) -> list[str]:
-    """Return the names of the temperatures; numbers where they have none, nothing where there are none."""
+    """Return the names of the temperature sensors, or numbers; empty without temperatures."""
     if "temperature" not in dataset or set(dataset["temperature"].dims) != {"time", "sensor"}:
         return []
     if "sensor" in dataset.coords:
@@ -154,18 +154,18 @@ def sensor_names(dataset: xr.Dataset) -> list[str]:
 
 
 def temperatures(names: Sequence[str], values: Array) -> list[Panel]:
-    """Return the panel of temperatures (n, sensor); none where none is known."""
+    """Return the panel of temperatures (n, sensor); empty if all are unknown."""
     known = [i for i in range(len(names)) if np.isfinite(values[:, i]).any()]
     if not known:
         return []
-    looks = [_LOOKS[place % len(_LOOKS)] for place in range(len(known))]
+    looks = [_LOOKS[k % len(_LOOKS)] for k in range(len(known))]
     lines = [Line(names[i], values[:, i], None, *look) for i, look in zip(known, looks, strict=True)]
     height = min(max(1.5, _LEGEND_ROW * len(known) + 0.1), 4.0)
     return [Panel("Temperatures", "°C", lines, height, legend=True)]
 
 
 def working(dataset: xr.Dataset, *, held: bool) -> list[Panel]:
-    """Return spindle speed and feed as strips, where they are known and a feed is ever there."""
+    """Return spindle speed and feed as strips, if known; the feed only if it is not always 0."""
     panels = []
     for name, title, unit, size in (
         ("spindle_speed", "Spindle speed", "1/min", 1.0),
@@ -186,7 +186,7 @@ def draw(
     done: Sequence[Event] = (),
     shaded: Array | None = None,
 ) -> Markup:
-    """Return the panels above one another.
+    """Return the drawing of stacked panels.
 
     Parameters
     ----------
@@ -194,11 +194,11 @@ def draw(
         The instants of all curves.
     panels : sequence of Panel
     key : str
-        Keeps identifiers apart.
+        Makes identifiers unique.
     done : sequence of Event
-        Set as dashed lines with their numbers.
+        Drawn as numbered dashed lines.
     shaded : (n,) of bool, optional
-        Instants with a coloured ground.
+        Instants with coloured background.
     """
     time = clock(seconds)
     names = [len(line.name) for panel in panels if panel.legend for line in panel.lines]
@@ -236,8 +236,8 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
     axes.margins(y=0.08)
     if panel.legend:
         low, high = axes.get_ylim()
-        if high - low < _LEAST:
-            axes.set_ylim((low + high - _LEAST) / 2, (low + high + _LEAST) / 2)
+        if high - low < _SMALLEST_SPAN:
+            axes.set_ylim((low + high - _SMALLEST_SPAN) / 2, (low + high + _SMALLEST_SPAN) / 2)
         curves = [drawn for drawn in axes.get_lines() if drawn.get_linestyle() != "None"]
         axes.legend(
             curves, [" " + line.name for line in panel.lines], loc="center left", bbox_to_anchor=(1.005, 0.5),
@@ -248,7 +248,7 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
 
 
 def alone(values: Array) -> NDArray[np.bool_]:
-    """Return known values without a known neighbour: no line leads to them."""
+    """Return known values without a known neighbour, which no line connects."""
     known = np.concatenate([[False], np.isfinite(values), [False]])
     return np.asarray(known[1:-1] & ~known[:-2] & ~known[2:])
 
@@ -266,7 +266,7 @@ def _strip(axes: Axes, panel: Panel, time: Array) -> None:
 
 
 def shade(axes: Axes, time: Array, where: Array) -> None:
-    """Colour the ground at these instants, half way to their neighbours."""
+    """Colour the background at these instants, up to the middle of their neighbours."""
     if not np.any(where):
         return
     half = np.diff(time) / 2
@@ -278,29 +278,29 @@ def shade(axes: Axes, time: Array, where: Array) -> None:
 
 
 def time_axis(axes: Axes, time: Clock) -> None:
-    """Name the time axis and end it with the record."""
+    """Label the time axis and limit it to the record."""
     axes.set_xlabel(f"time / {time.unit}")
     if time.values.size > 1:
-        margin = 0.008 * float(np.ptp(time.values)) if time.values.size <= DOTTED else 0.0  # room for the last dot
+        margin = 0.008 * float(np.ptp(time.values)) if time.values.size <= DOTTED else 0.0  # for the last dot
         axes.set_xlim(time.values[0] - margin, time.values[-1] + margin)
 
 
 def mark(axes: Axes, done: Sequence[Event], *, named: bool) -> None:
-    """Draw a dashed line at each event that lies within the axis, with its number above where ``named``."""
+    """Draw a dashed line at each event within the axis, with its number above if ``named``."""
     low, high = axes.get_xlim()
     inside = [event for event in done if low + 0.005 * (high - low) < event.minute < high]
     for event in inside:
         axes.axvline(event.minute, color="#999999", linewidth=0.6, linestyle=(0, (2, 2)), zorder=0.5)
     if named:
-        for place, name in _named_together(inside, 0.03 * (high - low)):
+        for minute, name in _labels(inside, 0.03 * (high - low)):
             axes.annotate(
-                name, (place, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
+                name, (minute, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
                 ha="center", fontsize=7,
             )  # fmt: skip
 
 
-def _named_together(inside: Sequence[Event], near: float) -> list[tuple[float, str]]:
-    """Return place and name of events by number; those closer than ``near`` share one name."""
+def _labels(inside: Sequence[Event], near: float) -> list[tuple[float, str]]:
+    """Return position and label of events by number; those closer than ``near`` share one label."""
     groups: list[list[int]] = []
     for i, event in enumerate(inside):
         if groups and event.minute - inside[groups[-1][-1]].minute < near:
@@ -313,7 +313,7 @@ def _named_together(inside: Sequence[Event], near: float) -> list[tuple[float, s
 
 
 def events_in_words(done: Sequence[Event]) -> str:
-    """Return what the numbered lines stand for; empty where there are none."""
+    """Return the meaning of the numbered lines; empty if there are none."""
     later = [event for event in done if event.minute > 0]
     if not later:
         return ""

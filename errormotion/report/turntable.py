@@ -1,6 +1,6 @@
-"""A drawing in space that the reader can turn, without any script: every view is drawn, and one is shown.
+"""A spatial drawing that can be rotated without scripts: all views are drawn, and one is shown.
 
-The views are chosen with radio buttons, so arrow keys turn the drawing. On paper stands the view that was chosen last.
+The views are selected with radio buttons, so that arrow keys rotate the drawing. The selected view is printed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Lines:
-    """Line segments (k, 2, 3), m, of one colour; ``head`` is the length of the arrows' heads in points."""
+    """Line segments (k, 2, 3), m, of one colour; ``head`` is the length of arrow heads in points."""
 
     ends: Array
     colour: str
@@ -38,7 +38,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Dots:
-    """Points (k, 3), m, with names where there are any."""
+    """Points (k, 3), m, with optional names."""
 
     places: Array
     colour: str
@@ -48,7 +48,7 @@ class Dots:
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """Ellipsoids at (k, 3), m, whose squared half axes are the eigenvalues of (k, 3, 3), m^2."""
+    """Ellipsoids at (k, 3), m; their squared semi-axes are the eigenvalues of (k, 3, 3), m^2."""
 
     places: Array
     shapes: Array
@@ -57,12 +57,12 @@ class Ellipsoids:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn; what comes later lies above."""
+    """Elements of the drawing; later ones are drawn on top."""
 
     parts: list[Lines | Dots | Ellipsoids] = field(default_factory=list)
 
     def points(self) -> Array:
-        """Return all places that must be in the picture, (k, 3)."""
+        """Return all points that must be visible, (k, 3)."""
         found = []
         for part in self.parts:
             if isinstance(part, Lines):
@@ -76,7 +76,7 @@ class Scene:
 
 
 def enlargement(longest: float, wanted: float) -> int:
-    """Return 1, 2 or 5 times a power of ten that draws a length at most as long as wanted; 1 at least."""
+    """Return the largest magnification (1, 2, 5 times a power of ten) that draws a length within ``wanted``."""
     if not (math.isfinite(longest) and longest > 0 and math.isfinite(wanted) and wanted > longest):
         return 1
     power = 10 ** math.floor(math.log10(wanted / longest))
@@ -84,7 +84,7 @@ def enlargement(longest: float, wanted: float) -> int:
 
 
 def camera(azimuth: float, elevation: float) -> Array:
-    """Return the directions to the right, upwards and towards the eye, (3, 3)."""
+    """Return the unit vectors to the right, upwards and towards the viewer, (3, 3)."""
     a, e = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]), elevation
     away = np.array([-a[1], a[0], 0.0])
     up = np.array([0.0, 0.0, np.cos(e)]) + away * np.sin(e)
@@ -92,7 +92,7 @@ def camera(azimuth: float, elevation: float) -> Array:
 
 
 def draw(scene: Scene, key: str) -> Markup:
-    """Return the drawing as HTML; ``key`` keeps its identifiers apart from those of others."""
+    """Return the drawing as HTML; ``key`` makes its identifiers unique."""
     views = [(2 * np.pi * k / _TURNS + np.radians(30.0), _ELEVATION, "") for k in range(_TURNS)]
     views += list(_FIXED)
     points = scene.points()
@@ -104,7 +104,7 @@ def draw(scene: Scene, key: str) -> Markup:
     buttons, pictures, rules = [], [], []
     for k, (azimuth, elevation, name) in enumerate(views):
         label = f"<label for='{key}-v{k}'>{name}</label> " if name else ""
-        title = name or f"turned by {30 * k}°"
+        title = name or f"rotated by {30 * k}°"
         checked = " checked" if k == 0 else ""
         buttons.append(f"<input type='radio' name='{key}' id='{key}-v{k}' aria-label='{title}'{checked}>{label}")
         pictures.append(_picture(scene, camera(azimuth, elevation), centre, scale, f"{key}-p{k}"))
@@ -115,7 +115,7 @@ def draw(scene: Scene, key: str) -> Markup:
         f"#{key}-t>label{{margin-right:6px}}@media print{{#{key}-t>:not(svg){{display:none}}}}"
     )
     return Markup(
-        f"<div id='{key}-t'><style>{style}</style><span>turn: </span>{''.join(buttons)}{''.join(pictures)}</div>"
+        f"<div id='{key}-t'><style>{style}</style><span>rotate: </span>{''.join(buttons)}{''.join(pictures)}</div>"
     )
 
 
@@ -145,7 +145,7 @@ def _lines(part: Lines, ends: Array) -> str:
         way = ends[:, 1] - ends[:, 0]
         size = np.linalg.norm(way, axis=1)
         for (_, tip), step, length in zip(ends, way, size, strict=True):
-            if length < 1.0:  # seen from its end: no head
+            if length < 1.0:  # parallel to the line of sight: no head
                 continue
             u = step / length
             back, side = tip - part.head * u, 0.38 * part.head * np.array([-u[1], u[0]])
@@ -156,7 +156,7 @@ def _lines(part: Lines, ends: Array) -> str:
 
 
 def _dots(part: Dots, places: Array, taken: list[_Box]) -> str:
-    """Draw points; names are set where they hide none of those that are ``taken`` already, if there is such a place."""
+    """Draw points; names are placed without overlap of the boxes ``taken``, if possible."""
     r = part.radius
     path = "".join(f"M{x - r:.1f} {y:.1f}a{r} {r} 0 1 0 {2 * r} 0a{r} {r} 0 1 0 {-2 * r} 0" for x, y in places)
     names = ""
@@ -176,23 +176,23 @@ def _around(x: float, y: float, r: float) -> _Box:
 
 
 def _free(x: float, y: float, r: float, width: float, taken: Sequence[_Box]) -> _Box:
-    """Return where a name of this width goes beside a point: left, top, right and bottom of its box."""
-    beside = [
+    """Return the box of a name of this width next to a point: left, top, right and bottom."""
+    candidates = [
         (left, y + down, left + width, y + down + _LINE)
         for down in (-r - _LINE, r, -_LINE / 2, -r - 2 * _LINE, r + _LINE)
         for left in (x + r + 3, x - r - 3 - width)
     ]
-    for box in beside:
+    for box in candidates:
         inside = box[0] > 0 and box[1] > 0 and box[2] < WIDE and box[3] < HIGH
         if inside and not any(
             box[0] < other[2] and other[0] < box[2] and box[1] < other[3] and other[1] < box[3] for other in taken
         ):
             return box
-    return beside[0]
+    return candidates[0]
 
 
 def _ellipses(part: Ellipsoids, places: Array, R: Array, scale: float) -> str:
-    """Draw outlines: that of an ellipsoid seen from afar is the ellipse of its shape in the plane of the picture."""
+    """Draw the outlines of ellipsoids in parallel projection, which are ellipses."""
     found = []
     for (x, y), shape in zip(places, part.shapes, strict=True):
         values, vectors = np.linalg.eigh(R[:2] @ shape @ R[:2].T)
@@ -203,7 +203,7 @@ def _ellipses(part: Ellipsoids, places: Array, R: Array, scale: float) -> str:
 
 
 def _triad(R: Array) -> str:
-    """Draw the directions of the machine's axes into the corner."""
+    """Draw the directions of the machine axes in the corner."""
     x, y, drawn = 30.0, HIGH - 30.0, []
     for k, name in enumerate("XYZ"):
         dx, dy = 20 * R[0, k], -20 * R[1, k]

@@ -16,9 +16,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 import errormotion
 from errormotion import plugins
 from errormotion.errors import DatasetError, RunError
-from errormotion.report import beams, generic, provenance
+from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.parts import beams
 from errormotion.report.text import DASH
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.

@@ -91,7 +91,7 @@ class Crossbeam:
         there[1, 3] = middle
         return there @ displaced(self.twist(t, middle)).as_matrix() @ going
 
-    def carriage_at(self, t: Array, places: Array) -> Array:
+    def carriage_at(self, t: Array, positions: Array) -> Array:
         """Return the poses of the carriage at times t (n,) since the start of the warm-up, s, and positions (n, 3), m.
 
         Returns
@@ -99,9 +99,9 @@ class Crossbeam:
         ndarray, (n, 4, 4)
             In the machine, m. Z moves the spindle in the carriage and not the carriage.
         """
-        going = np.tile(np.eye(4), (len(places), 1, 1))
-        going[:, :2, 3] = places[:, :2]
-        return np.asarray(going @ displaced(self.twist(t, places[:, 1])).as_matrix())
+        going = np.tile(np.eye(4), (len(positions), 1, 1))
+        going[:, :2, 3] = positions[:, :2]
+        return np.asarray(going @ displaced(self.twist(t, positions[:, 1])).as_matrix())
 
     def artefact_pose(self, seed: int, position: float) -> Array:
         """Return the pose of the artefact of a position, (4, 4) in the machine, m: under the profiler, misaligned."""

@@ -14,17 +14,17 @@ from errormotion.errors import BenchError
 from errormotion.kinematics.description import MachineDescription
 from errormotion.kinematics.iso import ROTARY_AXES
 from errormotion.kinematics.twists import move
-from errormotion.twin import bar as bars
-from errormotion.twin import frame as frames
 from errormotion.twin import truth
+from errormotion.twin.artefacts import bar as bars
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
+from errormotion.twin.heat.state import ThermalState, seeded_state
 from errormotion.twin.kinds import machine_kind
-from errormotion.twin.probing import ProbeMeasurements
 from errormotion.twin.schedule import Event, Schedule, StepProgram
-from errormotion.twin.sensing import Sensing
-from errormotion.twin.stage_sensor import StageSensor
-from errormotion.twin.state import ThermalState, seeded_state
+from errormotion.twin.sensors import frame as frames
+from errormotion.twin.sensors.probing import ProbeMeasurements
+from errormotion.twin.sensors.sensing import Sensing
+from errormotion.twin.sensors.stage_sensor import StageSensor
 
 #: time to full spindle speed, s
 SPIN_UP_TIME = 0.75

@@ -10,9 +10,9 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
-from errormotion.twin.artefacts import Artefact, circular_pocket, swept
+from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
 from errormotion.twin.crossbeam import Crossbeam
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 #: default distance of two artefacts, m
 SPACING = 0.2
@@ -78,16 +78,16 @@ class Table:
         """Yield which of increasing positions (n,) of the axis lie over which piece, None over none, in order."""
         first = 0
         for target in self.targets:
-            begin, end = (int(place) for place in np.searchsorted(y, target.reach))
-            if first < begin:
-                yield slice(first, begin), None
-            if begin < end:
-                yield slice(begin, end), target
+            start, end = (int(place) for place in np.searchsorted(y, target.reach))
+            if first < start:
+                yield slice(first, start), None
+            if start < end:
+                yield slice(start, end), target
             first = max(first, end)
         if first < y.size:
             yield slice(first, y.size), None
 
-    def scan(self, target: Target, profiler: Profiler, t: Array, places: Array, key: tuple[int, ...]) -> Array:
+    def scan(self, target: Target, profiler: Profiler, t: Array, positions: Array, key: tuple[int, ...]) -> Array:
         """Return the lines that the profiler takes of a piece, each with the error at its own time.
 
         Parameters
@@ -98,7 +98,7 @@ class Table:
             The sensor.
         t : ndarray, (n,)
             Time since the start of the warm-up, s, of each line; cold before 0.
-        places : ndarray, (n, 3)
+        positions : ndarray, (n, 3)
             Commanded X, Y and Z, m.
         key : tuple of int
             Of the noise.
@@ -110,8 +110,8 @@ class Table:
         """
         alone = len(t) == 1
         if alone:  # a direction along the feed takes two lines
-            t, places = np.repeat(t, 2), places + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
-        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, places), target.pose, lift=places[:, 2])
+            t, positions = np.repeat(t, 2), positions + np.array([[0.0, 0.0, 0.0], [0.0, 1e-6, 0.0]])
+        lines = self.crossbeam.lines(self.crossbeam.carriage_at(t, positions), target.pose, lift=positions[:, 2])
         heights = profiler.scan(target.artefact, lines, key=key)
         return heights[:1] if alone else heights
 

@@ -1,4 +1,4 @@
-"""A bench opens all its instruments or none, and says which did not come up and why."""
+"""A bench opens all its instruments or none, and reports the failures with their causes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -39,9 +39,9 @@ def test_failed_connections_are_told_as_a_tree_and_nothing_stays_open(bench: Cal
     with pytest.raises(BenchError) as caught, OpenBench(bench(SECOND + "refuses = true")):
         pass
     assert str(caught.value).splitlines() == [
-        "Bench 'Table': 1 of 2 instruments did not come up.",
+        "Bench 'Table': 1 of 2 instruments could not be opened.",
         "├── counter (counter, sim://counter): Lab Counter, serial number 17",
-        "└── other (counter, tcp://10.0.0.5:10001): InstrumentError: tcp://10.0.0.5:10001: nobody listens there",
+        "└── other (counter, tcp://10.0.0.5:10001): tcp://10.0.0.5:10001: nobody listens there",
     ]
     assert plugins.get("instruments", "counter").opened == []
 
@@ -76,5 +76,8 @@ def test_operator_is_asked_only_where_something_is_real(bench: Callable[..., Ben
     with OpenBench(bench("simulated = false"), asked.append) as table:
         table.ask("Mount the bar.")
     assert asked == ["Mount the bar."]
-    with OpenBench(bench("simulated = false")) as table, pytest.raises(BenchError, match="nobody can be asked here"):
+    with (
+        OpenBench(bench("simulated = false")) as table,
+        pytest.raises(BenchError, match="Run the command in a terminal"),
+    ):
         table.ask("Mount the bar.")

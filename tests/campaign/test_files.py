@@ -57,7 +57,7 @@ def test_all_mistakes_of_a_campaign_file_are_told_at_once(write: Callable[..., P
     level, unknown, twice, earlier = complaints(path, load_campaign)
     assert level == "test[0].settings.level: expected a length with its unit, such as '5 mm'; found 25"
     assert unknown.startswith("test[0].settings.cuont: unknown key; did you mean 'count'?")
-    assert twice == "test[1].name: expected a name of its own; found 'a' again"
+    assert twice == "test[1].name: expected a unique name; found 'a' again"
     assert earlier == "test[1].inputs.zero: expected the name of an earlier test; found 'first'; Known here: a"
 
 

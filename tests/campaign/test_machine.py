@@ -5,10 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from errormotion import plugins
+from errormotion import datasets, plugins
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import load_bench, load_campaign
-from errormotion.errors import BenchError
+from errormotion.campaign.runner import run
+from errormotion.errors import BenchError, InstrumentError
+from errormotion.instruments import simulators
+from errormotion.kinematics.description import MachineDescription
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Lab"\n'
 MACHINE = """\
@@ -115,6 +118,34 @@ def test_limits_outside_of_the_travel_are_refused(tmp_path: Path) -> None:
     assert found.startswith("limits.Y: the chain 'workpiece-C-X-bed-Z-spindle-tool' has no axis Y")
 
 
+def test_settings_that_are_not_stated_follow_from_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def machine_defaults(_self: object, machine: MachineDescription) -> dict[str, float]:
+        return {"level": machine.travel["Z"][1], "count": 7}
+
+    monkeypatch.setattr(plugins.get("methods", "ramp"), "machine_defaults", machine_defaults, raising=False)
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        'schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\n'
+        '[[test]]\nname = "a"\nmethod = "ramp"\nsettings = { count = 1 }\n'
+    )
+    bench(tmp_path, MACHINE)
+    settings = load_campaign(path).tests[0].settings
+    assert (settings.level, settings.count) == (0.46, 1)
+    bench(tmp_path, 'machine = "Mill"\n')
+    assert load_campaign(path).tests[0].settings.level != 0.46
+
+
+def test_raw_data_state_the_chain_of_the_axes_that_move(tmp_path: Path) -> None:
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        f'schema = "errormotion.campaign/1"\nname = "c"\nbench = "bench.toml"\nruns = "{tmp_path.as_posix()}/runs"\n'
+        '[[test]]\nname = "a"\nmethod = "ramp"\n'
+    )
+    bench(tmp_path, MACHINE)
+    (folder,) = run(load_campaign(path))
+    assert datasets.load(folder.raw).attrs["chain"] == "workpiece-X-Y-bed-Z-spindle-tool"
+
+
 def test_settings_that_contradict_the_machine_are_refused_when_the_campaign_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,3 +166,36 @@ def test_settings_that_contradict_the_machine_are_refused_when_the_campaign_is_r
     )
     bench(tmp_path, 'machine = "Mill"\n')  # nothing is known of the machine: nothing contradicts it
     assert load_campaign(path).tests[0].settings.level == 0.025
+
+
+CONTROL = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://machine/controller?seed=5"\n'
+
+
+def test_the_simulated_control_moves_the_machine_of_the_bench(tmp_path: Path) -> None:
+    plan = load_bench(bench(tmp_path, MACHINE + CONTROL))
+    with OpenBench(plan) as opened:
+        here = simulators.world("machine", seed=5).machine
+        assert here.description == plan.description
+        assert here.geometry.machine.chain == "workpiece-C-X-Y-bed-Z-spindle-tool"
+        control = opened.of_kind("controller")
+        control.move_to([0.29, 0.0, 0.45])
+        with pytest.raises(InstrumentError, match="X"):
+            control.move_to([0.31, 0.0, 0.45])
+    wider = load_bench(bench(tmp_path, MACHINE.replace('"300 mm"', '"400 mm"') + CONTROL))
+    with OpenBench(wider) as opened:  # another machine, though the address is the same
+        opened.of_kind("controller").move_to([0.31, 0.0, 0.45])
+
+
+@pytest.mark.parametrize(
+    ("machine", "text"),
+    [
+        ('machine = "Mill"\n', r"expected a table \[machine\] in the bench file; found none"),
+        (
+            MACHINE.replace(', fixed = "90 deg"', "").replace("travel = {", 'travel = { C = ["0 deg", "90 deg"],'),
+            "X, Y, Z, C",
+        ),
+    ],
+)
+def test_a_machine_that_cannot_be_simulated_over_the_wire_is_refused(tmp_path: Path, machine: str, text: str) -> None:
+    with pytest.raises(BenchError, match=text), OpenBench(load_bench(bench(tmp_path, machine + CONTROL))):
+        pass

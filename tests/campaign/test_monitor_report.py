@@ -107,8 +107,8 @@ def test_why_a_temperature_is_unknown_is_told(html):
     assert found["ambient"][2].startswith("—")
     text = words(html)
     assert "of motor: open in 20 rows and no answer in 23 rows" in text
-    assert "Never known: ambient" in text
-    assert "Without a known place: ambient" in text
+    assert "Without a valid reading: ambient" in text
+    assert "Position unknown: ambient" in text
 
 
 def test_working_parameters_are_those_of_the_log(html):

@@ -177,7 +177,7 @@ def test_two_processes_cannot_work_on_one_run(plan: Plan, tmp_path: Path) -> Non
 
 
 def test_bench_that_does_not_come_up_leaves_no_run_folder(plan: Plan, tmp_path: Path) -> None:
-    with pytest.raises(BenchError, match="did not come up"):
+    with pytest.raises(BenchError, match="could not be opened"):
         runner.run(plan('name = "a"', bench="refuses = true"))
     assert list_runs(tmp_path / "runs") == []
 

@@ -133,7 +133,7 @@ def test_a_tracker_that_nobody_moves_is_told_and_not_measured(lab):
         if not operator.messages:
             operator(message)
 
-    with pytest.raises(RunError, match=r"Set-up S2: the tracker stands near .* the place of S1"):
+    with pytest.raises(RunError, match=r"Set-up S2: the tracker is near .* the position of S1"):
         runner.run(plan, runs=runs, ask=lazy)
 
 

@@ -59,14 +59,14 @@ def test_mistake_in_the_text_is_told_with_its_place(run: Run, tmp_path: Path) ->
 def test_errors_name_no_method_to_identify_them(run: Run, raw: Path) -> None:
     run("identify", raw, "--method", "spindle_drift", "--out", "errors.nc")
     told = run("identify", "errors.nc", "--out", "again.nc", code=1).stderr
-    assert "expected a raw dataset, whose schema tells the method; found schema errormotion.errors/1" in told
+    assert "expected a raw dataset of a method; found schema errormotion.errors/1" in told
 
 
 def test_method_of_a_folder_of_runs_has_to_be_named(run: Run, tmp_path: Path) -> None:
     (tmp_path / "runs" / "one").mkdir(parents=True)
     (tmp_path / "runs" / "one" / "run.json").write_text("{}")
     told = run("identify", "runs", "--out", "errors", code=1).stderr
-    assert "is a folder of runs; say which method's with --method" in told
+    assert "is a folder of runs; name the method with --method" in told
 
 
 @pytest.mark.parametrize(
@@ -77,11 +77,14 @@ def test_check_bar_alone_is_fitted_and_tells_no_beam(run: Run, name: str, radius
     published = Path(__file__).parents[2] / "examples" / "check_bar" / f"{name}.csv"
     run("validate", published)
     told = run("identify", published, "--out", "errors.nc").stdout
-    assert f"Check bar: radius {radius:.4f} mm (U = " in told
+    line = next(line for line in told.splitlines() if line.startswith("radius of the check bar"))
+    value, unit = line.split()[-3], line.split()[-1]
+    digits = len(value.partition(".")[2])
+    assert (float(value), unit) == (pytest.approx(radius, abs=0.51 * 10 ** -min(digits, 4)), "mm")
     assert "the beam is taken as stated, without uncertainty, and its errors are unknown" in told
     errors = datasets.load("errors.nc")
     assert datasets.violations(errors) == []
     assert np.isnan(errors.em.twist()).all()
     assert int(errors["bar_left_out"].sum()) == left_out
-    assert "good" in run("validate", "errors.nc").stdout
+    assert "valid" in run("validate", "errors.nc").stdout
     assert "Check bar" in Path(run("report", "errors.nc").stdout.strip()).read_text()

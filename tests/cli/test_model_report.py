@@ -37,7 +37,7 @@ def test_a_check_writes_its_page_and_says_where(folder: Path) -> None:
     told = run("model", "check", "m.nc", "third.nc", "--report", "page.html")
     assert told.exit_code == 0, told.output
     assert told.stdout.splitlines()[-1] == "page.html"
-    assert "Thermal model against measurement" in (folder / "page.html").read_text(encoding="utf-8")
+    assert "Thermal model compared with measurement" in (folder / "page.html").read_text(encoding="utf-8")
     answer = json.loads(run("model", "check", "m.nc", "third.nc", "--report", "page.html", "--json").stdout)
     assert answer["report"] == "page.html"
     assert answer["removed"]["EZ"] > 0

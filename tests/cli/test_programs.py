@@ -52,7 +52,7 @@ def test_an_unknown_test_names_those_there_are(run, tmp_path):
 
 def test_a_program_out_of_travel_writes_nothing(run, tmp_path):
     for name in ("bench.toml", "campaign.toml"):
-        text = (GANTRY.parent / name).read_text().replace('travel = ["-900 mm"', 'travel = ["-600 mm"')
+        text = (GANTRY.parent / name).read_text().replace('travel.Y = ["-900 mm"', 'travel.Y = ["-620 mm"')
         (tmp_path / name).write_text(text)
     found = run("program", tmp_path / "campaign.toml", "--out", tmp_path / "nc", code=1)
     assert "would go from Y-633.000" in found.stderr

@@ -9,20 +9,30 @@ import xarray as xr
 
 from errormotion import plugins
 from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.datasets import build_errors, provenance
 from errormotion.methods.beam_direction import BeamDirection, Settings
 from errormotion.plugins import FigureOfMerit
 
 
 @pytest.fixture
 def result() -> xr.Dataset:
-    values = {"EX": [0.0, 2e-6], "EY": [0.0, np.nan]}
-    errors = {name: ("time", np.array(v), {"units": "m"}) for name, v in values.items()}
-    covariance = np.tile(np.diag([1e-14, 1e-14]), (2, 1, 1))
-    return xr.Dataset(
-        {**errors, "covariance": (("time", "dof", "dof_"), covariance)},
-        {"time": [0.0, 90.0], "dof": ["EX", "EY"]},
-        {"method": "unknown", "reference": "cold", "notes": ["one sensor is missing"]},
+    values = np.full((2, 6), np.nan)
+    values[:, 0], values[0, 1] = [0.0, 2e-6], 0.0
+    errors = build_errors(
+        values,
+        np.tile(1e-14 * np.eye(6), (2, 1, 1)),
+        dims=("time",),
+        coords={"time": [0.0, 90.0]},
+        component="tool",
+        machine="m",
+        frame="machine",
+        functional_point=np.zeros(3),
+        reference="cold",
+        method="unknown",
+        method_version="1",
+        provenance=provenance.make({}, None, None),
     )
+    return errors.assign_attrs(notes=["one sensor is missing"])
 
 
 def test_without_a_plugin_the_last_known_values_are_the_figures(result: xr.Dataset) -> None:

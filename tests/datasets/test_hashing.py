@@ -6,7 +6,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import hash_dataset, load, save
-from errormotion.datasets.hashing import LEAF, DatasetHasher, has_hash
+from errormotion.datasets.files.hashing import LEAF, DatasetHasher, has_hash
 from errormotion.errors import DatasetError
 
 
@@ -89,7 +89,7 @@ def test_what_is_not_handed_over_or_not_in_order_is_read() -> None:
 
 @pytest.mark.parametrize("chunks", [(1, 50_000), (5, 4096), (2, 300_000)])
 def test_the_chunks_of_a_large_store_do_not_matter(chunks, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("errormotion.datasets.hashing._TILE", 2**18)
+    monkeypatch.setattr("errormotion.datasets.files.hashing._TILE", 2**18)
     ds = record()
     ds.to_zarr(tmp_path / "raw.zarr", consolidated=False, encoding={"distance": {"chunks": chunks}})
     with xr.open_zarr(tmp_path / "raw.zarr", consolidated=False, chunks=None) as back:
@@ -100,7 +100,7 @@ def test_the_chunks_of_a_large_store_do_not_matter(chunks, tmp_path, monkeypatch
 def test_each_chunk_of_a_store_is_read_once(tmp_path, monkeypatch) -> None:
     import zarr
 
-    monkeypatch.setattr("errormotion.datasets.hashing._TILE", 2**18)
+    monkeypatch.setattr("errormotion.datasets.files.hashing._TILE", 2**18)
     record().to_zarr(tmp_path / "raw.zarr", consolidated=False, encoding={"distance": {"chunks": (5, 20_000)}})
     read: list[str] = []
     get = zarr.storage.LocalStore.get

@@ -4,7 +4,7 @@ import xarray as xr
 from xarray.indexes import RangeIndex
 
 from errormotion import datasets
-from errormotion.datasets.sampling import SAMPLE, sample
+from errormotion.datasets.files.sampling import SAMPLE, sample
 
 
 def told(ds: xr.Dataset) -> str:

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from errormotion.datasets import tomlfile
+from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import BenchError, DatasetError
 

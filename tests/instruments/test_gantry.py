@@ -18,8 +18,8 @@ from errormotion.instruments.simulators import world
 from errormotion.kinematics.poses import displaced
 from errormotion.plugins.readings import Profiles
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import circular_pocket, swept
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import circular_pocket, swept
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 CONTROL = "sim://gantry/controller?seed=3"
 SMALL = "sim://gantry/profiler?seed=3&points=80&pitch=4e-4&encoder_step=500"

@@ -1,4 +1,4 @@
-"""Points that do not hold a shape: every refusal is a FitError that says what is loose."""
+"""Points that do not determine a shape: every refusal is a FitError that names what is undetermined."""
 
 import numpy as np
 import pytest
@@ -16,30 +16,30 @@ TWO_LINES = np.concatenate([np.column_stack([c * np.ones(6), 0 * np.ones(6), np.
 
 
 @pytest.mark.parametrize(
-    ("fit", "points", "said"),
+    ("fit", "points", "message"),
     [
         (fit_line, [(0.0, 0.0)], "at least 2 points; found 1"),
         (fit_line, [(1.0, 2.0)] * 5, "all 5 are one point"),
-        (fit_line, [(1, 0), (0, 1), (-1, 0), (0, -1)], "single out no line"),
-        (fit_plane, LINE, "on one line, which leaves the plane loose"),
+        (fit_line, [(1, 0), (0, 1), (-1, 0), (0, -1)], "do not determine one line"),
+        (fit_plane, LINE, "on one line, which leaves the plane undetermined"),
         (fit_plane, [(0, 0, 0), (1, 0, 0)], "at least 3 points; found 2"),
-        (fit_circle, LINE[:, :2], r"on one line, which leaves the circle loose \(centre, radius\)"),
+        (fit_circle, LINE[:, :2], r"on one line, which leaves the circle undetermined \(centre, radius\)"),
         (fit_circle, LINE, "on one line"),
         (fit_circle, [(0, 0), (1, 1), (1, 1), (0, 0)], "Only 2 of the 4 points are distinct"),
-        (fit_sphere, PLANE, r"in one plane, which leaves the sphere loose \(centre, radius\)"),
+        (fit_sphere, PLANE, r"in one plane, which leaves the sphere undetermined \(centre, radius\)"),
         (fit_sphere, RING, "in one plane"),
-        (fit_cylinder, PLANE, "in one plane, which leaves the cylinder loose"),
+        (fit_cylinder, PLANE, "in one plane, which leaves the cylinder undetermined"),
         (fit_cylinder, RING, "in one plane"),
         (fit_cylinder, TWO_LINES, "in one plane"),
         (fit_cylinder, LINE, "on one line"),
-        (fit_cone, RING + PLACE, "in one plane, which leaves the cone loose"),
-        (lambda p: fit_cylinder(p, 1.0), RING, "cylinder loose: .*direction"),
+        (fit_cone, RING + PLACE, "in one plane, which leaves the cone undetermined"),
+        (lambda p: fit_cylinder(p, 1.0), RING, "cylinder undetermined: .*direction"),
         (lambda p: fit_cylinder(p, 1.0), LINE, "on one line"),
         (lambda p: fit_cylinder(p, 1.0), LINE[:3], "at least 4 points; found 3"),
     ],
 )
-def test_points_that_leave_a_freedom_loose_are_refused(fit, points, said):
-    with pytest.raises(FitError, match=said):
+def test_points_that_leave_a_freedom_undetermined_are_refused(fit, points, message):
+    with pytest.raises(FitError, match=message):
         fit(points)
 
 
@@ -63,7 +63,7 @@ def test_noise_that_hides_the_radius_is_refused():
     # Sagitta 1 um on a chord of 100 mm, noise 10 um: a circle of any radius fits as well.
     x = np.linspace(-0.05, 0.05, 20)
     y = x**2 * 4e-4 + 1e-5 * np.random.default_rng(3).normal(size=20)
-    with pytest.raises(FitError, match=r"noise hides the radius|leave the circle loose|did not settle"):
+    with pytest.raises(FitError, match=r"noise hides the radius|leave the circle undetermined|did not converge"):
         fit_circle(np.column_stack([x, y]))
 
 
@@ -74,7 +74,7 @@ def test_three_lines_hold_a_cylinder():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"sigma": 0.0}, "positive sigma"),
         ({"sigma": float("nan")}, "positive sigma"),
@@ -82,8 +82,8 @@ def test_three_lines_hold_a_cylinder():
         ({"weights": [0.0] + [1.0] * 11}, "leave out points of weight 0"),
     ],
 )
-def test_options_are_checked(options, said):
-    with pytest.raises(FitError, match=said):
+def test_options_are_checked(options, message):
+    with pytest.raises(FitError, match=message):
         fit_circle(RING[:, :2], **options)
 
 

@@ -190,7 +190,7 @@ def test_error_motion_of_a_turning_axis_goes_on():
 
 
 @pytest.mark.parametrize(
-    ("chain", "said"),
+    ("chain", "message"),
     [
         ("X-Y-Z", "expected a chain from 'workpiece'"),
         ("workpiece-X-Y-Z-tool", "one 'bed'"),
@@ -200,13 +200,13 @@ def test_error_motion_of_a_turning_axis_goes_on():
         ("workpiece-bed-tool", "at least one"),
     ],
 )
-def test_a_wrong_chain_is_refused(chain, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_wrong_chain_is_refused(chain, message):
+    with pytest.raises(ValueError, match=message):
         Machine(chain)
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: Machine(CFRAME, {"C": [0, 0, 0]}), "found one for C"),
         (lambda: Machine(CFRAME, {"X": [0, 0]}), "three coordinates"),
@@ -220,8 +220,8 @@ def test_a_wrong_chain_is_refused(chain, said):
         (lambda: Axis("Q", True), "found 'Q'"),
     ],
 )
-def test_wrong_arguments_are_refused(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_wrong_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 

@@ -124,7 +124,7 @@ def test_arguments_are_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: twists.move(np.zeros(5), np.zeros(3)), r"twist of shape \(..., 6\), found \(5,\)"),
         (lambda: twists.cross_matrix(np.zeros(2)), r"vector of shape \(..., 3\)"),
@@ -134,8 +134,8 @@ def test_arguments_are_left_alone():
         (lambda: twists.adjoint(np.diag([1.0, 1.0, -1.0])), "proper rotation"),
     ],
 )
-def test_wrong_shapes_are_refused(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_wrong_shapes_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 

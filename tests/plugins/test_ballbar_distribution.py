@@ -40,7 +40,7 @@ def installed(tmp_path_factory):
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
     run("-m", "pip", "install", "-q", *options, "--target", site, source, folder=folder, site=folder)
     work.mkdir()
-    for name in ("bench.toml", "campaign.toml"):
+    for name in ("bench.toml", "campaign.toml", "import.toml"):
         shutil.copy(EXAMPLE / name, work)
 
     def command(*arguments, code=0):
@@ -62,6 +62,7 @@ def measured(installed):
     run("-c", script, folder=installed.work, site=installed.site)
     raw = datasets.load(installed.work / "raw.nc")
     (installed.work / "readings.csv").write_text(as_csv(raw))
+    (installed.work / "log.txt").write_text(as_log(raw))
     raw.close()
     return installed.work
 
@@ -96,6 +97,21 @@ def as_csv(raw):
     return "\n".join(lines) + "\n"
 
 
+def as_log(raw):
+    """Return the readings as one table, the temperature beside each."""
+    lines = ["direction;circle;length;angle;time;T"]
+    for direction in raw["direction_of_travel"].values:
+        for number in range(raw.sizes["run"]):
+            here = raw.sel(direction_of_travel=direction).isel(run=number)
+            for length, angle, time in zip(
+                here["length"].values, here["angle"].values, here["reading_time"].values, strict=True
+            ):
+                shown = "" if np.isnan(length) else f"{1e3 * length:.7f}"
+                temperature = f"{float(here['temperature']):.6f}"
+                lines.append(f"{direction};{number + 1};{shown};{np.degrees(angle):.6f};{time:.4f};{temperature}")
+    return "\n".join(lines) + "\n"
+
+
 def test_nothing_in_the_package_knows_of_it():
     files = [path for path in (ROOT / "errormotion").rglob("*") if path.suffix in (".py", ".toml", ".j2")]
     knowing = [path for path in files if re.search(r"ballbar_test|[\"']ballbar[\"']|raw\.ballbar", path.read_text())]
@@ -120,10 +136,12 @@ def test_its_raw_data_are_validated_by_its_own_table(installed, measured):
 
 @pytest.fixture(scope="module")
 def identified(installed, measured):
-    """Identify the stored raw dataset and the CSV file."""
+    """Identify the stored raw dataset, the CSV file and an imported log."""
     limit = "circular_deviation_limit=10 um"
     printed = installed("identify", "raw.nc", "--out", "errors.nc", "--set", limit)
     answer = json.loads(installed("identify", "readings.csv", "--out", "from_csv.nc", "--json"))
+    installed("import", "log.txt", "--map", "import.toml", "--out", "imported.nc")
+    installed("identify", "imported.nc", "--out", "from_log.nc")
     return printed, answer
 
 
@@ -138,10 +156,13 @@ def test_the_command_line_prints_its_figures(identified, measured):
             assert abs(figure["value"] - true) < 2 * figure["expanded_uncertainty"], figure  # four u
 
 
-def test_the_csv_file_gives_the_same_errors(identified, measured):
-    with datasets.load(measured / "errors.nc") as one, datasets.load(measured / "from_csv.nc") as other:
+def test_the_csv_file_and_the_imported_log_give_the_same_errors(identified, measured):
+    with datasets.load(measured / "errors.nc") as one:
         assert one["deviation"].dims == ("direction_of_travel", "angle")
-        np.testing.assert_allclose(one["deviation"].values, other["deviation"].values, atol=1e-9)
+        for name in ("from_csv.nc", "from_log.nc"):
+            with datasets.load(measured / name) as other:
+                assert other.attrs["plane"] == "XY"
+                np.testing.assert_allclose(one["deviation"].values, other["deviation"].values, atol=1e-9)
 
 
 def test_the_report_has_its_chapter_with_the_polar_plot(installed, identified):

@@ -141,7 +141,7 @@ def test_a_switched_compensation_is_told_with_its_change(page):
 
 
 def test_an_unseen_freedom_is_a_dash_with_its_reason_and_never_a_zero(page):
-    row = re.search(r"EC ECC arcsec (.*?) a not observed by this method", page.text)
+    row = re.search(r"EC ECC arcsec (.*?) a not determined by this method", page.text)
     assert row[1].replace("a", "").split() == ["—"] * 3
     assert "Not observed by this test: EC (ECC)" in page.text
 

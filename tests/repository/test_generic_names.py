@@ -23,7 +23,7 @@ OTHER_MEANINGS = {
     ("virtual_controller", "errormotion/instruments/touch_probe/controller_probe.py"),
     ("beam_direction", "errormotion/methods/spindle_drift/"),
     ("beam_direction", "errormotion/instruments/"),
-    ("beam_direction", "errormotion/report/beams.py"),
+    ("beam_direction", "errormotion/report/parts/beams.py"),
     ("thermal_model", "errormotion/cli/commands/model.py"),
 }
 

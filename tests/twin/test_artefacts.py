@@ -6,8 +6,8 @@ from scipy.special import ndtr
 
 from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
-from errormotion.twin import artefacts
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts import pieces as artefacts
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 SHAPES = {
     "free form": artefacts.swept(),

@@ -11,9 +11,9 @@ from errormotion.kinematics.beams import tilt, tilt_vector
 from errormotion.kinematics.fits import fit_plane
 from errormotion.methods.beam_direction import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.planes import CheckBar, Plane
-from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
-from errormotion.twin.triangulation import key_of, speckle
+from errormotion.twin.artefacts.planes import CheckBar, Plane
+from errormotion.twin.sensors.point_sensor import PointSensor, seeded_point_sensor
+from errormotion.twin.sensors.triangulation import key_of, speckle
 
 SEEDS = range(5)
 DEG = np.radians(1.0)

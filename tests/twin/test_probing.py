@@ -6,7 +6,7 @@ import pytest
 from errormotion import datasets
 from errormotion.errors import BenchError
 from errormotion.twin import Event, VirtualMachine
-from errormotion.twin.balls import FORM, LOBING, NOISE, PRETRAVEL, RADIUS_ERROR
+from errormotion.twin.artefacts.balls import FORM, LOBING, NOISE, PRETRAVEL, RADIUS_ERROR
 
 ARCSEC = np.pi / 180 / 3600
 HOURS = 3600.0 * np.array([0.0, 0.5, 1.0, 2.0, 3.0])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from errormotion.errors import BenchError
 from errormotion.twin import Event, StepProgram, VirtualMachine, intersections
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE, Sensing
+from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE, Sensing
 
 RATE = 20000.0
 MIN = 60.0
@@ -227,7 +227,7 @@ def test_a_beam_that_misses_the_sphere_reads_nothing(machine):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         ((0, 10, RATE, ["X3"]), "X1, X2, Y1, Y2, Z"),
         ((-1, 10, RATE), "first >= 0"),
@@ -236,6 +236,6 @@ def test_a_beam_that_misses_the_sphere_reads_nothing(machine):
         ((0, 10, RATE, None, "probe"), "'bar'"),
     ],
 )
-def test_impossible_requests_are_refused_in_words(machine, arguments, says):
-    with pytest.raises(BenchError, match=says):
+def test_impossible_requests_are_refused_in_words(machine, arguments, message):
+    with pytest.raises(BenchError, match=message):
         machine.distances(*arguments)

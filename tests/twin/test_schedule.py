@@ -56,7 +56,7 @@ def test_compensation_goes_and_comes_within_its_slew():
 
 
 @pytest.mark.parametrize(
-    ("events", "says"),
+    ("events", "message"),
     [
         ([Event(5), Event(1)], "in order"),
         ([Event(-1.0)], "from 0 on"),
@@ -66,8 +66,8 @@ def test_compensation_goes_and_comes_within_its_slew():
         ([Event(0, compensation={"A": False})], "X, Y and Z"),
     ],
 )
-def test_impossible_schedules_are_refused_in_words(machine, events, says):
-    with pytest.raises(BenchError, match=says):
+def test_impossible_schedules_are_refused_in_words(machine, events, message):
+    with pytest.raises(BenchError, match=message):
         machine.start(events)
 
 
@@ -84,7 +84,7 @@ def test_step_program_visits_every_place_in_its_time():
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"direction": (0, 0, 0)}, "direction"),
         ({"count": 0}, "at least one position"),
@@ -93,7 +93,7 @@ def test_step_program_visits_every_place_in_its_time():
         ({"home": (0, 0, float("nan"))}, "'home'"),
     ],
 )
-def test_impossible_steps_are_refused_in_words(change, says):
+def test_impossible_steps_are_refused_in_words(change, message):
     good = {"start": (0, 0, 0), "direction": (0, 1, 0), "step": 20e-6, "count": 3}
-    with pytest.raises(BenchError, match=says):
+    with pytest.raises(BenchError, match=message):
         StepProgram(**(good | change))

@@ -6,8 +6,8 @@ import pytest
 from errormotion.errors import BenchError
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import circular_pocket, swept
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import circular_pocket, swept
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 from errormotion.twin.table import default_positions, set_table
 
 PERFECT = Profiler(80, 0.4e-3, disturbances=Disturbances.none())

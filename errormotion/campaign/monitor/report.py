@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from errormotion.campaign.monitor.log import AXES, BINS, NUMBERS, Channel, Gap, Log, read_log
-from errormotion.report import provenance, sensors, timeline
+from errormotion.report import provenance, timeline
 from errormotion.report.canvas import COLOURS
 from errormotion.report.document import (
     Block,
@@ -22,6 +22,7 @@ from errormotion.report.document import (
     Text,
     or_dash,
 )
+from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent
 
 _LISTED = 20

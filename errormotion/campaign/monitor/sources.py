@@ -12,7 +12,7 @@ from typing import Any
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchInstrument
-from errormotion.errors import ErrormotionError
+from errormotion.campaign.journal import cause_of
 
 FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
 """Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""
@@ -118,9 +118,7 @@ class Source:
                     self._reading = Reading(time.monotonic(), values, _flags(self._driver, values))
                 except Exception as error:  # noqa: BLE001 - reported to the operator, and retried
                     failed += 1
-                    self._note(
-                        str(error) if isinstance(error, ErrormotionError) else f"{type(error).__name__}: {error}"
-                    )
+                    self._note(cause_of(error))
                     if self._driver is None or failed >= FAILURES_BEFORE_RECONNECT:
                         self._close()
                         self._ready.set()

@@ -26,7 +26,7 @@ import xarray as xr
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
 from errormotion.campaign.folder import RunFolder, now
-from errormotion.campaign.journal import journal
+from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.recorder import Recorder
@@ -151,7 +151,7 @@ class Monitor:
         status, reason = "finished", ""
         if error is not None and isinstance(error, Exception):
             log.error("the monitor stopped", exc_info=error)
-            status, reason = "failed", f"{kind.__name__ if kind else ''}: {error}"
+            status, reason = "failed", cause_of(error)
         try:
             self._stack.__exit__(kind, error, trace)
         finally:

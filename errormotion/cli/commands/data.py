@@ -160,7 +160,7 @@ def validate(file: Path) -> list[str]:
 
 def _of_toml(file: Path) -> list[str]:
     from errormotion.campaign.files import load_bench, load_campaign
-    from errormotion.datasets.tomlfile import read_toml
+    from errormotion.datasets.files.tomlfile import read_toml
 
     try:
         schema = str(read_toml(file).get("schema", ""))

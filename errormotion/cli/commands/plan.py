@@ -12,7 +12,7 @@ from errormotion import datasets
 from errormotion.campaign.files import load_campaign
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.summary import FIELD_UNITS, notes_of
-from errormotion.datasets.folders import looking_beside
+from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import BenchError
 
 

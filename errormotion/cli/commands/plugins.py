@@ -91,7 +91,7 @@ def group_of(plugin_id: str) -> plugins.Group:
         return found[0]
     if found:
         raise PluginError(f"'{plugin_id}' is a plugin of the groups {' and '.join(found)}; rename one of them")
-    from errormotion.datasets.tomlfile import nearest
+    from errormotion.datasets.files.tomlfile import nearest
 
     names = [plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)]
     raise PluginError(f"No plugin '{plugin_id}'; {nearest(plugin_id, names)}")

@@ -29,7 +29,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.tilt_support import Hole, TiltSupport
 from errormotion.datasets.checks import dims, magnitude_violations, storable_violations
-from errormotion.datasets.folders import folders_beside
+from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.storage import load as load_dataset

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.tomlfile import load_model, nearest
 from errormotion.datasets.schemas import RawSchema, Row, variants
 from errormotion.datasets.text.csv_text import Table
 from errormotion.datasets.text.log_format import TIMESTAMP
@@ -29,7 +30,6 @@ from errormotion.datasets.text.table_reader import (
     unit_vectors,
     units_of,
 )
-from errormotion.datasets.tomlfile import load_model, nearest
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 

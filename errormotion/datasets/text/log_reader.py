@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.text.log_format import Format
-from errormotion.datasets.tomlfile import nearest
 from errormotion.errors import DatasetError
 
 T = TypeVar("T")

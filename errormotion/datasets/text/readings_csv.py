@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.schemas import Row, raw_schemas, variants
 from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.text.log_reader import Complaints
@@ -40,7 +41,6 @@ from errormotion.datasets.text.table_reader import (
     unit_vectors,
     units_of,
 )
-from errormotion.datasets.tomlfile import nearest
 from errormotion.datasets.validation import violations
 from errormotion.errors import DatasetError
 

@@ -1,6 +1,7 @@
 """Wire simulators: devices with the real protocols over real sockets and ptys, which read the truth from the twin.
 
-All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock.
+All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock. The
+name is ``cframe``, ``gantry``, or ``machine`` for the machine that the bench file describes.
 ``world("cframe", seed=3)`` returns it, so that a test can compare with the truth.
 
 Parameters of every address: ``seed`` (0), ``pace`` (simulated seconds per second; default: as fast as the readers

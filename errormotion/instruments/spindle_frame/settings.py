@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from errormotion import plugins
-from errormotion.datasets import tomlfile
+from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import Expansion, Length, Temperature
 from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.point_lds.optoncdt.settings import SensorSettings

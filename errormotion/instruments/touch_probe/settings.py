@@ -13,7 +13,7 @@ from pydantic import Field
 
 from errormotion.datasets.calibrations.owner import compare
 from errormotion.datasets.calibrations.pretravel import PretravelMap
-from errormotion.datasets.folders import folders_beside
+from errormotion.datasets.files.folders import folders_beside
 from errormotion.datasets.units import Length
 from errormotion.errors import InstrumentError
 from errormotion.plugins import Contact, PluginSettings, Touch

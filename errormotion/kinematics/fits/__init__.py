@@ -8,7 +8,7 @@
 All fits share their keywords: ``robust`` leaves out points that do not belong and names them in ``left_out``; ``sigma``
 is the standard uncertainty of a point across the shape, estimated from the residuals where it is not given; ``weights``
 are relative, one over the variance of each point. Points that do not determine the shape raise
-`errormotion.errors.FitError`, which says what is loose.
+`errormotion.errors.FitError`, which names what is undetermined.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def fit_line(
     Raises
     ------
     FitError
-        Too few points, points that leave the line loose, or input that is no such array.
+        Too few points, points that do not determine the line, or input that is no such array.
     """
     p = _points(points, (2, 3))
     return LineFit(**_fit(Line(p.shape[1]), p, robust, sigma, weights))

@@ -1,4 +1,4 @@
-"""Which points do not belong: found without trusting any single one.
+"""Outliers, found without trust in any single point.
 
 1. Shapes through few points are tried; the one that half of the points are nearest to wins (least median of squares,
    Rousseeuw 1984), improved by fitting to the nearest half (concentration steps of least trimmed squares).
@@ -6,7 +6,7 @@
 3. The set is refitted and every point judged by a fit that does not contain it, until the set no longer changes. A
    point is left out where Student's t says that among n clean Gaussian points the worst is so far off once in two
    hundred fits.
-4. Few points may look wrong only because the others happen to agree too well. Unless all left-out points together gain
+4. Few points may look wrong only because the others agree too well by chance. Unless all left-out points together gain
    more than such luck, the judging starts again from the set of all points.
 """
 
@@ -31,23 +31,23 @@ SEED = 230
 
 
 def outliers(shape: Shape, points: Array, weights: Array, sigma: float | None) -> tuple[int, ...]:
-    """Return the indices of the points that do not belong to the shape.
+    """Return the indices of the points that are not on the shape.
 
     Raises
     ------
     FitError
-        Too few points to tell, or no shape that half of the points agree on.
+        Too few points, or no shape that half of the points agree on.
     """
     spare = 3
     if len(points) < shape.minimum + spare:
         raise FitError(
-            f"a robust fit of a {shape.name} needs at least {shape.minimum + spare} points to tell the wrong ones "
-            f"from the right ones; found {len(points)}"
+            f"a robust fit of a {shape.name} needs at least {shape.minimum + spare} points to distinguish outliers "
+            f"from the others; found {len(points)}"
         )
     centre = np.median(points, axis=0)
     scale = float(np.median(np.linalg.norm(points - centre, axis=1)))
     if scale <= 10 * EPS * np.abs(points).max():
-        raise FitError(f"half of the points are one point; a {shape.name} needs points apart")
+        raise FitError(f"half of the points are one point; a {shape.name} needs distinct points")
     frame = Frame(centre, scale)
     local, q, root = shape.scaled(scale), frame.inside(points), np.sqrt(weights)
     # Nothing below the rounding of the coordinates is a deviation; nor, where the noise is known, what it explains.
@@ -101,7 +101,7 @@ def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
 
     starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
     if not starts:
-        raise FitError(f"no few of the points make a {shape.name}; look at them")
+        raise FitError(f"no small set of the points determines a {shape.name}; plot them")
     trimmed = [_concentrate(shape, theta, q, root, half) for theta in starts]
     best = min(trimmed, key=rank)
     quantile = _normal_length(half / n, shape.components)
@@ -165,5 +165,5 @@ def _misses(shape: Shape, theta: Array, q: Array, root: Array) -> Array:
 def _majority(shape: Shape, clean: Flags) -> None:
     if clean.sum() < max(shape.minimum + 1, (len(clean) + 1) // 2):
         raise FitError(
-            f"no {shape.name} that at least half of the {len(clean)} points agree on; they look like something else"
+            f"no {shape.name} that at least half of the {len(clean)} points agree on; they have another shape"
         )

@@ -1,7 +1,7 @@
-"""Least squares of orthogonal distances to any shape, with covariance and refusal of what the points do not hold.
+"""Least squares of orthogonal distances to any shape, with covariance and refusal of what the points do not determine.
 
 The points are centred and scaled, so that all numbers are near 1 wherever the machine's origin is. Levenberg-Marquardt
-(by QR) goes from the shape's algebraic start to the minimum, Gauss-Newton to its last digits.
+(by QR) iterates from the shape's algebraic start to the minimum, Gauss-Newton to its last digits.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ __all__ = ["Estimate", "Frame", "Solution", "design", "estimate", "levenberg"]
 EPS = float(np.finfo(float).eps)
 SEARCHED_POINTS = 1000  # the best of several starts is chosen on a part of the points
 # Of a shape of size 1 a step of 1e-7 changes the sum of squares by 1e-14 of itself: from there on the steps, not the
-# sum, tell whether the solver comes nearer.
+# sum, show whether the solver converges.
 LAST_DIGITS = 1e-7
 # Sum of squares of a fit that leaves nothing: among several such fits the shape prefers one.
 EXACT = 1e-20
-# Ratio of the least to the greatest singular value below which a freedom is numerically loose. An arc of one part in
-# 1e5 of its radius has 1e-10.
-LOOSE = 1e-11
+# Ratio of the least to the greatest singular value below which a freedom is numerically undetermined. An arc of one
+# part in 1e5 of its radius has 1e-10.
+UNDETERMINED = 1e-11
 # A radius known to worse than half of itself, a direction to half a radian: no linear covariance holds there.
 TOO_UNCERTAIN = 0.5
 
@@ -81,7 +81,7 @@ def estimate(
     Raises
     ------
     FitError
-        The points do not hold the shape; the message says what is loose.
+        The points do not determine the shape; the message names what is undetermined.
     """
     used = np.ones(len(points), dtype=bool)
     used[list(left_out)] = False
@@ -93,12 +93,12 @@ def estimate(
 
     J, f = design(local, theta, q[used], root[used])
     _, s, Vt = np.linalg.svd(J, full_matrices=False)
-    if not np.isfinite(theta).all() or s[-1] <= LOOSE * s[0]:
-        raise _loose(shape, points[used], local.tangent(theta) @ Vt[-1])
+    if not np.isfinite(theta).all() or s[-1] <= UNDETERMINED * s[0]:
+        raise _undetermined(shape, points[used], local.tangent(theta) @ Vt[-1])
     if not solution.converged:
         raise FitError(
-            f"the fit of the {shape.name} did not settle: the points do not look like a {shape.name}. "
-            f"Plot them, or ask for a robust fit"
+            f"the fit of the {shape.name} did not converge: the points do not look like a {shape.name}. "
+            f"Plot them, or use a robust fit"
         )
     dof = int(used.sum()) * shape.components - J.shape[1]
     estimated = float(np.sqrt(f @ f / dof)) if dof > 0 else np.nan
@@ -123,7 +123,7 @@ def design(shape: Shape, theta: Array, q: Array, root_weights: Array) -> tuple[A
 def levenberg(
     shape: Shape, theta: Array, q: Array, root_weights: Array, *, limit: int = 200, last_digits: bool = True
 ) -> Solution:
-    """Go from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
+    """Iterate from ``theta`` to the nearest minimum of the weighted sum of squared distances."""
     damping, cost = 1e-3, np.inf
     for _ in range(limit):
         J, f = design(shape, theta, q, root_weights)
@@ -162,7 +162,9 @@ def _last_digits(shape: Shape, theta: Array, q: Array, root_weights: Array) -> S
 def _best(shape: Shape, q: Array, root_weights: Array) -> Solution:
     starts = shape.starts(q)
     if not starts:
-        raise FitError(f"the points single out no {shape.name}: they fit several equally well. Add points elsewhere")
+        raise FitError(
+            f"the points do not determine one {shape.name}: they fit several equally well. Add points elsewhere"
+        )
     if len(starts) > 1:
         part = np.unique(np.linspace(0, len(q) - 1, min(len(q), SEARCHED_POINTS)).astype(int))
         tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60, last_digits=False) for theta in starts]
@@ -184,7 +186,7 @@ def _frame(shape: Shape, points: Array, weights: Array) -> Frame:
     centre = np.average(points, axis=0, weights=weights)
     scale = float(np.sqrt(np.mean((points - centre) ** 2) * points.shape[1]))
     if scale <= 10 * EPS * np.abs(points).max():
-        raise FitError(f"a {shape.name} needs {shape.minimum} points apart; all {len(points)} are one point")
+        raise FitError(f"a {shape.name} needs {shape.minimum} distinct points; all {len(points)} are one point")
     return Frame(centre, scale)
 
 
@@ -199,14 +201,14 @@ def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
     spread = int(np.sum(s > rounding * s[0]))
     if spread < shape.spans:
         where = {1: "on one line", 2: "in one plane"}[spread]
-        loose = ", ".join(group.name for group in shape.groups)
+        undetermined = ", ".join(group.name for group in shape.groups)
         raise FitError(
-            f"the points lie {where}, which leaves the {shape.name} loose ({loose}); it needs points that spread "
-            f"{'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
+            f"the points lie {where}, which leaves the {shape.name} undetermined ({undetermined}); it needs points "
+            f"that spread {'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
         )
 
 
-def _loose(shape: Shape, points: Array, direction: Array) -> FitError:
+def _undetermined(shape: Shape, points: Array, direction: Array) -> FitError:
     """Return the error that names the parameters which may change without moving the shape off the points."""
     names, start = [], 0
     for group in shape.groups:
@@ -214,7 +216,7 @@ def _loose(shape: Shape, points: Array, direction: Array) -> FitError:
             names.append(group.name)
         start += group.size
     return FitError(
-        f"the points leave the {shape.name} loose: {' and '.join(names) or 'everything'} may change together "
+        f"the points leave the {shape.name} undetermined: {' and '.join(names) or 'everything'} may change together "
         f"without leaving the points. Add points elsewhere on it{_repeated(shape, points)}"
     )
 

@@ -1,4 +1,4 @@
-"""What a fit returns: the shape's parameters by name, their covariance, and what the points are off by."""
+"""What a fit returns: the shape's parameters by name, their covariance, and the residuals of the points."""
 
 from __future__ import annotations
 

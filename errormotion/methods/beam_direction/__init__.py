@@ -1,9 +1,9 @@
-"""Where a point sensor's beam starts and where it goes, from planes that a stage moves it over (Lu et al.).
+"""Origin and direction of the beam of a point sensor, from readings on planes over which a stage moves it (Lu et al.).
 
-``method`` is the plugin. From readings to result: ``reading`` takes them out of the raw dataset, ``slopes`` finds how
-they change with the stage's place on each plane, ``direction`` the direction most likely from that, ``compensation``
-takes the inclination error off, ``origin`` finds the zero point, ``propagation`` carries what is unknown through, and
-``identification`` puts them together.
+``method`` is the plugin. In ``identification``, ``reading`` reads and checks the raw dataset, ``slopes`` fits the
+gradient of the readings on each plane, ``direction`` finds the most likely direction, ``compensation`` corrects the
+inclination error, ``origin`` finds the zero point, ``propagation`` propagates the uncertainties, and ``planes``
+combines these parts.
 """
 
 from errormotion.methods.beam_direction.method import BeamDirection

@@ -1,7 +1,7 @@
-"""Measuring: a point sensor on a stage looks at one face of a sine gauge after the other.
+"""Acquisition: a point sensor on a stage measures the faces of a sine gauge in turn.
 
-For each face the stage looks for it along the beam, from far away to near, comes to mid-range, and then moves along X,
-Y and Z (or along a given path). At each place it rests, and several readings are averaged.
+The stage searches each face along the beam, from far to near, moves to mid-range, and then along X, Y and Z (or along a
+given path). It rests at each position, and several readings are averaged.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TRIES = 5
 _CLOSE = 0.05
 _TRIAL = 0.1
 _SEARCH = 0.5
-"""Shares of the range: how close to mid-range is close enough; a move that shows the sign; a step of the search."""
+"""Shares of the range: largest distance from mid-range; a move that shows the sign; a step of the search."""
 
 
 def measure_planes(
@@ -45,26 +45,26 @@ def measure_planes(
     Parameters
     ----------
     bench : Bench
-        With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). One that can also set
-        the gauge (``set_target``) does; otherwise the operator is asked to.
+        With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). It also sets
+        the gauge if it can (``set_target``); otherwise the operator is asked to.
     settings : Settings
     inputs : mapping
         Not used.
     done : Dataset, optional
-        What an interrupted run holds: its faces are not measured again.
+        Data of an interrupted run, whose faces are not measured again.
 
     Raises
     ------
     MethodError
         No control that moves the stage, or no face within the search.
     DatasetError
-        The calibration that the settings name is not found: before anything is measured.
+        The calibration of the settings is not found; raised before anything is measured.
     """
     if settings.compensation is not None:
         InclinationCalibration.find(settings.compensation)
     stand = Stand(bench, settings)
     faces = settings.planes
-    longest = max(len(places) for places in stand.paths)
+    longest = max(len(positions) for positions in stand.paths)
     for number in range(0 if done is None else int(done.sizes["plane"]), len(faces)):
         stand.set_face(number)
         middle = stand.approach(number)
@@ -79,7 +79,7 @@ class Stand:
     normals : ndarray (k, 3)
         Of the faces, as commanded.
     paths : list of ndarray (n, 3)
-        Places of the stage on each face about its middle, m.
+        Stage positions on each face about its middle, m.
     """
 
     def __init__(self, bench: Bench, settings: Settings) -> None:
@@ -88,9 +88,9 @@ class Stand:
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
             raise MethodError(
-                "A beam is calibrated by moving its sensor over the faces of a gauge, which needs an instrument of "
-                "kind 'controller' that can move to a place (move_to); the bench has none. Measure by hand and hand "
-                "the readings over as a table: 'errormotion identify READINGS.csv'."
+                "The calibration of a beam moves the sensor over the faces of a gauge and needs an instrument of kind "
+                "'controller' that can move to a position (move_to); the bench has none. Measure manually, write the "
+                "readings to a table, and use 'errormotion identify READINGS.csv'."
             )
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
         self.middle = float(self.sensor.mid_range)
@@ -118,7 +118,7 @@ class Stand:
         return design.stroke_points(lengths, counts)
 
     def set_face(self, number: int) -> None:
-        """Turn the gauge to a face; the sensor is out of the way then."""
+        """Set the gauge to a face; the sensor is moved away before."""
         face = self.settings.planes[number]
         self.move(self.start() - self.sign * self.layout.search * self.beam)
         if hasattr(self.control, "set_target"):
@@ -130,26 +130,26 @@ class Stand:
         )
 
     def start(self) -> Array:
-        """Return the place of the stage from which a face is looked for, m.
+        """Return the start position of the search for a face, m.
 
         Raises
         ------
         MethodError
-            The settings do not say.
+            The settings state none.
         """
         p = self.layout
         if p.start is not None:
             return np.array(p.start)
         if p.pivot is None or p.nominal_origin is None:
             raise MethodError(
-                "Where does the search for a face begin? Expected layout.start (a place of the stage), or both "
+                "The start position of the search is unknown. Expected layout.start (a position of the stage), or both "
                 "layout.pivot and layout.nominal_origin; found neither."
             )
         return np.asarray(self.sign * (np.array(p.pivot) - np.array(p.nominal_origin) - self.middle * self.beam))
 
-    def move(self, place: Array) -> Array:
-        """Move the stage and return where the control says that it is, m."""
-        self.control.move_to([float(x) for x in place])
+    def move(self, position: Array) -> Array:
+        """Move the stage and return the position reported by the control, m."""
+        self.control.move_to([float(x) for x in position])
         return np.array(self.control.state()["position"], np.float64)
 
     def read(self) -> float:
@@ -165,29 +165,29 @@ class Stand:
         return float(valid.mean()) if 2 * valid.size >= values.size else float("nan")
 
     def approach(self, number: int) -> Array:
-        """Look for a face along the beam, from far away to near, and return the stage's place at mid-range, m.
+        """Search a face along the beam, from far to near, and return the stage position at mid-range, m.
 
         Raises
         ------
         MethodError
-            No reading, or readings that do not fall while the sensor comes nearer.
+            No reading, or readings that do not decrease towards the face.
         """
         forth = self.sign * self.beam
         steps = np.arange(-self.layout.search, self.layout.search + 1e-12, _SEARCH * self.range)
         name = f"Face {number + 1}"
         for step in steps:
-            place = self.move(self.start() + step * forth)
+            position = self.move(self.start() + step * forth)
             reading = self.read()
             if np.isfinite(reading):
                 break
         else:
             raise MethodError(
                 f"{name}: no reading from {-self.layout.search * 1e3:g} to {self.layout.search * 1e3:g} mm along the "
-                f"beam about the stage's place {_mm(self.start())} mm. Check layout.start or layout.pivot, the "
-                "nominal direction, and how the gauge stands; or widen layout.search."
+                f"beam about the stage position {_mm(self.start())} mm. Check layout.start or layout.pivot, the "
+                "nominal direction, and the setting of the gauge; or increase layout.search."
             )
         ahead = _TRIAL * self.range if reading > self.middle else -_TRIAL * self.range
-        there = self.move(place + ahead * forth)
+        there = self.move(position + ahead * forth)
         change = (self.read() - reading) / ahead
         if not abs(change + 1) < 0.5:
             raise MethodError(
@@ -200,7 +200,7 @@ class Stand:
             if abs(off) < _CLOSE * self.range:
                 break
             there = self.move(there + off * forth)
-        self.invalid.clear()  # a search meets places without a reading
+        self.invalid.clear()  # readings that are missing during the search are not counted
         return there
 
     def measure(self, number: int, middle: Array, longest: int) -> xr.Dataset:
@@ -256,5 +256,5 @@ class Stand:
         )
 
 
-def _mm(place: Array) -> str:
-    return "({:.3f}, {:.3f}, {:.3f})".format(*(place * 1e3))
+def _mm(position: Array) -> str:
+    return "({:.3f}, {:.3f}, {:.3f})".format(*(position * 1e3))

@@ -1,4 +1,4 @@
-"""Settings for measuring and planning: the sensor as mounted, the gauge, the stage, and what readings are worth."""
+"""Settings for acquisition and planning: the mounted sensor, the gauge, the stage, and the noise of the readings."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ Vector = tuple[float, float, float]
 
 
 class Face(PluginSettings):
-    """How the sine gauge is set: the inclination of its face, and the rotation of its turntable about Z."""
+    """Setting of the sine gauge: inclination of its face, and rotation of its turntable about Z."""
 
     inclination: Angle = Field(ge=0, lt=1.5707963267948966, description="of the gauge's face to the table")
     rotation: Angle = Field(default=0.0, description="of the turntable; at 0 the face's normal leans towards +X")
 
 
 class Layout(PluginSettings):
-    """The set-up that is measured, or planned."""
+    """Set-up of a measurement or plan."""
 
     # The sensor
     nominal_origin: Point | None = Field(
-        default=None, description="where the reading is 0 while the stage stands at 0, as drawn"
+        default=None, description="position of reading 0 while the stage is at 0, from the drawing"
     )
-    nominal_direction: Vector = Field(default=(0.0, 0.0, -1.0), description="of the beam, to the target, as drawn")
+    nominal_direction: Vector = Field(
+        default=(0.0, 0.0, -1.0), description="of the beam, towards the target, from the drawing"
+    )
     direction_uncertainty: Angle = Field(
         default=8.7e-3, gt=0, description="standard uncertainty of the nominal direction"
     )
@@ -35,25 +37,32 @@ class Layout(PluginSettings):
         default=None, description="normal of the plane of emitted and received beam, for the inclination compensation"
     )
     reading_range: tuple[Length, Length] = Field(
-        default=(-10e-3, 10e-3), description="lowest and highest reading to plan for; measuring asks the sensor"
+        default=(-10e-3, 10e-3),
+        description="lowest and highest reading of a plan; a measurement uses the range of the sensor",
     )
     used_range: float = Field(default=0.8, gt=0, le=1, description="share of the range that strokes use")
-    average: int = Field(default=8, ge=1, description="readings averaged at each place")
+    average: int = Field(default=8, ge=1, description="readings averaged at each position")
     noise: Length = Field(
-        default=0.1e-6, gt=0, description="standard deviation of a reading, where the sensor's own settings do not say"
+        default=0.1e-6, gt=0, description="standard deviation of a reading, where the settings of the sensor state none"
     )
     speckle: Length = Field(
-        default=0.0, ge=0, description="standard deviation of the error by the surface's texture, the same at one place"
+        default=0.0,
+        ge=0,
+        description="standard deviation of the error caused by the surface texture, constant at one position",
     )
-    speckle_length: Length = Field(default=50e-6, gt=0, description="way on which that error loses its correlation")
+    speckle_length: Length = Field(default=50e-6, gt=0, description="correlation length of that error")
     scale_uncertainty: float = Field(
         default=0.0, ge=0, description="relative standard uncertainty of the sensor's scale, for planning"
     )
 
     # The gauge
-    pivot: Point | None = Field(default=None, description="place that the gauge's face goes through however it is set")
+    pivot: Point | None = Field(
+        default=None, description="point of the face of the gauge that is the same at every setting"
+    )
     pivot_uncertainty: Length = Field(
-        default=2e-6, gt=0, description="standard uncertainty of the face's distance from that place, at each setting"
+        default=2e-6,
+        gt=0,
+        description="standard uncertainty of the distance of the face from that point, at each setting",
     )
     inclinations: tuple[Angle, Angle] = Field(
         default=(0.0, 0.7853981633974483), description="least and largest inclination of the gauge"
@@ -61,7 +70,7 @@ class Layout(PluginSettings):
     rotations: tuple[Angle, Angle] = Field(
         default=(0.0, 6.283185307179586), description="least and largest rotation of the turntable"
     )
-    plate: Length = Field(default=60e-3, gt=0, description="longest way of the light spot over the gauge's face")
+    plate: Length = Field(default=60e-3, gt=0, description="longest path of the light spot on the face of the gauge")
     max_inclination: Angle = Field(
         default=0.7853981633974483,
         gt=0,
@@ -72,20 +81,22 @@ class Layout(PluginSettings):
     # The stage
     start: Point | None = Field(
         default=None,
-        description="place of the stage from which the face is looked for; default where the nominal beam has the "
+        description="start position of the stage for the search of the face; default where the nominal beam has the "
         "pivot at mid-range",
     )
     search: Length = Field(
-        default=20e-3, ge=0, description="how far from the start the face is looked for, along the beam to and fro"
+        default=20e-3, ge=0, description="range of the search along the beam, in both directions from the start"
     )
     strokes: Literal["longest"] | Point = Field(
         default="longest",
-        description="lengths of the strokes along X, Y and Z, or the longest that keep to range, travel and plate",
+        description="lengths of the strokes along X, Y and Z, or the longest within range, travel and plate",
     )
     travel: Point = Field(default=(40e-3, 40e-3, 40e-3), description="longest strokes along X, Y, Z")
-    readings: int = Field(default=60, ge=9, description="places on each face, shared out evenly to its three strokes")
+    readings: int = Field(
+        default=60, ge=9, description="number of positions on each face, evenly distributed to its three strokes"
+    )
     path: tuple[Point, ...] = Field(
-        default=(), description="places of the stage about the middle instead of strokes, the same for every face"
+        default=(), description="stage positions about the middle instead of strokes, the same for every face"
     )
 
     @model_validator(mode="after")
@@ -99,5 +110,5 @@ class Layout(PluginSettings):
             if vector is not None and not any(vector):
                 raise ValueError(f"{name}: expected a direction; found (0, 0, 0)")
         if self.path and len(self.path) < 9:
-            raise ValueError(f"path: expected 9 places or more; found {len(self.path)}")
+            raise ValueError(f"path: expected 9 positions or more; found {len(self.path)}")
         return self

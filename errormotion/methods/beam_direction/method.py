@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class BeamDirection:
-    """Where a point sensor's beam starts and where it goes, from planes that a stage moves it over."""
+    """Origin and direction of the beam of a point sensor, from readings on planes over which a stage moves it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="beam_direction",
@@ -26,7 +26,7 @@ class BeamDirection:
         cannot_see=(
             "the rotation of the beam about itself",
             "the zero point, where fewer than three planes have a known point",
-            "errors of the stage: its axes are taken as straight and true",
+            "errors of the stage, whose axes are assumed to be straight and square",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
@@ -52,7 +52,7 @@ class BeamDirection:
         return acquisition.measure_planes(bench, settings, inputs, done)
 
     def check(self, settings: BeamSettings) -> dict[str, str]:
-        """Return why the calibration that the settings name cannot be used, where it cannot."""
+        """Return why the calibration of the settings cannot be used; empty where it can."""
         if settings.compensation is None:
             return {}
         from errormotion.datasets.calibrations.inclination import InclinationCalibration
@@ -74,20 +74,20 @@ class BeamDirection:
     def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``beam``.
 
-        A check bar alone is measured with the beam as the data state it: its errors are then NaN.
+        A check bar alone is measured with the beam as stated in the data; the errors of the beam are then NaN.
 
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.beam_direction/1``; stays as it is.
+            Schema ``errormotion.raw.beam_direction/1``; not modified.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema (all violations at once), or the calibration is not found.
+            The raw dataset violates its schema (all violations are reported together), or the calibration is not found.
         MethodError
-            The data do not determine the answer.
+            The data do not determine the result.
         """
         from errormotion.datasets import validate
         from errormotion.methods.beam_direction.identification.planes import identify_beam
@@ -105,7 +105,7 @@ class BeamDirection:
         return identify_beam(checked, settings, self.info.id, self.info.version)
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
         from errormotion.methods.beam_direction.planning.plan import plan
 
         return plan(self, settings or BeamSettings())

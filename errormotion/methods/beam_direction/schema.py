@@ -30,10 +30,10 @@ _POINT_SENSOR = (
         (),
         "m",
         *NOISE,
-        "standard deviation of what the surface adds along a stroke",
+        "standard deviation of the error caused by the surface texture along a stroke",
         required=False,
     ),
-    Row("speckle_length", (), "m", 0.0, 0.1, "way of the stage on which that correlates", required=False),
+    Row("speckle_length", (), "m", 0.0, 0.1, "correlation length of that error", required=False),
 )
 
 _ALIASES = {"reading": "distance", "x": "stage_x", "y": "stage_y", "z": "stage_z"}
@@ -50,7 +50,7 @@ RAW_SCHEMAS = (
                 ("plane", "reading", "direction"),
                 "m",
                 *POSITION,
-                "place of the stage; NaN only where a plane has fewer readings than others",
+                "position of the stage; NaN only where a plane has fewer readings than others",
                 missing=True,
             ),
             Row("nominal_direction", ("direction",), "1", *UNIT_VECTOR, "rough direction of the beam"),
@@ -61,7 +61,7 @@ RAW_SCHEMAS = (
                 ("plane", "direction"),
                 "1",
                 *UNIT_VECTOR,
-                "normal of each plane as set, to compare; the method needs none",
+                "normal of each plane as set, for comparison only",
                 required=False,
             ),
             *_POINT_SENSOR,
@@ -75,9 +75,11 @@ RAW_SCHEMAS = (
                 required=False,
             ),
             Row("bar_distance", ("bar_reading",), "m", -2.0, 2.0, "reading on a check bar; NaN = none", required=False),
-            Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "place of the stage there", required=False),
+            Row(
+                "bar_stage", ("bar_reading", "direction"), "m", *POSITION, "position of the stage there", required=False
+            ),
             Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar", required=False),
-            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = to be found", required=False),
+            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = unknown", required=False),
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
@@ -89,9 +91,9 @@ RAW_SCHEMAS = (
         "bar_distance",
         (
             Row("bar_distance", ("bar_reading",), "m", -2.0, 2.0, "reading on a check bar; NaN = none", missing=True),
-            Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "place of the stage there"),
+            Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "position of the stage there"),
             Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar"),
-            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = to be found", required=False),
+            Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = unknown", required=False),
             Row("nominal_direction", ("direction",), "1", *UNIT_VECTOR, "direction of the beam"),
             Row("distance_noise", (), "m", *NOISE, "standard deviation of one reading"),
             Row("nominal_origin", ("direction",), "m", *POSITION, "zero point while the stage is at 0", required=False),
@@ -107,8 +109,17 @@ RAW_SCHEMAS = (
         "group",
         (
             Row("reading", ("group",), "m", *READING, "of the sensor; NaN = none", missing=True),
-            Row("reference", ("group",), "m", *READING, "true depth, by an interferometer, counted as the reading is"),
-            Row("inclination", ("group",), "rad", -1.5, 1.5, "of the surface; negative: tilted the other way"),
+            Row(
+                "reference", ("group",), "m", *READING, "true depth by an interferometer, with the sign of the reading"
+            ),
+            Row(
+                "inclination",
+                ("group",),
+                "rad",
+                -1.5,
+                1.5,
+                "of the surface; negative: tilted in the opposite direction",
+            ),
             Row("rotation", ("group",), "rad", -6.3, 6.3, "azimuth of the tilt from the triangulation plane"),
             Row("reading_noise", (), "m", *NOISE, "standard deviation of one reading", required=False),
             Row(

@@ -1,4 +1,4 @@
-"""Settings of the method: what a campaign file or ``--set`` may say."""
+"""Settings of the method, for a campaign file or ``--set``."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class Settings(PluginSettings):
 
     # Acquisition
     planes: tuple[Face, ...] = Field(
-        default_factory=_three_planes, min_length=2, description="how the gauge stands, one after the other"
+        default_factory=_three_planes, min_length=2, description="settings of the gauge, in their order"
     )
 
-    layout: Layout = Field(default_factory=Layout, description="the set-up that is measured, or planned")
+    layout: Layout = Field(default_factory=Layout, description="set-up of the measurement or plan")
 
     # Identification
     moves: Literal["sensor", "target"] = Field(
-        default="sensor", description="what the stage carries; a raw dataset with the attribute moves knows better"
+        default="sensor", description="what the stage carries; the attribute moves of a raw dataset takes precedence"
     )
     compensation: str | None = Field(
         default=None, description="calibration of the sensor's inclination error, by path or name; default: none"
     )
     extrapolate: bool = Field(
-        default=False, description="compensate also at tilts and readings that the calibration does not speak for"
+        default=False, description="compensate also at tilts and readings that the calibration does not cover"
     )
     allow_other_sensor: bool = Field(
         default=False, description="use a calibration of a sensor with another serial number or mid range"
@@ -45,16 +45,19 @@ class Settings(PluginSettings):
     triangulation_normal_uncertainty: Angle = Field(
         default=float(np.radians(0.5)),
         ge=0,
-        description="standard uncertainty of the triangulation plane's angle about the beam, where the data state none",
+        description="standard uncertainty of the angle of the triangulation plane about the beam, where the data "
+        "state none",
     )
     tolerance: Angle = Field(
         default=1e-9, gt=0, description="change of the direction at which the compensation has converged"
     )
-    max_iterations: int = Field(default=30, ge=1, description="after so many the compensation is refused")
-    robust: bool = Field(default=True, description="leave out readings that lie far off their plane, and name them")
+    max_iterations: int = Field(default=30, ge=1, description="largest number of iterations of the compensation")
+    robust: bool = Field(default=True, description="ignore and report outliers")
     ordered: bool = Field(
-        default=True, description="readings lie along strokes; false where the stage went to its places in any order"
+        default=True,
+        description="readings are in their order along strokes; false where the stage positions have any order",
     )
     noise: Literal["auto", "stated"] = Field(
-        default="auto", description="the stated noise of the readings, raised where their scatter is larger (auto)"
+        default="auto",
+        description="noise of the readings: as stated, or raised to the observed scatter where that is larger (auto)",
     )

@@ -20,9 +20,9 @@ from errormotion.kinematics.beams import beam_errors, tilt_vector
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA, SCHEMA
 from errormotion.methods.beam_direction.settings import Settings
 from errormotion.twin import VirtualMachine, kernels, truth
-from errormotion.twin.planes import CheckBar, Target
-from errormotion.twin.point_sensor import PointSensor
-from errormotion.twin.stage_sensor import NOISE, TEXTURE
+from errormotion.twin.artefacts.planes import CheckBar, Target
+from errormotion.twin.sensors.point_sensor import PointSensor
+from errormotion.twin.sensors.stage_sensor import NOISE, TEXTURE
 
 PLANES = tuple((np.radians(20.0), np.radians(rotation)) for rotation in (0.0, 90.0, 180.0))
 """Default faces of the sine gauge: inclination and rotation, rad."""

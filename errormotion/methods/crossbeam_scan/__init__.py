@@ -1,11 +1,10 @@
-"""Crossbeam scan: thermal errors of a carriage from a line profiler that scans the same artefacts again and again.
+"""Crossbeam scan: thermal errors of a carriage from repeated scans of artefacts with a line profiler.
 
-Measuring: ``schedule`` and ``programs`` (what happens when, as NC programs), ``acquisition`` (the scans line by line),
-``pocket`` (scans for the profiler's pose), ``live`` (what it shows meanwhile).
-Identifying: ``cutting`` (scans out of the record), ``registration`` and ``registrations`` (warm scans on cold ones),
-``strain`` and ``carriage`` (to the six errors of the carriage), ``judgement`` (artefacts that moved), ``curves``
-(smooth curves), ``identification`` (all of it); ``edges``, ``calibration`` and ``pose_errors`` (the profiler's own
-pose).
+``acquisition`` measures scans and the pocket, with the schedule and its NC programs. ``identification`` cuts the scans
+out of the record, registers warm scans onto cold ones (``registration``), transforms the result to the six errors of
+the carriage, checks for artefacts that moved, and determines the pose of the profiler (``profiler_pose``).
+``planning`` computes expected uncertainties, ``simulation`` raw data with a known truth, ``report`` chapters and
+figures of merit.
 """
 
 from errormotion.methods.crossbeam_scan.method import CrossbeamScan

@@ -14,21 +14,23 @@ from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from errormotion.kinematics.description import MachineDescription
+
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
 
 
 class CrossbeamScan:
-    """How the carriage on a crossbeam moves and turns as the machine warms up, from scans of artefacts beneath it."""
+    """Thermal errors of the carriage on a crossbeam, from repeated scans of artefacts below it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="crossbeam_scan",
-        summary="Six thermal errors of a crossbeam's axis from a line profiler that scans artefacts again and again",
+        summary="Six thermal errors of a crossbeam's axis from repeated scans of artefacts with a line profiler",
         status="simulated_only",
         version="1",
         cannot_see=(
-            "errors that the cold machine has already: all is relative to the cold scans",
-            "what moves the table and its artefacts along with the crossbeam",
-            "errors between two artefacts that neither of them shows",
+            "errors of the cold machine: all errors are relative to the cold scans",
+            "motion of the table and its artefacts together with the crossbeam",
+            "errors between two artefacts that affect neither of them",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
@@ -55,6 +57,29 @@ class CrossbeamScan:
             return pocket.record_pocket(bench, settings, done)
         return acquisition.record_scans(bench, settings, inputs.get("pose"), done)
 
+    def machine_defaults(self, machine: MachineDescription) -> dict[str, Any]:
+        """Return the travel of Y."""
+        return {"travel": machine.travel["Y"]} if "Y" in machine.travel else {}
+
+    def check_machine(self, settings: ScanSettings, machine: MachineDescription) -> dict[str, str]:
+        """Return what contradicts the machine: Y does not carry the tool, or passes outside of its travel."""
+        if "Y" not in machine.tool_axes:
+            return {"": f"expected a machine whose axis Y carries the tool; found the chain '{machine.chain}'"}
+        found = {}
+        low, high = machine.travel["Y"]
+        if settings.travel and (settings.travel[0] < low - 1e-9 or settings.travel[1] > high + 1e-9):
+            found["travel"] = (
+                f"expected ends within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
+                f"found {settings.travel[0] * 1e3:g} mm to {settings.travel[1] * 1e3:g} mm"
+            )
+        positions = settings.positions if settings.procedure == "scan" else (settings.pocket_position,)
+        if outside := [y for y in positions if not low <= y <= high]:
+            found["positions"] = (
+                f"expected positions within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
+                f"found {outside[0] * 1e3:g} mm"
+            )
+        return found
+
     def append_dim(self, settings: ScanSettings) -> str:
         """Return ``scan`` for the profiler's pose, ``line`` for scans."""
         return "scan" if settings.procedure == "profiler_pose" else "line"
@@ -66,7 +91,7 @@ class CrossbeamScan:
         return float(len(settings.pocket_lifts) if settings.procedure == "profiler_pose" else expected_lines(settings))
 
     def follow(self, settings: ScanSettings) -> Callable[[xr.Dataset], str]:
-        """Return what tells, chunk by chunk while measuring, how far things are."""
+        """Return a function that reports the progress for each chunk."""
         from errormotion.methods.crossbeam_scan.acquisition.live import LiveScans
 
         return LiveScans(settings).update
@@ -82,24 +107,24 @@ class CrossbeamScan:
         return program_texts(settings)
 
     def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros whose covariance is the one to expect. See ``planning``."""
+        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
         from errormotion.methods.crossbeam_scan.planning import plan
 
         return plan(self.info, settings or ScanSettings())
 
     def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
+        """Return the error dataset of a raw dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
 
         Parameters
         ----------
         raw : Dataset
-            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; stays as it is and may be larger than memory.
+            Schema ``errormotion.raw.crossbeam_scan/1``, any variant; not changed, and possibly larger than memory.
         settings : Settings, optional
 
         Raises
         ------
         DatasetError
-            The raw dataset does not follow its schema; all violations at once.
+            The raw dataset does not follow its schema; all violations are listed.
         MethodError
             The data do not determine the answer.
         """

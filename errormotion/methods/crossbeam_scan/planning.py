@@ -1,9 +1,9 @@
-"""What to expect of a campaign before anything is measured: the covariance of its errors.
+"""Expected covariance of the errors of a campaign.
 
 The artefacts are waves along x and y. From their slopes comes the information of one registration, line by line: a line
 that jitters along z and y with the variances t (of both scans) has two unknowns of its own, with B its columns for
-them, and what it says of the twist is A - B (1/t + C)^-1 B^T, all in units of the noise. Then the chain, as for real
-registrations.
+them, and its information about the twist is A - B (1/t + C)^-1 B^T, all in units of the noise. The chain
+follows, as for real registrations.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ if TYPE_CHECKING:
 
 
 EXPECTED = np.array([20e-6, 20e-6, 20e-6, 10e-6, 10e-6, 10e-6])
-"""Errors (m, rad) of which a wrong pose and lever take their share in a plan."""
+"""Errors (m, rad) that a plan assumes for the influence of pose and lever."""
 _CELLS = 100
 PLATE = 2e-3
-"""How far beside the pocket the plate is looked at, m: a mean of a hundred points of each line."""
+"""Distance of the used part of the plate from the pocket, m: a mean of a hundred points of each line."""
 _OPEN = 1e12
 
 
 def plan(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros with the covariance to expect, of the procedure that the settings name."""
+    """Return an error dataset of zeros with the expected covariance, for the procedure of the settings."""
     return _plan_pose(info, settings) if settings.procedure == "profiler_pose" else _plan_scans(info, settings)
 
 
 def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return what to expect of scans, over (time, position).
+    """Return the plan of scans, over (time, position).
 
     Raises
     ------
@@ -51,22 +51,22 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
         No ``positions`` in the settings.
     """
     if not settings.positions:
-        raise MethodError("A plan needs the places of the artefacts: set positions, such as ['350 mm', '550 mm']")
-    places = np.array(settings.positions)
+        raise MethodError("A plan needs the positions of the artefacts: set positions, such as ['350 mm', '550 mm']")
+    positions = np.array(settings.positions)
     pose = settings.profiler_pose or PoseSettings()
     rig = Rig(given(pose), np.array(settings.lever), given_covariance(pose), np.array(settings.lever_uncertainty))
     W, A = strain.from_maps(rig.pose)[:6], carriage_adjoint(rig.pose, rig.lever)
-    noise = np.tile(W @ registration_covariance(settings) @ W.T, (places.size, 1, 1))
+    noise = np.tile(W @ registration_covariance(settings) @ W.T, (positions.size, 1, 1))
     if settings.strain == "guided":
-        twist = np.zeros((places.size, 6))
-        noise = strain.guided(twist, noise, places, A, settings.guide_uncertainty).covariance
+        twist = np.zeros((positions.size, 6))
+        noise = strain.guided(twist, noise, positions, A, settings.guide_uncertainty).covariance
     own = transform_covariance(noise, A)
     shared = carriage_errors(
         EXPECTED, np.zeros((6, 6)), rig.pose, rig.lever,
         pose_covariance=rig.pose_covariance, lever_uncertainty=rig.lever_uncertainty,
     )  # fmt: skip
     time = np.array([0.0, *settings.warm_up])
-    shape = (time.size, places.size)
+    shape = (time.size, positions.size)
     covariance = np.broadcast_to(own, (*shape, 6, 6)).copy()
     # The influence is stated at the carriage's origin for errors of the size expected, for these are not known yet.
     influence = np.broadcast_to(shared.influence[:, None, None], (len(shared.sources), *shape, 6)).copy()
@@ -76,7 +76,7 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
         np.zeros((*shape, 6)),
         covariance,
         dims=("time", "position"),
-        coords={"time": time, "y": ("position", places, {"units": "m"})},
+        coords={"time": time, "y": ("position", positions, {"units": "m"})},
         component="Y",
         machine="plan",
         frame="carriage, machine directions",
@@ -120,12 +120,12 @@ def registration_covariance(settings: Settings) -> Array:
 
 
 def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return what to expect of scans of a pocket: edges on the rim, and the plate beside it.
+    """Return the plan of scans of a pocket: edges of the rim, and the plate next to it.
 
     Raises
     ------
     MethodError
-        The scans leave a parameter of the pose open.
+        The scans do not determine a parameter of the pose.
     """
     nominal = given(settings.profiler_pose or PoseSettings())
     centre = np.array([*calibration.parameters(nominal), settings.pocket_radius])
@@ -142,8 +142,8 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
     if np.linalg.cond(information * np.outer(scale, scale)) > _OPEN:
         raise MethodError(
-            "These scans of the pocket leave the pose of the profiler open: expected two lifts of the spindle at least "
-            f"(pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
+            "These scans of the pocket do not determine the pose of the profiler: expected two lifts of the spindle at "
+            f"least (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
         )
     covariance = (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
     at_profiler = pose_twists(nominal, -nominal.translation)
@@ -164,7 +164,7 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
 
 
 def _pocket(settings: Settings, parameters: Array) -> Array:
-    """Return what the fit of a pocket would see with (a, b, g, dx, dy, dz, r), in units of its noise."""
+    """Return the observations of the fit of a pocket with (a, b, g, dx, dy, dz, r), in units of its noise."""
     layout, radius = settings.layout, settings.pocket_radius
     nominal = given(settings.profiler_pose or PoseSettings())
     pose = calibration.pose(*parameters[:6])

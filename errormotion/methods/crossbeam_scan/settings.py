@@ -1,4 +1,4 @@
-"""Settings of the method: what a campaign file or ``--set`` may say."""
+"""Settings of the method, as in a campaign file or after ``--set``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MINUTE = 60.0
 
 
 class PoseSettings(PluginSettings):
-    """Pose of the profiler in the tool frame, T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g), and what it is known to."""
+    """Pose of the profiler in the tool frame, T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g), and its uncertainty."""
 
     a: Angle = 0.0
     b: Angle = 0.0
@@ -27,7 +27,7 @@ class PoseSettings(PluginSettings):
 
 
 class Layout(PluginSettings):
-    """The artefacts and the profiler that a plan assumes: waves along both directions, and what is wrong with lines."""
+    """The artefacts and the profiler that a plan assumes: waves along both directions, and the jitter of the lines."""
 
     relief: Length = Field(default=1.5e-3, gt=0, description="amplitude of the waves")
     wavelength: tuple[Length, Length] = Field(default=(28e-3, 36e-3), description="of the waves along x and y")
@@ -35,7 +35,7 @@ class Layout(PluginSettings):
     points: int = Field(default=3200, ge=16, description="points of a profile")
     edge: Length = Field(default=2.5e-6, gt=0, description="standard deviation of a pocket's edge in one line")
     jitter_z: Length = Field(default=0.5e-6, ge=0, description="standard deviation of a line's height")
-    jitter_y: Length = Field(default=2e-6, ge=0, description="standard deviation of a line's place along the feed")
+    jitter_y: Length = Field(default=2e-6, ge=0, description="standard deviation of a line's position along the feed")
 
 
 class Settings(PluginSettings):
@@ -66,7 +66,7 @@ class Settings(PluginSettings):
         default=None, description="ends of the axis: programs that leave them are refused"
     )
     scan_z: Length | None = Field(
-        default=None, description="Z of the spindle for the scans, at which every pass begins; default: where it stands"
+        default=None, description="Z of the spindle for the scans, at which every pass starts; default: where it stands"
     )
     encoder_pitch: Length = Field(default=1e-6, description="way per encoder count; negative where it counts backwards")
     encoder_zero: Length = Field(default=0.0, description="position of the axis where the encoder's count is 0")

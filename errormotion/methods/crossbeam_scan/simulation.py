@@ -21,8 +21,8 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors
 from errormotion.methods.crossbeam_scan.method import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 from errormotion.twin import VirtualMachine, truth
-from errormotion.twin.artefacts import Artefact, circular_pocket, swept
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
+from errormotion.twin.sensors.profiler import Profiler
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings

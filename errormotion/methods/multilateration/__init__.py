@@ -1,15 +1,13 @@
-"""Multilateration: volumetric errors from displacements of a reflector, measured from four or more places.
+"""Multilateration: volumetric errors from displacements of a reflector, measured from four or more stations.
 
-``method`` is the plugin, ``identification`` what it does with raw data (``reading``): ``refraction`` and ``expansion``
-are the scale, ``drift`` is what places visited again tell, ``moving`` which station was moved, ``parameters`` are the
-errors of the axes, and ``volume`` is what these make of any grid.
+``method`` is the plugin. ``acquisition`` measures, ``identification`` turns raw data into errors, ``planning`` predicts
+the uncertainty of a layout, ``report`` and ``figures`` show a result, ``simulation`` makes raw data with a known truth.
 
-The numbers: ``solver`` (Gauss-Newton with every target eliminated), over ``model`` (the equations), ``kernels``
-and ``examination`` (compiled loops: to the solution, and at it), ``start`` (where the stations are, roughly),
-``turning`` (the datum), ``outliers`` (readings that are wrong), ``determinacy`` (what distances determine), ``network``
-(the answer and its covariances); ``bound`` foretells them without readings, and ``alternating`` is the scheme of the
-paper. Source: Takeuchi et al., estimation of three-dimensional volumetric
-errors of numerically controlled machine tools by a laser tracker.
+``network`` solves for targets and stations: ``model`` (the equations), ``start`` (approximate stations), ``descent``
+(Gauss-Newton with every target eliminated), ``turning`` (the datum), ``outliers`` (wrong readings), ``determinacy``
+(loose freedoms), ``network`` (result and covariances), over ``loops`` (array operations for small networks, compiled
+ones for large networks). Source: Takeuchi et al., estimation of three-dimensional volumetric errors of numerically
+controlled machine tools by a laser tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration

@@ -15,6 +15,8 @@ from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from errormotion.kinematics.description import MachineDescription
+
 
 class Multilateration:
     """Errors of the volume and of the axes from distances of a reflector to four or more places of a tracker."""
@@ -51,6 +53,28 @@ class Multilateration:
         from errormotion.methods.multilateration.acquisition import measure as acquisition
 
         return acquisition.measure_stations(bench, settings, inputs, done)
+
+    def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
+        """Return the chain of the axes that move."""
+        return {"chain": machine.moving_chain}
+
+    def check_machine(self, settings: MultilaterationSettings, machine: MachineDescription) -> dict[str, str]:
+        """Return what contradicts the machine: other axes, another chain, targets outside of the travel."""
+        if machine.moving_axes != ("X", "Y", "Z"):
+            moving = ", ".join(machine.moving_axes)
+            return {"": f"expected a machine with the moving axes X, Y and Z; found {moving}. Fix the rotary axes"}
+        found = {}
+        if settings.chain != machine.moving_chain:
+            found["chain"] = f"expected '{machine.moving_chain}'; found '{settings.chain}'"
+        corners = settings.layout.targets or (settings.layout.low, settings.layout.high)
+        for axis, column in zip("XYZ", zip(*corners, strict=True), strict=True):
+            low, high = machine.travel[axis]
+            if min(column) < low - 1e-9 or max(column) > high + 1e-9:
+                found["layout"] = (
+                    f"expected targets within the travel of {axis}, {low * 1e3:g} mm to {high * 1e3:g} mm; "
+                    f"found {min(column) * 1e3:g} mm to {max(column) * 1e3:g} mm"
+                )
+        return found
 
     def append_dim(self, settings: MultilaterationSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``station``."""

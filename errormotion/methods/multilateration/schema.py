@@ -19,14 +19,14 @@ RAW_SCHEMAS = (
                 "interferometer reading; NaN = beam broken",
                 missing=True,
             ),
-            Row("target_nominal", ("target", "direction"), "m", -100.0, 100.0, "commanded place of the reflector"),
+            Row("target_nominal", ("target", "direction"), "m", -100.0, 100.0, "commanded position of the reflector"),
             Row(
                 "station_nominal",
                 ("station", "direction"),
                 "m",
                 -100.0,
                 100.0,
-                "rough place of the tracker; without it, or where NaN, found from the displacements",
+                "approximate position of the tracker; without it, or where NaN, determined from the displacements",
                 required=False,
             ),
             Row(
@@ -34,7 +34,7 @@ RAW_SCHEMAS = (
                 ("target", "direction"),
                 "m",
                 *POSITION,
-                "where the reflector is with all axes at zero: commanded place less axis positions",
+                "position of the reflector with all axes at zero: commanded position minus axis positions",
                 required=False,
             ),
             Row(
@@ -43,7 +43,7 @@ RAW_SCHEMAS = (
                 "s",
                 -NO_LIMIT,
                 NO_LIMIT,
-                "when each reading was taken; with places visited again it shows the drift",
+                "time of each reading; with targets visited again it shows the drift",
                 required=False,
             ),
             *(
@@ -57,8 +57,8 @@ RAW_SCHEMAS = (
                         "1",
                         1.0,
                         1.001,
-                        "that the displacements were computed with, 1 for lengths in vacuum; where given, "
-                        "displacements are computed anew from the state of the air",
+                        "with which the displacements were computed, 1 for lengths in vacuum; where given, "
+                        "displacements are corrected again from the state of the air",
                     ),
                 )
             ),

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from errormotion.kinematics.description import MachineDescription
+
 SCHEMA = "errormotion.raw.normal_vector/1"
 
 
@@ -81,6 +83,18 @@ class NormalVector:
                 f"found {settings.interval:g} s"
             )
         return found
+
+    def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
+        """Return the axes that carry the tool."""
+        return {"tool_axes": machine.tool_axes}
+
+    def check_machine(self, settings: BallSettings, machine: MachineDescription) -> dict[str, str]:
+        """Return what contradicts the machine: other axes that carry the tool."""
+        if settings.tool_axes == machine.tool_axes:
+            return {}
+        return {
+            "tool_axes": f"expected '{machine.tool_axes}', the axes that carry the tool; found '{settings.tool_axes}'"
+        }
 
     def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
         """Return ``time``."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from errormotion.arrays import Array
 from errormotion.errors import BenchError, MethodError
 from errormotion.twin import Event, VirtualMachine
-from errormotion.twin.balls import Balls, Probe
+from errormotion.twin.artefacts.balls import Balls, Probe
 
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from errormotion.kinematics.description import MachineDescription
+
 
 class SpindleDrift:
     """Thermal displacement and tilt of a spindle, from five distance sensors on a bar."""
@@ -57,6 +59,15 @@ class SpindleDrift:
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, given_beams(inputs), done)
+
+    def check_machine(self, settings: DriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
+        """Return what contradicts the machine: a spindle along another axis than Z of the measuring frame."""
+        if machine.spindle_axis == "Z":
+            return {}
+        return {
+            "": "expected a spindle axis Z, the direction of the channel Z of the measuring frame; the machine's is "
+            f"{machine.spindle_axis}"
+        }
 
     def append_dim(self, settings: DriftSettings) -> str:
         """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""

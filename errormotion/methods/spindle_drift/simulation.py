@@ -16,8 +16,8 @@ from errormotion.errors import BenchError
 from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings
 from errormotion.twin import Event, VirtualMachine, intersections
-from errormotion.twin.frame import FrameGeometry
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE
+from errormotion.twin.sensors.frame import FrameGeometry
+from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE
 
 Beams = tuple[Array, Array, Array | None]
 

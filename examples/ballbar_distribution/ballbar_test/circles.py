@@ -82,12 +82,13 @@ def read(raw, notes):
 
 
 def _plane(raw):
-    names = [str(name) for name in raw["axis"].values] if "axis" in raw.coords else []
-    plane = "".join(names)
     axes = np.array(_xyz(raw["axis_direction"].transpose("axis", "direction")), float)
+    labels = raw["axis"].values if "axis" in raw.coords else np.array(list("XYZ"))[np.abs(axes).argmax(axis=1)]
+    names = [str(name) for name in labels]
+    plane = "".join(names)
     if plane not in PLANES:
         raise MethodError(
-            f"axis: expected the two axes of the circle in the order X Y, Y Z or Z X; found {' '.join(names) or 'none'}"
+            f"axis: expected the two axes of the circle in the order X Y, Y Z or Z X; found {' '.join(names)}"
         )
     if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-3):
         raise MethodError("axis_direction: expected two unit vectors at right angles to one another")

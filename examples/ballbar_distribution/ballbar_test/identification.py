@@ -31,9 +31,16 @@ def identify(raw, settings, method, version):
         reference=result.REFERENCE,
         method=method,
         method_version=version,
-        provenance=provenance.make(settings, raw, None, steps=steps(found)),
+        provenance=provenance.make(effective(settings, read), raw, None, steps=steps(found)),
     )
     return errors.assign_attrs(notes=[*notes, *remarks(found, read)] or [""], **limits(settings))
+
+
+def effective(settings, read):
+    """Return the settings with the test that the raw dataset states."""
+    runs, samples = read.length.shape[1:]
+    test = {"plane": read.plane, "centre": tuple(read.centre), "nominal_radius": read.radius, "feed": read.feed}
+    return settings.model_copy(update={**test, "runs": runs, "samples": samples})
 
 
 def plan(settings, method, version):

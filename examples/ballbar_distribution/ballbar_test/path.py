@@ -20,7 +20,8 @@ parameter            error of the axes                            radial deviati
 
 f is the angle travelled since the last reversal of the axis, and d the decay of its spike. ``squareness`` is the
 rotation of the second axis from the right angle to the first, about the normal of the plane: C0Y in plane XY. A bow is
-the straightness error of an axis at the ends of the circle's diameter against its middle.
+the straightness error of an axis at the ends of the circle's diameter against its middle. The second order is the
+square of the error across the bar by twice the radius: 1 nm for 17 um at a radius of 150 mm.
 """
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The chapter of a circular test: figures of ISO 230-4, polar plot, model of the path, uncertainty, data."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ballbar_test import plots
@@ -139,15 +141,18 @@ def parameter_table(errors):
 def uncertainty(errors):
     """Return the budget of a deviation."""
     here = errors.isel(direction_of_travel=0, angle=0)
+    made = budget.table(here, "of the radial deviation in the first sector of the counterclockwise path")
+    noise = budget.readable("independent")
+    rows = [["noise, independent from sector to sector" if row[0] == noise else row[0], *row[1:]] for row in made.rows]
     return [
-        budget.table(here, "of the radial deviation in the first sector of the counterclockwise path"),
+        replace(made, rows=rows),
         Text(
             "Noise is independent from sector to sector. All other sources are one draw for the whole test: they shift "
             "the deviations together, so that G and H hardly depend on them."
         ),
         Text(
-            "G, H, Fmax and Fmin are extreme values: noise makes them larger on average. The mean excess is removed, "
-            "and the doubt about it is part of their uncertainty."
+            "G, H, Fmax and Fmin are extreme values: noise makes them larger on average. The mean excess is "
+            "removed, and the uncertainty of this correction is included."
         ),
     ]
 

@@ -47,7 +47,7 @@ RAW_SCHEMAS = (
                 ("axis", "direction"),
                 "1",
                 *UNIT_VECTOR,
-                "of the two axes of the plane; labels of axis: X Y, Y Z or Z X",
+                "of the two axes of the plane; labels of axis, where given: X Y, Y Z or Z X",
             ),
             Row("length_uncertainty", (), "m", *NOISE, "standard uncertainty of the calibrated length"),
             Row(

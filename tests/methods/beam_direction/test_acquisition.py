@@ -182,7 +182,7 @@ def test_a_face_that_is_not_there_is_told_with_where_it_was_looked_for():
 def test_a_bench_that_cannot_measure_says_what_it_lacks():
     bench = Bench()
     bench.stage = SimpleNamespace(state=dict)
-    with pytest.raises(MethodError, match="'controller' that can move to a place"):
+    with pytest.raises(MethodError, match="'controller' that can move to a position"):
         list(measure_planes(bench, settings(), {}, None))
     with pytest.raises(MethodError, match=r"layout.start .* or both layout.pivot and layout.nominal_origin"):
         list(measure_planes(Bench(), settings(pivot=None), {}, None))

@@ -53,7 +53,9 @@ def test_published_centres(name: str, centre: tuple[float, float]) -> None:
 def test_misprint_of_the_published_table_is_named() -> None:
     bar = published("scheme2_0deg_compensated")
     assert bar.left_out == (8,)
-    assert "Point 9 of 20 (index 8, reading 5.465 mm) was left out: it lies 130 um inside" in bar.notes[0]
+    assert (
+        "Point 9 of 20 (index 8, reading 5.465 mm) is an outlier and was ignored: it is 130 um inside" in bar.notes[0]
+    )
 
 
 def test_systematic_residual_of_the_published_compensation_is_called_so() -> None:
@@ -156,7 +158,7 @@ def test_held_radius_holds_the_centre_better_and_carries_its_own_uncertainty() -
 
 def test_wrong_certificate_is_said() -> None:
     bar = fit_bar(bar_points(0.2e-6, 1), ALONG_Z, radius=R + 20e-6, noise=0.2e-6)
-    assert any("um off the bar's 25.0200 mm" in note for note in bar.notes)
+    assert any("um off the calibrated 25.0200 mm" in note for note in bar.notes)
     assert fit_bar(bar_points(0.2e-6, 1), ALONG_Z, radius=R, noise=0.2e-6).notes == ()
 
 

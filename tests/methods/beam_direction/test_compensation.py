@@ -7,7 +7,7 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction.identification.compensation import Planes, Sensor, settle, uncompensated
+from errormotion.methods.beam_direction.identification.compensation import Planes, Sensor, converge, uncompensated
 from errormotion.methods.beam_direction.identification.origin import locate
 from errormotion.methods.beam_direction.identification.propagation import closure_chi2, propagate
 from errormotion.methods.beam_direction.identification.slopes import expected_covariance
@@ -70,7 +70,7 @@ def sensor(calibration=TRUE, roll=0.0):
 
 
 def settled(planes=None, by=None, tolerance=1e-12, most=30):
-    return settle(planes or read_planes(), NOMINAL, by or sensor(), tolerance, most)
+    return converge(planes or read_planes(), NOMINAL, by or sensor(), tolerance, most)
 
 
 @pytest.mark.parametrize("normals", [PAIR, FOUR])
@@ -148,12 +148,12 @@ def test_closure_knows_of_the_calibration():
 
 def test_too_few_iterations_are_refused_with_the_last_change():
     with pytest.raises(
-        MethodError, match=r"after 2 iterations the direction changed by \S+ rad, expected less .*creeps"
+        MethodError, match=r"after 2 iterations the direction changed by \S+ rad, expected less .*the steps decrease"
     ):
         settled(most=2)
 
 
-def test_an_error_that_jumps_with_the_tilt_swings_to_and_fro():
+def test_an_error_that_jumps_with_the_tilt_makes_the_steps_alternate():
     class Jump(Polynomial):
         """Small but so steep about the true tilt of the first plane that each step overshoots."""
 
@@ -164,11 +164,13 @@ def test_an_error_that_jumps_with_the_tilt_swings_to_and_fro():
     by = sensor(Jump(np.array([0.0, middle, 0.0, 0.0]), np.zeros((4, 4))))
     exact = read_planes(PAIR, Polynomial(np.zeros(4), np.zeros((4, 4))))
     with pytest.raises(
-        MethodError, match=r"does not settle: after 30 iterations .* swings to and fro, .*less inclined"
+        MethodError, match=r"does not converge: after 30 iterations .* the steps alternate, .*less inclination"
     ):
         settled(exact, by)
 
 
 def test_a_calibration_of_another_sensor_is_refused():
-    with pytest.raises(MethodError, match=r"Plane 1: the calibration says .* Does it belong to this sensor"):
+    with pytest.raises(
+        MethodError, match=r"Plane 1: the inclination error by the calibration .* belongs to this sensor"
+    ):
         settled(by=sensor(Polynomial(np.array([0.5, 0, 0, 0]), np.zeros((4, 4)))))

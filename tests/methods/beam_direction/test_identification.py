@@ -142,9 +142,11 @@ def by(serial, kind="point_lds"):
 
 
 def test_calibration_of_another_sensor_is_refused_with_both_serial_numbers(machine, tmp_path):
-    readings = machine.raw_inclination(np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0)
+    readings = simulation.raw_inclination(
+        machine, np.radians(np.arange(-45, 46, 5.0)), np.radians(np.arange(0, 180, 15.0)), seed=0
+    )
     path = str(calibrate(readings.assign_attrs(by("S1"))).save(tmp_path / "s1.nc"))
-    raw = machine.raw_beam_direction(FOUR, seed=0)
+    raw = simulation.raw(machine, FOUR, seed=0)
     same = identify(raw.assign_attrs(by("S1")), compensation=path)
     assert "serial number" not in notes(same)
     with pytest.raises(DatasetError, match=r"'s1': .*serial number S1; the sensor in use has S2"):
@@ -159,7 +161,7 @@ def test_calibration_of_another_sensor_is_refused_with_both_serial_numbers(machi
 
 
 def test_calibration_without_a_serial_number_is_used_with_a_note(machine, calibration):
-    raw = machine.raw_beam_direction(FOUR, seed=0).assign_attrs(by("S2"))
+    raw = simulation.raw(machine, FOUR, seed=0).assign_attrs(by("S2"))
     assert "'sensor' holds no serial number" in notes(identify(raw, compensation=calibration))
 
 
@@ -192,12 +194,12 @@ def test_without_compensation_it_is_said_and_planes_contradict_one_another(machi
     assert "The uncertainties are raised" in told
     assert "worst is plane" in told
     told = notes(identify(simulation.raw(machine, FOUR[:3], seed=0)))
-    assert "three planes do not tell which of them is wrong" in told
+    assert "three planes do not show which of them is wrong" in told
 
 
 def test_two_planes_state_the_other_direction_and_the_missing_zero_point(machine):
     errors = identify(simulation.raw(machine, FOUR[:2], seed=0, inclination_error=False))
-    assert "Two directions fit the planes; the nominal direction decided" in notes(errors)
+    assert "Two directions fit the planes; the one nearer to nominal was taken" in notes(errors)
     assert "2 planes with a known point" in notes(errors)
     assert np.isnan(errors["beam_origin"]).all()
     assert np.isnan([errors[name].values[0] for name in FREEDOMS]).tolist() == [True] * 3 + [False] * 3
@@ -229,8 +231,8 @@ def test_outliers_are_named_by_plane_and_reading(machine):
     raw["distance"][1, 8] += 20e-6
     raw["distance"][3, 40] -= 5e-6
     errors = identify(raw)
-    assert "Plane 2: 1 readings left out as outliers: reading 9." in notes(errors)
-    assert "Plane 4: 1 readings left out as outliers: reading 41." in notes(errors)
+    assert "Plane 2: 1 readings are outliers and were ignored: reading 9." in notes(errors)
+    assert "Plane 4: 1 readings are outliers and were ignored: reading 41." in notes(errors)
     assert np.argwhere(errors["left_out"].values).tolist() == [[1, 8], [3, 40]]
 
 
@@ -254,24 +256,24 @@ def test_less_scatter_than_stated_is_said(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
     raw["distance_noise"] = raw["distance_noise"] * 3
     raw["distance_noise"].attrs["units"] = "m"
-    assert "scatter only" in notes(identify(raw))
+    assert "scatter of the readings is only" in notes(identify(raw))
 
 
 def test_speckle_that_is_not_stated_is_noticed(machine):
     raw = simulation.raw(
         machine, FOUR, seed=0, inclination_error=False, speckle=True, half_length=0.5e-3, count=60
     ).drop_vars(["speckle", "speckle_length"])
-    assert "Residuals of neighbouring readings resemble each other" in notes(identify(raw))
+    assert "Residuals of neighbouring readings are correlated" in notes(identify(raw))
 
 
 def test_sound_data_raise_no_alarm(machine):
     alarms = [notes(identify(simulation.raw(machine, FOUR, seed=seed, inclination_error=False))) for seed in range(25)]
-    assert set(alarms) == {"No inclination compensation: the readings are taken as they are."}
+    assert set(alarms) == {"No inclination compensation: the readings are not corrected for the inclination error."}
 
 
 def test_known_points_without_an_uncertainty_are_said_to_be_taken_as_exact(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
-    told = "the known points of the planes were taken as exact"
+    told = "the known points of the planes are assumed to be exact"
     assert told in notes(identify(raw.drop_vars("plane_point_uncertainty")))
     assert told in notes(identify(raw.assign(plane_point_uncertainty=((), np.nan, {"units": "m"}))))
 
@@ -306,7 +308,7 @@ def refused(raw, match, kind=MethodError, **settings):
 
 def test_parallel_planes(machine):
     raw = simulation.raw(machine, [FOUR[0]] * 3, seed=0, inclination_error=False)
-    refused(raw, r"The planes are parallel .*leave open how far the beam is turned about it")
+    refused(raw, r"The planes are parallel .*but not the rotation of the beam about it")
 
 
 def test_a_stroke_out_of_the_range(machine):
@@ -322,7 +324,7 @@ def test_a_stage_that_steps_back_along_a_stroke(machine):
     order = np.arange(60)
     order[[7, 8]] = order[[8, 7]]
     swapped = raw.assign(stage=raw["stage"].isel(reading=order))
-    refused(swapped, r"Plane 1: at reading 9 the stage steps back by .* um along a stroke")
+    refused(swapped, r"Plane 1: at reading 9 the stage moves back by .* um along a stroke")
     # Places and readings that belong together may come in any order, where that is meant.
     together = raw.isel(reading=order)
     refused(together, "ordered = false")
@@ -336,7 +338,7 @@ def test_a_stage_that_moves_along_two_directions(machine):
 
 def test_a_direction_that_flips_sign(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False)
-    refused(raw, r"its sign is turned.*setting moves", moves="target")
+    refused(raw, r"with the opposite sign.*setting moves", moves="target")
 
 
 def test_readings_in_mm(machine):
@@ -350,7 +352,7 @@ def test_places_of_the_stage_in_mm(machine):
     raw = simulation.raw(machine, FOUR, seed=0, inclination_error=False, half_length=5e-3)
     home = raw["stage"].mean("reading")
     raw["stage"] = ((raw["stage"] - home) * 1e3).assign_attrs(units="m")
-    refused(raw, "Plane 1: .*Are readings and places of the stage in the same unit")
+    refused(raw, "Plane 1: .*readings and stage positions have the same unit")
 
 
 def test_a_plane_that_the_beam_grazes(machine):
@@ -362,7 +364,7 @@ def test_a_plane_that_the_beam_grazes(machine):
     stage = raw["stage"].values[1] - raw["stage"].values[1].mean(axis=0)
     raw["stage"][1] = stage * 0.05
     raw["distance"][1] = stage * 0.05 @ g
-    refused(raw, "Plane 2: the beam grazes it")
+    refused(raw, "Plane 2: grazing incidence")
 
 
 def test_a_hole_in_the_calibration(machine, tmp_path):
@@ -376,7 +378,7 @@ def test_a_hole_in_the_calibration(machine, tmp_path):
         compensation=file,
     )
     errors = identify(raw, compensation=file, extrapolate=True)
-    assert "Plane 2: extrapolated. Calibration 'holed' does not speak for" in notes(errors)
+    assert "Plane 2: extrapolated. Calibration 'holed' does not cover" in notes(errors)
     assert "Plane 1: extrapolated" not in notes(errors)
     deviation = twist_error(errors, machine) / np.sqrt(np.diag(errors["covariance"].values[0]))
     assert np.abs(deviation).max() < 4

@@ -99,7 +99,7 @@ def test_where_the_error_vanishes_is_checked() -> None:
     wrong = calibrate(readings(mid=5e-3).assign(mid_range=7e-3))
     shift = float(wrong.dataset["mid_range_found"]) - 5e-3
     assert abs(shift) < 4 * float(wrong.dataset["mid_range_uncertainty"])
-    assert "not at the stated mid range, 7.0000 mm" in wrong.dataset.attrs["notes"]
+    assert "not at the stated mid-range, 7.0000 mm" in wrong.dataset.attrs["notes"]
 
 
 def test_compensated_readings_are_true_depths_about_the_mid_range_of_the_data() -> None:
@@ -126,7 +126,7 @@ def test_a_setting_at_the_wrong_angle_is_left_out_and_named() -> None:
     wrong = np.isclose(raw["inclination"], np.radians(20)) & np.isclose(raw["rotation"], np.radians(60))
     raw["reading"] = raw["reading"] + xr.where(wrong, 3e-4 * raw["reference"], 0.0)
     found = calibrate(raw)
-    told = "1 setting contradicts all the others and was left out: inclination 20 deg at rotation 60 deg."
+    told = "1 setting contradicts all others and was left out: inclination 20 deg at rotation 60 deg."
     assert told in found.dataset.attrs["notes"]
     assert int(found.dataset["setting_left_out"].sum()) == 1
     q = tilt_vector(np.radians(20.0), np.radians(60.0))
@@ -168,7 +168,7 @@ def test_every_reading_may_be_a_setting_of_its_own() -> None:
     found = calibrate(raw)
     q = tilt_vector(rng.uniform(0, 0.6, 200), rng.uniform(0, 6.28, 200))
     assert np.abs(found.slope(q)[0] - plane_slope(q)).max() < 5e-6
-    with pytest.raises(MethodError, match="do not tell the noise"):
+    with pytest.raises(MethodError, match="do not determine the noise"):
         calibrate(raw.drop_vars("reading_noise"))
 
 
@@ -226,7 +226,7 @@ def test_a_hole_along_the_inclination_is_named() -> None:
     assert "usual step is 5 deg of inclination; tilts in them are refused: inclination 20 to 35 deg at every" in told
     assert "spoils" not in told
     told = calibrate(readings(alphas=rings[[0, 1, 2, 3, 6, 7]])).dataset.attrs["notes"]
-    assert "A hole of 25 deg at every rotation spoils what is told beside it too" in told
+    assert "A hole of 25 deg at every rotation also affects its surroundings" in told
 
 
 def test_intervals_hold_the_truth_in_holes() -> None:
@@ -284,18 +284,18 @@ def test_readings_in_another_unit_are_refused(raw: xr.Dataset, expected: str) ->
 @pytest.mark.parametrize(
     ("raw", "expected"),
     [
-        (changed(reference=lambda d: -d), "The readings fall where the reference rises.*Change the sign"),
+        (changed(reference=lambda d: -d), "The readings decrease where the reference increases.*Change the sign"),
         (changed(reference=lambda d: 0 * d + 1e-3), r"The reference stays at 1\.0000 mm"),
         (changed(reading=lambda r: 0 * r + 2e-3), r"The readings stay near 2\.0000 mm"),
-        (changed(reference=lambda d: 1e-3 * d), r"1\d\d\d times as far as the reference.*Are the readings in mm"),
+        (changed(reference=lambda d: 1e-3 * d), r"1\d\d\d times as much as the reference.*Are the readings in mm"),
         (changed(reference=lambda d: d + 11e-3, reading=lambda r: r + 11e-3), r"from 1\.000 to 21\.000 mm .* one side"),
         (changed(inclination=lambda a: 0 * a), "Every inclination is 0"),
         (changed(reading=lambda r: r * np.nan), "Every reading is missing"),
         (readings(alphas=np.radians([0.0, 20.0]), betas=np.radians([0.0, 90.0])), "3 different tilts of the surface"),
-        (readings(depths=np.array([-1e-3, 1e-3])), r"0 readings more than unknowns do not tell the noise"),
+        (readings(depths=np.array([-1e-3, 1e-3])), r"0 readings more than unknowns do not determine the noise"),
     ],
 )
-def test_readings_that_cannot_be_meant_are_refused(raw: xr.Dataset, expected: str) -> None:
+def test_readings_that_are_implausible_are_refused(raw: xr.Dataset, expected: str) -> None:
     if "0 readings more" in expected:
         with pytest.raises(MethodError, match=expected):
             calibrate(raw, Settings(offsets="each"))

@@ -207,14 +207,14 @@ def calibration(tmp_path_factory):
     return calibrate(raw, CalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
 
 
-def test_the_best_planes_are_those_that_the_calibration_speaks_for(calibration):
+def test_the_best_planes_are_those_that_the_calibration_covers(calibration):
     ds = BeamDirection().plan(settings(compensation=str(calibration)))
     best = design.plane_normals(np.stack([ds["best_inclination"], ds["best_rotation"]], axis=-1))
     q = tilt(BEAM, np.array([0.0, 1.0, 0.0]), best)
     assert InclinationCalibration.load(calibration).supported(q).all()
     assert float(ds["gain"]) > 1.5
-    refused = [note for note in ds.attrs["notes"] if "does not speak for" in note]
-    assert "strokes of one length, which this calibration does not speak for." in refused[0]
+    refused = [note for note in ds.attrs["notes"] if "does not cover" in note]
+    assert "strokes of one length, which this calibration does not cover." in refused[0]
     assert "plane 2 of the published set-up" in refused[1]
     assert "would be refused" in refused[1]
 

@@ -285,7 +285,7 @@ def test_the_direction_stands_before_and_after_compensation(html):
     assert [number(cell) for cell in rows["without compensation"][:3]] == pytest.approx(before, abs=5.1e-7)
     turned = np.linalg.norm(np.cross(u, before))
     assert number(rows["without compensation"][4]) == pytest.approx(turned / ARCSEC, abs=0.051)
-    taken = table(html, "What was taken off")
+    taken = table(html, "Corrections of the raw readings")
     for k, row in enumerate(taken):
         spans = 1e6 * errors["compensation"].values[k]
         assert [number(cell) for cell in row[3:5]] == pytest.approx([spans.min(), spans.max()], abs=5.1e-3)
@@ -299,13 +299,13 @@ def test_a_tilt_that_the_calibration_does_not_support_is_said(page):
     assert "not supported" not in told[0]
     assert re.search(r"plane 2 \S+ \(not supported\)", told[1])
     assert "extrapolated" not in supported
-    assert "plane 2 lies where the calibration has no settings around" in words_of(bare)
+    assert "plane 2 lies outside the settings of the calibration" in words_of(bare)
 
 
 def test_the_calibration_is_told_with_its_remaining_error(html):
     found = re.search(r"at 78 tilts, 1 of them left out, fitted by a polynomial of order (\d+)", words_of(html))
     assert int(found[1]) == calibration().order
-    told = re.search(r"did not know: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
+    told = re.search(r"were left out of the fit: (\S+) µm per mm \(95 %: (\S+) to (\S+)\)", words_of(html))
     ds = calibration().dataset
     expected = 1e3 * np.array([ds["remaining_error"].item(), *ds["remaining_error_interval"].values])
     np.testing.assert_allclose([float(number) for number in told.groups()], expected, rtol=0.06)  # two digits
@@ -322,7 +322,7 @@ def test_a_calibration_of_the_same_name_and_another_content_is_not_shown(page):
     errors = result()
     errors["compensation"] = 1.1 * errors["compensation"]
     html = page(errors)
-    assert "No map: the calibration 'lk-h050' that is found here is not the one that was taken off" in words_of(html)
+    assert "No map: the calibration 'lk-h050' that is found here is not the one of the correction" in words_of(html)
 
 
 def test_the_calibration_beside_the_campaign_is_found_from_elsewhere(tmp_path, monkeypatch):

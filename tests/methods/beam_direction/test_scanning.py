@@ -198,7 +198,7 @@ def test_uncertainty_of_the_calibration_is_shared(scan: Callable[..., Points], b
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stage": STAGE[:2]}, r"readings \(n,\) and stage places \(n, 3\)"),
+        ({"stage": STAGE[:2]}, r"readings \(n,\) and stage positions \(n, 3\)"),
         ({"reading": np.full(3, np.nan)}, "found none that is a number"),
         ({"origin": (np.nan, 0, 0)}, "Give 0 0 0 for form and size alone"),
         ({"direction": (1, 1, 0)}, "a unit vector of three numbers"),

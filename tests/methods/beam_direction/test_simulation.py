@@ -8,7 +8,7 @@ from errormotion.errors import BenchError
 from errormotion.kinematics.beams import tilt, tilt_vector
 from errormotion.methods.beam_direction import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.point_sensor import seeded_point_sensor
+from errormotion.twin.sensors.point_sensor import seeded_point_sensor
 
 DEG = np.radians(1.0)
 

@@ -125,11 +125,11 @@ def test_too_few_readings_are_refused():
 def test_readings_on_no_plane_are_refused():
     two = EXACT.copy()
     two[: EXACT.size // 5 * 2] += 1e-3 * np.random.default_rng(5).normal(size=EXACT.size // 5 * 2)
-    with pytest.raises(MethodError, match="lie far off any plane"):
+    with pytest.raises(MethodError, match="do not fit any plane"):
         fit_plane_readings(two, STAGE, NOISE)
 
 
 def test_readings_too_dense_for_their_speckle_are_refused():
     stage = strokes(count=1400)
-    with pytest.raises(MethodError, match="Thin them out"):
+    with pytest.raises(MethodError, match="Use fewer"):
         fit_plane_readings(stage @ G, stage, NOISE, SPECKLE, LENGTH, robust=False)

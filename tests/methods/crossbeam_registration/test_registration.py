@@ -287,7 +287,7 @@ def test_two_artefacts_are_no_pair(scanner, make_scanner):
 def test_a_scan_off_its_place_by_a_quarter_is_refused(scanner, shift):
     rng = np.random.default_rng(12)
     shifted = RigidTransform.from_translation(shift)
-    with pytest.raises(MethodError, match=r"begin at the same place"):
+    with pytest.raises(MethodError, match=r"at the same position"):
         register(prepare(*scanner.scan(rng)), prepare(*scanner.scan(rng, shifted)))
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from errormotion.instruments.line_profiler.profile_files import ProfileFiles
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition import moving
-from errormotion.methods.crossbeam_scan.acquisition.scans import HAND_OVER_LINES, expected_lines, record_scans
+from errormotion.methods.crossbeam_scan.acquisition.scans import CHUNK_LINES, expected_lines, record_scans
 from errormotion.methods.crossbeam_scan.acquisition.schedule import schedule
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans, interruptions
 from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
@@ -190,7 +190,7 @@ def test_only_lines_at_artefacts_are_kept(tmp_path):
 
 def test_chunks_are_small_and_counts_are_kept(tmp_path):
     chunks = list(record_scans(bench_of(Machine()), SETTINGS, None, None))
-    assert max(chunk.sizes["line"] for chunk in chunks) < HAND_OVER_LINES + 64
+    assert max(chunk.sizes["line"] for chunk in chunks) < CHUNK_LINES + 64
     raw = store(chunks, tmp_path / "raw.zarr")
     assert json.loads(raw.attrs["invalid"])["dark"] > 100
     assert raw.attrs["dropped"] == 0
@@ -237,7 +237,7 @@ def test_a_cold_pass_that_breaks_is_made_again_while_the_machine_is_cold(tmp_pat
 def test_three_broken_passes_in_a_row_end_the_campaign_and_keep_what_came(tmp_path):
     lost = InstrumentError("connection lost")
     machine = Machine(dict.fromkeys(range(2, 9), (0.4, lost)))
-    with pytest.raises(InstrumentError, match="3 passes in a row broke, the last one, number 4: connection lost"):
+    with pytest.raises(InstrumentError, match="3 successive passes failed, the last one is number 4: connection lost"):
         record(machine, tmp_path / "raw.zarr")
     raw = datasets.load(tmp_path / "raw.zarr")
     assert [broken.cycle for broken in interruptions(raw)] == [2, 3, 4]
@@ -253,7 +253,9 @@ def test_broken_passes_that_are_not_in_a_row_do_not_end_it(tmp_path):
 
 @pytest.mark.parametrize("pitch", [1e-3, 1e-9, -1e-6])
 def test_a_wrong_encoder_pitch_is_told_at_the_first_pass(tmp_path, pitch):
-    with pytest.raises(MethodError, match=r"none of them in a scan; those are at 0\.3, 0\.45 m\. Check encoder_pitch"):
+    with pytest.raises(
+        MethodError, match=r"none of them in a scan; the scans are at 0\.3, 0\.45 m\. Check encoder_pitch"
+    ):
         record(Machine(), tmp_path / "raw.zarr", SETTINGS.model_copy(update={"encoder_pitch": pitch}))
 
 
@@ -372,7 +374,7 @@ def test_on_a_real_machine_the_warm_up_goes_on_by_the_clock_and_overdue_passes_a
 def test_a_record_that_does_not_say_when_it_began_is_not_gone_on_with(tmp_path, day):
     done = cut_off(tmp_path, 2, 0.4)
     del done.attrs["start"]
-    with pytest.raises(MethodError, match="does not say when it began"):
+    with pytest.raises(MethodError, match="does not state when it started"):
         record_scans(bench_of(day(Machine(real=True))), SETTINGS, None, done)
 
 
@@ -384,7 +386,7 @@ def test_the_operator_is_told_which_program_and_what_it_does(tmp_path, day):
         machine.t = max(machine.t, machine.end)  # the operator waits for the last one
         name = next(name for name in texts if f" {name} (" in f" {message}")
         machine.run_program(texts[name])
-        if "confirm at the moment it begins" in message:
+        if "confirm at the moment it starts" in message:
             machine.t = machine.begun
 
     bench = Bench(asks=obey, line_profiler=machine)
@@ -460,7 +462,7 @@ def test_a_profiler_whose_line_is_cut_is_opened_again(tmp_path):
     with control, profiler:
         reopened = []
         profiler.close = lambda: (reopened.append(1), KeyenceLJX.close(profiler))[1]
-        with pytest.raises(InstrumentError, match="3 passes in a row broke, the last one, number 0"):
+        with pytest.raises(InstrumentError, match="3 successive passes failed, the last one is number 0"):
             store(
                 record_scans(Bench(controller=control, line_profiler=profiler), settings, None, None),
                 tmp_path / "raw.zarr",

@@ -9,7 +9,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration, edges
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import Pocket, calibrate
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 RADIUS = 12.496e-3
 POCKET = Pocket(RADIUS)

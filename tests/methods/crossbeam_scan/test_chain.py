@@ -13,8 +13,8 @@ from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification import chain
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import swept
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import swept
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 T, Y = 7200.0, 0.3
 PERFECT = Profiler(80, 0.4e-3, disturbances=Disturbances.none())

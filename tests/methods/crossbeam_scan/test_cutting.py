@@ -101,7 +101,7 @@ def test_lost_lines_stand_as_nan_where_they_would_have_been(whole):
     found = scans.scan(1, 0)
     assert_whole(found, 0)
     assert np.isnan(found[0]).all(axis=1).sum() == 3
-    assert scans.notes == ["Pass 1 at 0.3 m: 3 lost lines of 800 are left open."]
+    assert scans.notes == ["Pass 1 at 0.3 m: 3 of 800 lines are lost and NaN."]
 
 
 def test_lines_that_never_came_are_left_open_as_well(whole):
@@ -133,13 +133,13 @@ def test_lines_in_the_wrong_order_are_put_in_order_and_it_is_noted(whole):
     order[[900, 902]] = order[[902, 900]]
     scans = Scans(whole.isel(line=order))
     assert_whole(scans.scan(0, 0), 0)
-    assert "lay behind the one before them" in scans.notes[0]
+    assert "were before the previous one" in scans.notes[0]
 
 
 def test_lines_that_came_twice_are_taken_once(whole):
     scans = Scans(whole.isel(line=np.r_[0:700, 690 : whole.sizes["line"]]))
     assert_whole(scans.scan(0, 0), 0)
-    assert any("10 lines came twice" in note for note in scans.notes)
+    assert any("10 lines were repeated" in note for note in scans.notes)
 
 
 def test_a_pass_the_other_way_gives_the_same_scan(whole):

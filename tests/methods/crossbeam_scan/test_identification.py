@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose import cali
 from errormotion.methods.crossbeam_scan.identification.registration import kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 PROFILER = Profiler(800, 25e-6)
 TIMES, PLACES = [0.0, 1800.0, 7200.0], [-0.5, 0.0, 0.5]
@@ -270,8 +270,8 @@ def test_raw_stays_as_it_was_and_is_named(campaigns, found):
 def test_unknown_uncertainties_are_told(campaigns):
     bare = campaigns[0].drop_vars(["pose_covariance", "lever_uncertainty"]).isel(cycle=[0, 2])
     ds = identify(bare)
-    assert any("pose of the profiler is taken as exact" in note for note in ds.attrs["notes"])
-    assert any("lever is taken as exact" in note for note in ds.attrs["notes"])
+    assert any("pose of the profiler is assumed exact" in note for note in ds.attrs["notes"])
+    assert any("lever is assumed exact" in note for note in ds.attrs["notes"])
     assert not ds["influence"].transpose("source", ...).values[: len(SOURCES)].any()
     assert "pose_u" not in ds
 
@@ -287,7 +287,7 @@ def test_a_cold_repeat_is_judged_and_no_row_of_its_own(with_repeat):
     assert ds["time"].values.tolist() == [0.0, 1800.0]
     assert ds["cold_repeat"].shape == (1, 3, 6)
     assert np.all(np.abs(ds["cold_repeat"].values) < 4 * ds["cold_repeat_u"].values)
-    assert not any("cold scan was repeated" in note for note in ds.attrs["notes"])
+    assert not any("cold scan and its repetition" in note for note in ds.attrs["notes"])
 
 
 # ---------------------------------------------------------------- the same again

@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 from errormotion.methods.crossbeam_scan import simulation
-from errormotion.methods.crossbeam_scan.acquisition.live import LONGEST_QUEUE, LiveScans
+from errormotion.methods.crossbeam_scan.acquisition.live import QUEUE_LENGTH, LiveScans
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 POSITIONS = (0.1, 0.3)
 SETTINGS = Settings(positions=POSITIONS, warm_up=(7200.0,), cold_repeats=0, scan_length=400 * 70e-6)
@@ -72,7 +72,7 @@ def test_it_never_waits_and_its_thread_ends(scans, monkeypatch):
     waiting = len(live._waiting)
     gate.set()
     live.wait()
-    assert waiting <= len(POSITIONS) + LONGEST_QUEUE
+    assert waiting <= len(POSITIONS) + QUEUE_LENGTH
     assert live._thread is None
 
 

@@ -13,8 +13,8 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose import cali
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import freeform
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import freeform
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 PLACES = (-0.4, 0.0, 0.4)
 WARM_UP = (1800.0, 7200.0)

@@ -89,7 +89,7 @@ def test_lifts_that_are_there_are_not_scanned_again():
 
 def test_a_profiler_that_breaks_every_time_is_given_up():
     control, profiler = gantry(24, "&fault=disconnect&fault_at=200")
-    with control, profiler, pytest.raises(InstrumentError, match=r"pocket_1\.nc broke 3 times, at last, its last line"):
+    with control, profiler, pytest.raises(InstrumentError, match=r"pocket_1\.nc failed 3 times\. The last line"):
         list(record_pocket(Bench(controller=control, line_profiler=profiler), SETTINGS, None))
 
 

@@ -8,7 +8,7 @@ from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registration import prepare
 from errormotion.methods.crossbeam_scan.identification.registrations import register_all
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 
 def test_bending_of_a_block_is_that_of_its_parabola():
@@ -24,4 +24,4 @@ def test_points_too_far_apart_for_the_relief_are_told(gantry, pitch, notes):
     raw = simulation.raw_scans(gantry, [0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
     found = register_all(Scans(raw), [0], 0.5e-6, Settings())
     assert len(found.notes) == notes
-    assert all("closer to one another" in note for note in found.notes)
+    assert all("Reduce the pitch of points and lines" in note for note in found.notes)

@@ -15,7 +15,7 @@ from errormotion.methods.crossbeam_scan.report.view import campaign
 from errormotion.report import write_report
 from errormotion.report.fields import remarks
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import swept
+from errormotion.twin.artefacts.pieces import swept
 
 MINUTES = (0, 7, 15, 30, 45, 60, 90, 120, 150, 180)
 PLACES = 0.35 + 0.2 * np.arange(8) - 1.05

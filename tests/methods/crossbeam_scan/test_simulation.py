@@ -8,8 +8,8 @@ from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.twin import VirtualMachine
-from errormotion.twin.artefacts import swept
-from errormotion.twin.profiler import Disturbances, Profiler
+from errormotion.twin.artefacts.pieces import swept
+from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 POSITIONS = -0.7 + 0.2 * np.arange(8)
 TIMES = 60.0 * np.array([0, 7, 15, 30, 45, 60, 90, 120, 150, 180])

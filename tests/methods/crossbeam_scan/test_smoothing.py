@@ -248,7 +248,7 @@ def test_unknown_freedom_spoils_itself_alone():
 def test_wrong_inputs_are_refused():
     x = PLACES
     y, v = np.ones((2, 8)), np.full((2, 8), 1e-6)
-    with pytest.raises(MethodError, match=r"places \(n,\)"):
+    with pytest.raises(MethodError, match=r"positions \(n,\)"):
         smooth(x[:5], y, v, x)
     with pytest.raises(MethodError, match="above 0"):
         smooth(x, y, 0 * v, x)

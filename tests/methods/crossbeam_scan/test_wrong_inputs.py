@@ -10,8 +10,8 @@ from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.twin.artefacts import freeform, plane
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.artefacts.pieces import freeform, plane
+from errormotion.twin.sensors.profiler import Profiler
 
 PROFILER, LINES, FEED = Profiler(800, 25e-6), 400, 70e-6
 #: two cold cycles, the second a repeat, and two warm ones, s
@@ -73,7 +73,7 @@ def assert_lost_alone(found, errors, reason, cycles=(CYCLE,), artefact=ARTEFACT)
         assert np.isnan(there[lost]).all()
         np.testing.assert_array_equal(there[~lost], clean[~lost])
     assert not found["points_used"].values[lost].any()
-    assert any(note.startswith(f"{lost[1:].sum()} of 6 warm scans gave no errors (at 0 m)") for note in notes(found))
+    assert any(note.startswith(f"{lost[1:].sum()} of 6 warm scans have no errors (at 0 m)") for note in notes(found))
 
 
 def notes(found):
@@ -104,7 +104,7 @@ def test_a_scan_shifted_by_a_quarter_of_the_artefact(gantry, raw, errors):
     # a scan of 28 mm out of one of 42 mm that begins 7 mm earlier
     longer = scan(gantry, [1800.0], [0.0], seed=9, lines=600)
     spoil(raw, longer["height"][0, 0, :LINES].values)
-    assert_lost_alone(identify(raw), errors, "6.96 mm across and 0.000 rad; let both scans begin at the same place")
+    assert_lost_alone(identify(raw), errors, "6.96 mm across and 0.000 rad; start both scans at the same position")
 
 
 def test_heights_that_are_no_surface(raw, errors):
@@ -140,7 +140,7 @@ def test_a_scan_backwards_is_the_same_scan(raw, errors):
 
 def test_places_that_run_against_the_heights(raw, errors):
     raw["y"][CYCLE, ARTEFACT] = raw["y"][CYCLE, ARTEFACT, ::-1].values
-    assert_lost_alone(identify(raw), errors, "let both scans begin at the same place of the artefact")
+    assert_lost_alone(identify(raw), errors, "start both scans at the same position of the artefact")
 
 
 def test_places_in_millimetres(raw, errors):
@@ -185,7 +185,7 @@ def test_a_whole_cold_pass_may_break(raw):
 def test_without_any_cold_scan_an_artefact_tells_nothing(raw, errors):
     raw["height"][:2, ARTEFACT] = np.nan
     found = identify(raw)
-    assert found["reason"][1:, ARTEFACT].values.tolist() == ["there is no cold scan to lay it on"] * 2
+    assert found["reason"][1:, ARTEFACT].values.tolist() == ["there is no cold scan to register it onto"] * 2
     assert np.isnan(found.em.twist().values[:, ARTEFACT]).all()  # not zero when it was cold: unknown
     np.testing.assert_array_equal(found.em.twist().values[:, [0, 2]], errors.em.twist().values[:, [0, 2]])
 
@@ -201,7 +201,9 @@ def test_a_flat_artefact_is_refused_with_what_it_leaves_open(gantry, raw, errors
 
 def test_not_one_usable_scan_is_refused_with_the_reasons(raw):
     raw["height"][2:] = np.nan
-    with pytest.raises(MethodError, match="Not one of 6 warm scans could be laid on its cold one: there is no scan"):
+    with pytest.raises(
+        MethodError, match="None of 6 warm scans could be registered onto its cold scan: there is no scan"
+    ):
         identify(raw)
 
 

@@ -159,7 +159,7 @@ def test_operator_is_asked_for_every_station_with_the_machine_at_its_first_targe
     bench = Bench()
     measured(bench)
     assert len(bench.messages) == 4
-    assert "S2: put the tracker near (350, -300, 50) mm" in bench.messages[1]
+    assert "S2: set up the tracker near (350, -300, 50) mm" in bench.messages[1]
 
 
 def test_a_control_that_can_place_the_tracker_does_and_nobody_is_asked():
@@ -202,7 +202,7 @@ def test_a_weather_station_that_falls_silent_stops_the_measurement():
     chunks = measure_stations(bench, settings(), {}, None, QUICK)
     next(chunks)
     bench.tracker.air = False
-    with pytest.raises(MethodError, match="no longer tells the state of the air"):
+    with pytest.raises(MethodError, match="no longer reports the state of the air"):
         next(chunks)
 
 
@@ -273,7 +273,7 @@ def test_an_interrupted_run_goes_on_behind_what_it_holds():
     assert [str(chunk["station"].values[0]) for chunk in rest] == ["S3", "S4"]
     assert len(bench.messages) == 2
     assert measured(Bench(), done=joined(chunks)) == []
-    with pytest.raises(MethodError, match=r"go on with S1; expected S2"):
+    with pytest.raises(MethodError, match=r"continue with S1; expected S2"):
         measured(Bench(), Measuring(sequence=(2, 1)), done=joined(chunks[:1]))
 
 
@@ -286,7 +286,7 @@ def test_a_poor_set_up_at_the_end_of_what_is_held_is_repeated():
 
 
 def test_a_tracker_that_was_not_moved_is_found_out():
-    with pytest.raises(MethodError, match=r"Set-up S2: the tracker stands near \(-0\.3., -0\.3., .*place of S1"):
+    with pytest.raises(MethodError, match=r"Set-up S2: the tracker is near \(-0\.3., -0\.3., .*position of S1"):
         measured(Bench(moved=False))
 
 

@@ -195,7 +195,7 @@ def test_a_target_in_the_stations_plane_does_not_move_the_others(n):
     assert np.allclose(network.target_covariance[others], without.target_covariance[others], rtol=1e-9, atol=1e-18)
     assert not network.carries[7]
     assert network.carries[others].all()
-    assert any("no say in where the whole lies (1 of them): 8" in note for note in notes_of(network))
+    assert any("do not carry the datum (1 of them): 8" in note for note in notes_of(network))
 
 
 def test_swapped_stations_are_noted_and_do_no_harm():

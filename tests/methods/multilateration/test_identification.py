@@ -306,7 +306,7 @@ def test_a_stated_repeatability_is_weighed_against_returns_by_its_uncertainty(ma
     assert "the settings state 0.1 um" in notes(wrong)
 
 
-def test_where_all_stations_read_at_once_repeatability_moves_the_target_itself(machine):
+def test_where_all_stations_read_from_plain_readings_repeatability_moves_the_target_itself(machine):
     q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[::4]])
     truth, d = vectors(simulation.true_errors(machine, q)), []

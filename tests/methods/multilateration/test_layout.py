@@ -7,7 +7,7 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.bound import bound, predicted_uncertainty
 from errormotion.methods.multilateration.planning.sight import Sight, blocked
 from errormotion.methods.multilateration.settings import Box, Layout, Planning
 
@@ -172,3 +172,13 @@ def test_a_box_with_its_corners_swapped_and_a_reflector_that_looks_nowhere_are_r
         Box(low=(0.1, 0, 0), high=(0, 0, 0))
     with pytest.raises(ValueError, match="reflector_axis: expected a direction"):
         Planning(reflector_axis=(0.0, 0.0, 0.0))
+
+
+def test_the_uncertainty_that_is_minimised_is_that_of_the_network():
+    target, stations = layout.grid(Layout(count=(3, 3, 3)))[1], np.array(Layout().stations)
+    seen = np.ones((4, 27), dtype=bool)
+    seen[0, 3] = seen[2, 9] = seen[1, 9] = False
+    expected = layout.uncertainty(bound(target, stations, noise=1e-6, seen=seen).target_covariance)
+    np.testing.assert_allclose(predicted_uncertainty(seen / 1e-6, stations, target), expected, rtol=1e-9)
+    flat = stations * (1.0, 1.0, 0.0)
+    assert predicted_uncertainty(seen / 1e-6, flat, target) is None

@@ -176,7 +176,7 @@ def test_alternating_scheme_is_reported_beside_ours_where_it_was_run(tmp_path):
         page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
     )
     assert "iterations 4" in html
-    assert "turns of the alternating scheme, beside ours 715 what it had left to go / µm 0.250" in html
+    assert "iterations of the alternating scheme 715 its estimated remaining distance / µm 0.250" in html
 
 
 def test_targets_that_are_unknown_are_counted(tmp_path):
@@ -196,7 +196,7 @@ def test_result_without_any_known_target_is_no_crash(tmp_path):
 def test_given_up_target_is_named(tmp_path):
     errors = measured()[0].copy(deep=True)
     errors["left_out"][{"target": 5}] = 2
-    assert "nothing tells which is wrong: T006." in words(page(errors, tmp_path))
+    assert "the wrong one is not determined: T006." in words(page(errors, tmp_path))
 
 
 def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
@@ -209,7 +209,7 @@ def test_names_that_look_like_markup_are_shown_as_they_are(tmp_path):
 def test_plan_states_what_to_expect_and_no_errors(tmp_path):
     planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
     html = page(planned, tmp_path)
-    assert "The plan names no better places" in html
+    assert "The plan contains no better positions" in html
     assert "Expected uncertainty of a multilateration" in html
     assert "Errors of the volume" not in html
 

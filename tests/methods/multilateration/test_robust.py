@@ -69,7 +69,7 @@ def test_a_target_is_given_up_where_nothing_tells_which_reading_is_wrong():
     network = solve(d, u, noise=30e-9)
     assert network.undecided == (9,)
     assert np.isnan(network.target[9]).all()
-    assert any("nothing tells which: 10" in note for note in notes_of(network))
+    assert any("it is not determined which: 10" in note for note in notes_of(network))
 
 
 def test_many_wrong_distances_of_all_sizes_are_named():

@@ -1,6 +1,5 @@
 """Targets and stations from displacements: exact on exact ones, best on noisy ones, honest about their worth."""
 
-import numba
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -195,21 +194,6 @@ def test_the_relative_formulation_costs_what_it_says():
     assert np.mean(found) == pytest.approx(variance.sum(), rel=4 * 0.25 / np.sqrt(seeds))
 
 
-def test_has_the_same_bits_on_any_number_of_threads():
-    u = nominal_targets(25_000)
-    d = measured(u, NEAR[:4], NOISE)
-    d[1, 77] = np.nan
-    threads, found = numba.get_num_threads(), []
-    try:
-        for count in {1, threads}:
-            numba.set_num_threads(count)
-            found.append(solve(d, u, NEAR[:4], noise=NOISE))
-    finally:
-        numba.set_num_threads(threads)
-    for name in ("target", "station", "target_covariance", "joint_covariance", "residual"):
-        assert np.array_equal(getattr(found[0], name), getattr(found[-1], name), equal_nan=True), name
-
-
 @pytest.mark.parametrize("off", [1e-6, 300e-6, 1e-3])
 def test_a_sample_first_leads_where_all_targets_lead(off):
     # 3000 targets are preceded by a sample; with a further parameter that is held at 0 they are not.
@@ -234,17 +218,6 @@ def test_what_follows_is_the_same_whenever_it_is_asked_for():
     u += 1.0
     assert np.array_equal(late.residual, residual)
     assert np.array_equal(late.target_covariance, early.target_covariance)
-
-
-def test_four_stations_have_no_way_of_their_own():
-    # A further parameter that is held at 0 makes the general elimination do the work of the four's.
-    u = nominal_targets(200)
-    d = measured(u, NEAR[:4], NOISE)
-    d[2, [5, 9]] = np.nan
-    own = solve(d, u, NEAR[:4], noise=NOISE)
-    general = solve(d, u, NEAR[:4], noise=NOISE, extra=np.ones((1, 4, 200)), extra_prior=[1e-15])
-    assert np.abs(own.target - general.target).max() < 1e-12
-    assert np.abs(own.target_covariance / general.target_covariance - 1).max() < 1e-5
 
 
 def test_missing_distances_cost_what_the_bound_says():
@@ -327,7 +300,7 @@ def test_far_off_rough_places_do_no_harm():
         ({"target": np.zeros((9, 3))}, r"expected displacements \(station, target\)"),
         ({"noise": 0.0}, "expected a positive standard deviation"),
         ({"noise": np.ones(3)}, "expected noise as one value"),
-        ({"station": np.zeros((3, 3))}, "expected rough places"),
+        ({"station": np.zeros((3, 3))}, "expected approximate positions"),
         ({"extra": np.zeros((1, 4, 3))}, "expected further parameters"),
     ],
 )

@@ -58,7 +58,7 @@ def test_a_fifth_of_gross_readings_is_borne():
 def test_flat_targets_need_to_be_told_the_side():
     u = targets(thickness=0.0)
     d = displacements(u, off=0.0)
-    with pytest.raises(MethodError, match="on which side of it a station stands"):
+    with pytest.raises(MethodError, match="on which side of it a station is"):
         start(d, u)
     found = start(d, u, STATION + CENTRE + 0.02)
     assert np.abs(found.place - STATION - CENTRE).max() < 1e-6

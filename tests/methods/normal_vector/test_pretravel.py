@@ -24,7 +24,7 @@ from errormotion.methods.normal_vector.identification.pretravel import (
     fit_pretravel,
 )
 from errormotion.twin import VirtualMachine
-from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
+from errormotion.twin.artefacts.balls import Balls, Probe, seeded_balls, seeded_probe
 
 TRAVEL = {"X": (-0.3, 0.3), "Y": (-0.25, 0.25), "Z": (0.0, 0.46)}
 STRAIN = 15e-6

@@ -227,8 +227,8 @@ def test_sensors_stand_at_the_places_of_their_thermometer(tmp_path):
         [values[0], values.min(), values.max(), values[-1]], abs=0.06
     )
     text = words(html)
-    assert "Sensors at their places on the machine" in text
-    assert re.search(r"Without a known place: .*bed", text)
+    assert "Positions of the sensors on the machine" in text
+    assert re.search(r"Position unknown: .*bed", text)
 
 
 def test_temperature_that_is_never_known_is_no_number(tmp_path):
@@ -243,7 +243,7 @@ def test_temperature_that_is_never_known_is_no_number(tmp_path):
     assert first[2].startswith("—")
     assert second[7].startswith("20.00 %")
     assert html.count("stroke='#B3261E'") == 2  # one red bar in each of the two small curves
-    assert f"Never known: {first[0]}" in words(html)
+    assert f"Without a valid reading: {first[0]}" in words(html)
 
 
 def test_result_by_the_normals_says_so(tmp_path):

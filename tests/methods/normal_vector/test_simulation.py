@@ -9,7 +9,7 @@ from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector, Settings
 from errormotion.methods.normal_vector.simulation import raw
 from errormotion.twin import Event, VirtualMachine
-from errormotion.twin.balls import NOISE
+from errormotion.twin.artefacts.balls import NOISE
 
 HOURS = 3600.0 * np.array([0.0, 0.5, 1.0, 2.0, 3.0])
 

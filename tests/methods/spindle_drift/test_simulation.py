@@ -8,7 +8,7 @@ from errormotion.datasets import validate
 from errormotion.errors import BenchError
 from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import Event, VirtualMachine, intersections
-from errormotion.twin.sensing import REPEATABILITY, SPECKLE
+from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE
 
 T = np.linspace(1.0, 6240.0, 50)
 MINUTE = 60.0

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.report import budget, provenance, quality, sensors, timeline
+from errormotion.report import budget, provenance, quality, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
-from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
+from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent
 
 _PREDICTED = (
@@ -166,5 +166,4 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
 
 def notes(errors: xr.Dataset) -> list[Block]:
     """Return the notes on a dataset, and its completeness."""
-    found: list[Block] = [Text(note, "warning") for note in remarks(errors)]
-    return [*found, *quality.sentences(errors, None)]
+    return [*quality.notes(errors), *quality.sentences(errors, None)]

@@ -52,7 +52,7 @@ class GantryProfiles:
     """
 
     def __init__(self, address: Address, world: VirtualWorld, name: str) -> None:
-        from errormotion.twin.profiler import Profiler
+        from errormotion.twin.sensors.profiler import Profiler
 
         if world.name != "gantry":
             raise InstrumentError(f"'artefact=twin' in '{address.url}': only on sim://gantry is there a crossbeam")
@@ -136,7 +136,7 @@ class GantryProfiles:
 
     def _commanded(self, layout: StreamLayout) -> Iterator[Lines]:
         """Yield a profile for each trigger by command that has come."""
-        from errormotion.twin.profiler import Profiler
+        from errormotion.twin.sensors.profiler import Profiler
 
         while self._triggers.acquire(blocking=False):
             times = np.array([max(self._last, self._rested)])
@@ -152,7 +152,7 @@ class GantryProfiles:
 
     def _along(self, path: Path, layout: StreamLayout, after: float) -> Iterator[Lines]:
         """Yield the profiles on a path after a time."""
-        from errormotion.twin.profiler import Profiler
+        from errormotion.twin.sensors.profiler import Profiler
         from errormotion.twin.table import CHUNK
 
         profiler = Profiler(layout.points, layout.x_pitch, disturbances=self._disturbances)
@@ -186,7 +186,7 @@ class GantryProfiles:
 
 
 def _disturbances(address: Address) -> Any:
-    from errormotion.twin.profiler import Disturbances
+    from errormotion.twin.sensors.profiler import Disturbances
 
     name = address.params.get("disturbances", "full")
     if name not in DISTURBANCES:

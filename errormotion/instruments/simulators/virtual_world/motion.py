@@ -19,7 +19,7 @@ from errormotion.twin.paths import Path
 
 if TYPE_CHECKING:
     from errormotion.twin import VirtualMachine
-    from errormotion.twin.balls import Balls
+    from errormotion.twin.artefacts.balls import Balls
 
 Array = np.ndarray[Any, Any]
 

@@ -12,8 +12,8 @@ from errormotion.errors import InstrumentError
 if TYPE_CHECKING:
     from errormotion.instruments.simulators.virtual_world.streams import Stream
     from errormotion.twin import VirtualMachine
+    from errormotion.twin.artefacts.planes import Target
     from errormotion.twin.paths import Path
-    from errormotion.twin.planes import Target
 
 Array = np.ndarray[Any, Any]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.virtual_world.described import described
 from errormotion.instruments.simulators.virtual_world.motion import LEAD_IN, Motion
 from errormotion.instruments.simulators.virtual_world.streams import Carried, Device, Stream
 from errormotion.instruments.simulators.virtual_world.targets import TargetStand
@@ -24,7 +25,7 @@ class VirtualWorld(Motion):
     Parameters
     ----------
     name : str
-        Kind of the machine, ``cframe`` or ``gantry``.
+        Kind of the machine, ``cframe`` or ``gantry``; ``machine`` for the one that the bench describes.
     seed : int
     warm : bool
         Whether the sensors were switched on long ago.
@@ -42,7 +43,7 @@ class VirtualWorld(Motion):
 
         self.name = name
         self.seed = seed
-        self.machine = VirtualMachine(name, seed, warm=warm)
+        self.machine = VirtualMachine(described(name), seed, warm=warm)
         self._compile()
         super().__init__()
         self.stand = TargetStand(self.machine)
@@ -218,6 +219,9 @@ def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualW
     """Return the world of a machine and seed, which is created at the first call."""
     with _lock:
         key = (name, int(seed), warm)
+        machine = described(name)
+        if key in _worlds and not isinstance(machine, str) and _worlds[key].machine.description != machine:
+            _worlds[key].end()  # of another bench
         if key not in _worlds:
             _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
         return _worlds[key]

@@ -1,12 +1,12 @@
-"""The sensor's inclination error taken off, when it depends on the direction that is sought.
+"""Correction of the inclination error of the sensor, which depends on the direction of the beam.
 
 A reading r of a plane with the tilt q is r = d + (d - m) k(q). On one plane q is the same for all readings, so that the
-compensated gradient is g / (1 + k) and the compensated offset m + (offset - m) / (1 + k): nothing has to be fitted
-again. The normal is N = g / |g| whatever k is. The tilt needs the beam, the beam needs the gradients: both are found
-in turn until the direction rests. Source: Lu et al., section 3.3, whose loop is over readings instead.
+compensated gradient is g / (1 + k) and the compensated offset m + (offset - m) / (1 + k): no second
+fit is needed. The normal is N = g / |g| for any k. The tilt depends on the beam and the beam on the gradients: both are
+found in turn until the direction converges. Source: Lu et al., section 3.3, whose iteration is over the readings.
 
-What is uncertain goes through the whole loop. With du = M dk the effect of the slopes on the direction and H = dk/du
-that of the direction on the slopes, a change that comes from elsewhere grows to (1 - M H)^-1 of itself.
+Uncertainties are propagated through the iteration. With du = M dk the effect of the slopes on the direction and
+H = dk/du that of the direction on the slopes, any other change is multiplied by (1 - M H)^-1.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation plane", "scale of the sensor"
-"""What all planes share: the first two where the inclination error is compensated, the last one where it is not."""
+"""Sources common to all planes: the first two with compensation of the inclination error, the last one without."""
 _STEP = 1e-5
 _LARGEST = 0.2
 _NEGLIGIBLE = 1e-12
@@ -36,7 +36,7 @@ _NEGLIGIBLE = 1e-12
 
 @dataclass(frozen=True)
 class Planes:
-    """What was found on the planes, as read or compensated.
+    """Fitted planes, as read or compensated.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Planes:
         For messages.
     gradients : ndarray (k, 3)
     offsets : ndarray (k,)
-        Reading at the stage's place 0, m.
+        Reading at the stage position 0, m.
     covariances : ndarray (k, 4, 4)
         Of (gradient, offset), SI.
     """
@@ -60,7 +60,7 @@ class Planes:
         return np.asarray(self.gradients / np.linalg.norm(self.gradients, axis=1, keepdims=True))
 
     def compensated(self, slope: Array, mid_range: float) -> Planes:
-        """Return them with the inclination error of slopes (k,) taken off."""
+        """Return the planes corrected for an inclination error of slopes (k,)."""
         scale = 1 / (1 + slope)
         return replace(
             self,
@@ -76,7 +76,7 @@ class Planes:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the compensation has to know of the sensor.
+    """Properties of the sensor for the compensation.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Sensor:
     mid_range : float
         Reading at which the inclination error vanishes, m.
     notes : tuple of str
-        What could not be checked of the calibration, and what was allowed.
+        Notes on the use of the calibration.
     """
 
     calibration: InclinationCalibration
@@ -103,13 +103,13 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class Settled:
-    """A direction and the compensation that belongs to it.
+class Converged:
+    """A direction and its compensation.
 
     Attributes
     ----------
     direction : Direction
-        Its covariance is that of the noise without the loop; see `propagation`.
+        Its covariance is that of the noise, without the iteration; see `propagation`.
     planes : Planes
         Compensated.
     tilt : ndarray (k, 2) or None
@@ -119,7 +119,7 @@ class Settled:
     slope_by_direction : ndarray (k, 3)
         Its change with the direction.
     sources, groups : tuple of str
-        What the slopes share, and what it belongs to in a budget.
+        Sources common to the slopes, and their groups in the budget.
     slope_by_source : ndarray (source, k)
         Change of the slopes with one standard uncertainty of each source, at this direction.
     mid_range : float
@@ -140,7 +140,7 @@ class Settled:
     iterations: int
 
 
-def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0, mid_range: float = 0.0) -> Settled:
+def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0, mid_range: float = 0.0) -> Converged:
     """Return the direction from the readings as they are.
 
     Parameters
@@ -153,7 +153,7 @@ def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0
     """
     k, known = len(planes.offsets), scale_uncertainty == 0
     direction = planes.direction(nominal)
-    return Settled(
+    return Converged(
         direction,
         planes,
         tilt=None,
@@ -167,8 +167,8 @@ def uncompensated(planes: Planes, nominal: Array, scale_uncertainty: float = 0.0
     )
 
 
-def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max_iterations: int) -> Settled:
-    """Compensate and solve in turn until the direction rests.
+def converge(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max_iterations: int) -> Converged:
+    """Compensate and solve in turn until the direction converges.
 
     Parameters
     ----------
@@ -178,14 +178,14 @@ def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max
         Rough direction.
     sensor : Sensor
     tolerance : float
-        Change of the direction at which it rests, rad.
+        Change of the direction at convergence, rad.
     max_iterations : int
 
     Raises
     ------
     MethodError
-        It does not rest within ``max_iterations``, or the compensation is no small correction; what `direction.solve`
-        refuses.
+        No convergence within ``max_iterations``, a compensation that is not a small correction, or an error of
+        `direction.solve`.
     """
     normals = planes.normals
     u = planes.direction(nominal).direction
@@ -200,20 +200,20 @@ def settle(planes: Planes, nominal: Array, sensor: Sensor, tolerance: float, max
         if np.linalg.norm(steps[-1]) < tolerance:
             break
         if len(steps) >= max_iterations:
-            raise MethodError(_does_not_settle(steps, tolerance))
+            raise MethodError(_not_converged(steps, tolerance))
     q = tilt(u, sensor.triangulation_normal, normals)
     sources, groups, by_source = _slope_sources(sensor, q)
     by_direction = np.zeros((len(slope), 3))
     for e in np.eye(2):
         ahead, behind = (sensor.slopes(turned(u, sign * _STEP * e), normals) for sign in (1, -1))
         by_direction += np.outer((ahead - behind) / (2 * _STEP), e @ across(u))
-    return Settled(direction, now, q, slope, by_direction, sources, groups, by_source, sensor.mid_range, len(steps))
+    return Converged(direction, now, q, slope, by_direction, sources, groups, by_source, sensor.mid_range, len(steps))
 
 
 def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str, ...], Array]:
-    """Return names and groups of what the slopes share, and their change (source, k) with each at tilts q (k, 2)."""
+    """Return names and groups of the sources common to the slopes, and their change (source, k) at tilts q (k, 2)."""
     J = sensor.calibration.jacobian(q)
-    # All coefficients together move the slopes of k planes in k independent ways at most.
+    # The coefficients change the slopes of k planes in at most k independent ways.
     variance, axes = np.linalg.eigh(J @ sensor.calibration.coefficient_covariance @ J.T)
     moved = variance > _NEGLIGIBLE * max(float(variance[-1]), 1e-300)
     by_source = (axes * np.sqrt(np.maximum(variance, 0.0)))[:, moved].T[::-1]
@@ -221,7 +221,7 @@ def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str
     groups = (CALIBRATION,) * len(sources)
     if sensor.normal_uncertainty > 0:
         c, s = np.cos(sensor.normal_uncertainty), np.sin(sensor.normal_uncertainty)
-        # Turned about the beam with the sensor, the axes of q turn, and q the other way.
+        # A rotation of the sensor about the beam rotates the axes of q, and q in the opposite sense.
         ahead, behind = (sensor.calibration.slope(q @ np.array([[c, -sign * s], [sign * s, c]]))[0] for sign in (1, -1))
         by_source = np.concatenate([by_source, [(ahead - behind) / 2]])
         sources, groups = (*sources, TRIANGULATION), (*groups, TRIANGULATION)
@@ -232,32 +232,32 @@ def _check_slopes(slope: Array, names: Sequence[str]) -> None:
     for name, k in zip(names, slope, strict=True):
         if np.isnan(k):
             raise MethodError(
-                f"{name}: while compensating, the beam came to look at its back. Check the nominal direction and that "
-                "the calibration belongs to this sensor."
+                f"{name}: during the compensation, the beam met its back. Check the nominal direction and that the "
+                "calibration belongs to this sensor."
             )
         if abs(k) > _LARGEST:
             raise MethodError(
-                f"{name}: the calibration says that the reading is off by {k:.0%} of the depth; expected a few per "
-                "cent at most. Does it belong to this sensor, and does it reach this inclination?"
+                f"{name}: the inclination error by the calibration is {k:.0%} of the depth; expected a few per cent at "
+                "most. Check that the calibration belongs to this sensor and covers this inclination."
             )
 
 
-def _does_not_settle(steps: list[Array], tolerance: float) -> str:
+def _not_converged(steps: list[Array], tolerance: float) -> str:
     size = np.linalg.norm(steps, axis=1)
     back = float(steps[-1] @ steps[-2]) / max(size[-1] * size[-2], 1e-300) if len(steps) > 1 else 0.0
     factor = size[-1] / size[-2] if len(steps) > 1 else np.nan
     if back < -0.5:
-        how = f"it swings to and fro, each step {factor:.2g} of the one before"
+        how = f"the steps alternate, each {factor:.2g} times the previous one"
     elif factor >= 1:
-        how = f"its steps grow, each {factor:.2g} of the one before"
+        how = f"the steps increase, each {factor:.2g} times the previous one"
     else:
-        how = f"it still creeps, each step {factor:.2g} of the one before" if len(steps) > 1 else "after one step"
+        how = f"the steps decrease, each {factor:.2g} times the previous one" if len(steps) > 1 else "after one step"
     needs = (
-        f" At this rate {int(np.ceil(np.log(tolerance / size[-1]) / np.log(factor)))} more would do (max_iterations)."
+        f" At this rate {int(np.ceil(np.log(tolerance / size[-1]) / np.log(factor)))} more are needed (max_iterations)."
         if 0 < factor < 0.9
-        else " The inclination error depends too strongly on the tilt: take planes that are less inclined."
+        else " The inclination error depends too strongly on the tilt: use planes with less inclination."
     )
     return (
-        f"The compensation of the inclination error does not settle: after {len(steps)} iterations the direction "
+        f"The compensation of the inclination error does not converge: after {len(steps)} iterations the direction "
         f"changed by {size[-1]:.2g} rad, expected less than {tolerance:.2g} rad; {how}.{needs}"
     )

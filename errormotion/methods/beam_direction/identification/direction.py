@@ -1,20 +1,20 @@
-"""The direction of a beam from how its readings change on planes.
+"""Direction of a beam from the change of its readings on planes.
 
-The zero point of the sensor is at p0 + s, s the place of the stage, and reads d along the unit vector u until the plane
+The zero point of the sensor is at p0 + s, s the stage position, and reads d along the unit vector u until the plane
 N . (x - P) = 0 is met: N . (p0 + s + u d - P) = 0. So the gradient of the reading is g = -N / (N . u), and each plane,
 whatever its normal, sets one condition: g . u = -1. With N towards the sensor N . u < 0, so that N = g / |g|.
 
 Measured gradients g_k have covariances S_k. Over all true gradients gamma_k that meet their condition the likelihood is
-greatest at gamma_k = g_k - S_k u c_k / (u . S_k u), with c_k = g_k . u + 1; what is left to minimise is
+greatest at gamma_k = g_k - S_k u c_k / (u . S_k u), with c_k = g_k . u + 1; it remains to minimise
 
     chi2(u) = sum_k c_k^2 / (u . S_k u)    under |u| = 1,
 
 the exact profile likelihood: nothing is linearised and no prior knowledge of the planes is used. The information about
 u is sum_k gamma_k gamma_k^T / (u . S_k u), across u; its inverse is both the covariance and the Cramer-Rao bound.
 
-A step by the angle w across u changes each c_k by gamma_k . w + w^2 / 2 to second order, since gamma_k . u = -1. How
-that second part compares to one standard deviation is the ``curvature``: with two planes it is the standard uncertainty
-over twice the distance to the mirror plane of the two roots.
+A step by the angle w across u changes each c_k by gamma_k . w + w^2 / 2 to second order, since gamma_k . u = -1. The
+ratio of the second part to one standard deviation is the ``curvature``: with two planes it is the standard uncertainty
+divided by twice the distance to the mirror plane of the two roots.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ GRAZING = 10.0
 LEAST_GRADIENT = 0.8
 """Least gradient: -N / (N . u) is 1 or more, whatever the plane; a sensor's inclination error is a few per cent."""
 AS_CLOSE = 0.8
-"""Two roots whose angles to the nominal direction have at least this ratio are not told apart by it."""
+"""Two roots whose angles to the nominal direction have at least this ratio are not distinguished by it."""
 EXCLUDED = 25.0
 """A root whose chi2 is greater by this is no root of the same data (5 standard deviations)."""
 _STRONGLY_CURVED = 1 / 6
@@ -60,17 +60,17 @@ class Direction:
     discrepancy : ndarray (k,)
         g . u + 1 of the gradients as measured.
     closure, closure_u : ndarray (k,)
-        The same, and the standard deviation that it should have by the noise; both 0 where two planes meet it exactly.
+        The same, and its standard deviation by the noise; both 0 where two planes meet the condition exactly.
     other_root : ndarray (3,) or None
-        Another direction that fits as well.
+        Another direction that fits equally well.
     gradients_fitted : ndarray (k, 3)
         Most likely gradients that meet their condition.
     chi2 : float
-        How far the planes are from closing.
+        Chi-square of the closure of the planes.
     freedom : int
         Of ``chi2``: planes minus 2.
     curvature : float
-        How far from linear the problem is over one standard uncertainty; above 0.05 intervals are only about right.
+        Nonlinearity over one standard uncertainty; above 0.05 intervals are approximate.
     """
 
     direction: Array
@@ -92,19 +92,19 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     Parameters
     ----------
     gradients : ndarray (k, 3)
-        Of the reading with the stage's place, 1; two planes or more.
+        Of the reading with the stage position, 1; two planes or more.
     covariances : ndarray (k, 3, 3)
         Of each gradient; planes are independent.
     nominal : ndarray (3,)
         Rough direction, from sensor to target: decides between two roots.
     names : sequence of str, optional
-        What to call the planes in messages.
+        Names of the planes in messages.
 
     Raises
     ------
     MethodError
-        One plane, parallel planes, a plane that the beam grazes, readings and places in different units, a direction
-        against the nominal one, or two roots that nothing tells apart.
+        One plane, parallel planes, a plane at grazing incidence, readings and positions in different units, a direction
+        opposite to the nominal one, or two roots that cannot be distinguished.
     """
     names = names or [f"Plane {i + 1}" for i in range(len(gradients))]
     nominal = nominal / np.linalg.norm(nominal)
@@ -114,9 +114,10 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
     others = [root for root in roots[1:] if root[0] < chi2 + EXCLUDED]
     if u @ nominal < 0:
         raise MethodError(
-            f"The beam comes out as {_vector(u)}, {_degrees(_angle(u, nominal))} off the nominal direction "
-            f"{_vector(nominal)}: its sign is turned. Check that the nominal direction points from the sensor to the "
-            "target, that readings grow with the distance, and whether the stage carries the sensor or the target "
+            f"The beam has the direction {_vector(u)}, {_degrees(_angle(u, nominal))} off the nominal direction "
+            f"{_vector(nominal)}, with the opposite sign. Check that the nominal direction points from the sensor to "
+            "the "
+            "target, that readings increase with the distance, and whether the stage carries the sensor or the target "
             "(setting moves)."
         )
     other = others[0][1] if others else None
@@ -125,8 +126,8 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
         if not better and _angle(u, other) > 1e-6:
             raise MethodError(
                 f"Two directions fit: {_vector(u)} and {_vector(other)}, {_degrees(_angle(u, nominal))} and "
-                f"{_degrees(_angle(other, nominal))} off the nominal direction, which does not tell them apart. Give "
-                "a better nominal direction, or measure a third plane that is tilted about another axis."
+                f"{_degrees(_angle(other, nominal))} off the nominal direction, which does not distinguish them. "
+                "Give a better nominal direction, or measure a third plane that is tilted about another axis."
             )
         if better:
             (chi2, u), other = others[0], None
@@ -139,9 +140,9 @@ def solve(gradients: Array, covariances: Array, nominal: Array, names: Sequence[
         curvature = 0.5 * float(np.linalg.eigvalsh(small)[-1]) * float(np.sqrt(np.sum(1 / sigma2)))
     if not curvature < _STRONGLY_CURVED:
         raise MethodError(
-            f"The beam lies in the plane of the planes' normals to within its uncertainty, near {_vector(u)}: there "
-            "the two directions that would fit merge, and noise decides which comes out. Measure a plane that is "
-            "tilted about another axis."
+            f"The beam is in the plane of the normals of the planes within its uncertainty, near {_vector(u)}: there "
+            "the two possible directions coincide and noise decides between them. Measure a plane that is tilted "
+            "about another axis."
         )
     covariance = basis.T @ small @ basis
     closure = gradients @ u + 1
@@ -175,7 +176,7 @@ def bound(
     Parameters
     ----------
     stages : sequence of ndarray (n, 3)
-        Places of the stage on each plane, m.
+        Stage positions on each plane, m.
     normals : ndarray (k, 3)
         Unit normals of the planes.
     u : ndarray (3,)
@@ -186,7 +187,7 @@ def bound(
     Raises
     ------
     MethodError
-        Planes and beam that leave the direction open.
+        Planes that do not determine the direction.
     """
     gradients = -normals / (normals @ u)[:, None]
     S = np.stack([gradient_covariance(stage, noise, speckle, speckle_length) for stage in stages])
@@ -194,7 +195,9 @@ def bound(
     basis = across(u)
     reduced = basis @ information @ basis.T
     if not np.linalg.cond(reduced) < 1e14:
-        raise MethodError("The planes leave the beam's direction open: all normals and the beam lie in one plane.")
+        raise MethodError(
+            "The planes do not determine the direction of the beam: all normals and the beam are in one plane."
+        )
     return np.asarray(basis.T @ np.linalg.inv(reduced) @ basis)
 
 
@@ -222,7 +225,7 @@ def _minima(gradients: Array, covariances: Array, nominal: Array) -> list[tuple[
 
 
 def _descend(gradients: Array, covariances: Array, u: Array) -> tuple[float, Array]:
-    """Follow chi2 down by Gauss-Newton on the sphere; steps are halved until they descend."""
+    """Minimise chi2 by Gauss-Newton on the sphere; steps are halved until chi2 decreases."""
 
     def misfit(u: Array) -> tuple[Array, Array]:
         Su = covariances @ u
@@ -261,12 +264,12 @@ def _check_gradients(gradients: Array, covariances: Array, names: Sequence[str])
         if g > 50 * GRAZING or g < LEAST_GRADIENT:
             raise MethodError(
                 f"{name}: along the steepest direction the reading changes by {g:.3g} m for each metre of the stage; "
-                "expected 1 to 10. Are readings and places of the stage in the same unit, and does the plane stand "
-                "still?"
+                "expected 1 to 10. Check that readings and stage positions have the same unit, and that the plane "
+                "is at rest."
             )
         if g > GRAZING:
             raise MethodError(
-                f"{name}: the beam grazes it, at {_degrees(np.arcsin(1 / g))} to the surface; expected at least "
+                f"{name}: grazing incidence, at {_degrees(np.arcsin(1 / g))} to the surface; expected at least "
                 f"{_degrees(np.arcsin(1 / GRAZING))}. Tilt the plane towards the sensor."
             )
     normals = gradients / size[:, None]
@@ -276,9 +279,10 @@ def _check_gradients(gradients: Array, covariances: Array, names: Sequence[str])
         axis = normals.mean(axis=0)
         axis /= np.linalg.norm(axis)
         raise MethodError(
-            f"The planes are parallel to within {_degrees(spread)}, with a noise of {_degrees(noise)}: they fix the "
-            f"angle between the beam and their common normal {_vector(axis)}, and leave open how far the beam is "
-            "turned about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
+            f"The planes are parallel to within {_degrees(spread)}, with a noise of {_degrees(noise)}: they "
+            f"determine the angle between the beam and their common normal {_vector(axis)}, but not the rotation of "
+            "the "
+            "beam about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
         )
 
 

@@ -1,13 +1,13 @@
-"""Where the beam starts, from planes of which a point is known.
+"""Zero point of the beam, from planes with known points.
 
 With the reading d = offset + g . s on a plane through the point P, and g . u = -1, the zero point p0 of the sensor (the
 stage at 0) meets
 
     offset = g . (p0 - P),
 
-one condition a plane: three planes with independent normals fix it. Gradients and offsets are those that have been
-corrected for g . u = -1. The estimate is by generalised least squares; how it changes with every gradient, offset and
-known point is returned, so that whatever is uncertain can be carried through.
+one condition a plane: three planes with independent normals determine it. Gradients and offsets are corrected for
+g . u = -1. The estimate is by generalised least squares; its derivatives by every gradient, offset and known point are
+returned for the propagation of uncertainty.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 INDEPENDENT = 0.02
-"""Least singular value of the normals, over the root of their number, at which they fix a point."""
+"""Least singular value of the normals, over the root of their number, at which they determine a point."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Origin:
     by_point : ndarray (3, k)
         Change with a shift of each plane along its normal.
     misfit : ndarray (k,)
-        By how far each plane misses its known point, along the reading, m.
+        Distance of each plane from its known point, along the reading, m.
     chi2 : float
         Of these misfits; their freedom is k - 3.
     """
@@ -55,14 +55,14 @@ class Origin:
 def locate(
     direction: Direction, offsets: Array, covariances: Array, points: Array, point_uncertainty: float
 ) -> Origin | None:
-    """Return the zero point of a beam whose direction is known, None where the planes leave it open.
+    """Return the zero point of a beam whose direction is known, None where the planes do not determine it.
 
     Parameters
     ----------
     direction : Direction
         From `direction.solve` on the same planes.
     offsets : ndarray (k,)
-        Reading at the stage's place 0, m.
+        Reading at the stage position 0, m.
     covariances : ndarray (k, 4, 4)
         Of (gradient, offset), SI.
     points : ndarray (k, 3)
@@ -89,7 +89,7 @@ def locate(
     for _ in range(3):
         arm = np.concatenate([np.nan_to_num(points) - p0, np.ones((len(points), 1))], axis=1)
         variance = np.einsum("ki,kij,kj->k", arm, left, arm) + (size * point_uncertainty) ** 2
-        # A plane that is known better than a millionth of the worst one counts no more than that: nothing is exact.
+        # The weight of a plane is at most a million times that of the worst one (in standard deviations).
         W = 1 / np.maximum(variance[known], 1e-12 * variance[known].max())
         K = np.linalg.solve((A * W[:, None]).T @ A, (A * W[:, None]).T)
         p0 = K @ b

@@ -1,4 +1,4 @@
-"""From readings on planes to an error dataset of one beam."""
+"""Error dataset of one beam from readings on planes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
 from errormotion.methods.beam_direction.identification.check_bar.result import bar_extras
 from errormotion.methods.beam_direction.identification.compensation import (
+    Converged,
     Planes,
     Sensor,
-    Settled,
-    settle,
+    converge,
     uncompensated,
 )
 from errormotion.methods.beam_direction.identification.origin import Origin, locate
@@ -35,17 +35,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3
-"""Chance at which sound data are called noisier than stated, correlated, or not closing."""
+"""Probability that correct data are reported as noisier than stated, correlated, or not closing."""
 _BARELY_LINEAR = 0.05
 
 
 def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return an error dataset of component ``beam``: what the beam is, minus what it was meant to be.
+    """Return an error dataset of component ``beam``: the beam minus the nominal beam.
 
     Raises
     ------
     MethodError
-        Data that do not determine the beam; the plane and the freedom are named.
+        Data that do not determine the beam; the message names the plane.
     """
     notes: list[str] = []
     data = read(raw, settings, notes)
@@ -64,36 +64,38 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     plain = uncompensated(planes, data.nominal_direction, settings.layout.scale_uncertainty, middle)
     sensor = sensor_of(raw, settings)
     if sensor is None:
-        settled = plain
-        notes.append("No inclination compensation: the readings are taken as they are.")
+        converged = plain
+        notes.append("No inclination compensation: the readings are not corrected for the inclination error.")
     else:
         notes += sensor.notes
-        settled = settle(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
-    corrected = _corrected(data, settled, sensor, settings, notes)
-    origin = locate(settled.direction, settled.planes.offsets, settled.planes.covariances, data.points,
+        converged = converge(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
+    corrected = _corrected(data, converged, sensor, settings, notes)
+    origin = locate(converged.direction, converged.planes.offsets, converged.planes.covariances, data.points,
                     data.point_uncertainty)  # fmt: skip
-    found = propagate(settled, origin, data.point_uncertainty)
-    found_covariance = found.covariance * _closure_factor(data, settled, found, notes) ** 2
-    _note_roots(settled, data, notes)
+    found = propagate(converged, origin, data.point_uncertainty)
+    found_covariance = found.covariance * _closure_factor(data, converged, found, notes) ** 2
+    _note_roots(converged, data, notes)
     _note_origin(data, origin, notes)
 
     influence = found.influence
     total = found_covariance + influence.T @ influence
     p0, u0 = data.nominal_origin, data.nominal_direction
     p = origin.origin if origin is not None else np.full(3, np.nan)
-    u = settled.direction.direction
+    u = converged.direction.direction
     errors, covariance = beam_errors(p0[None], u0[None], p[None], u[None], total[None])
     chart = error_jacobian(u0[None], u[None])[0]
     by_source = np.nan_to_num(influence) @ chart.T
     steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
-    steps += [f"inclination compensation, {settled.iterations} iterations"] if sensor is not None else []
-    extras = _extras(data, fits, settled, plain, found, total, corrected, factor, p, settings.beam)
+    steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
+    extras = _extras(data, fits, converged, plain, found, total, corrected, factor, p, settings.beam)
     if "bar_distance" in raw:
         if not np.isfinite(p).all():
-            notes.append("Check bar: its centre counts from the nominal zero point, since the actual one is not known.")
-        place = p if np.isfinite(p).all() else np.nan_to_num(p0)
+            notes.append(
+                "Check bar: its centre is relative to the nominal zero point, because the actual one is unknown."
+            )
+        position = p if np.isfinite(p).all() else np.nan_to_num(p0)
         calibration = sensor.calibration if sensor is not None else None
-        extras |= bar_extras(raw, place, u, np.nan_to_num(total), calibration, data.moves, settings, notes)
+        extras |= bar_extras(raw, position, u, np.nan_to_num(total), calibration, data.moves, settings, notes)
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -110,21 +112,21 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         method_version=version,
         provenance=provenance.make(settings, raw, None, steps=steps)
         | ({"calibration": sensor.calibration.reference()} if sensor is not None else {}),
-        influence=by_source[:, None, :] if settled.sources else None,
-        sources=settled.sources or None,
-        source_groups=settled.groups or None,
+        influence=by_source[:, None, :] if converged.sources else None,
+        sources=converged.sources or None,
+        source_groups=converged.groups or None,
         extras=extras,
     )
     return ds.assign_attrs(notes=notes or [""])
 
 
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
-    """Return what the compensation needs; None without a compensation.
+    """Return the sensor for the compensation; None without compensation.
 
     Raises
     ------
     MethodError
-        The data do not say how the sensor is turned.
+        The data do not state the orientation of the sensor.
     DatasetError
         No such calibration, or one that belongs to another sensor.
     """
@@ -134,7 +136,7 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     if "triangulation_normal" not in raw:
         raise MethodError(
             "The inclination compensation needs triangulation_normal(direction) in the raw dataset: the normal of the "
-            "plane that holds the emitted and the received beam. Add it, or leave the compensation out."
+            "plane of the emitted and the received beam. Add it, or identify without compensation."
         )
     t = np.asarray(raw["triangulation_normal"].values, np.float64)
     name = "triangulation_normal_uncertainty"
@@ -155,11 +157,13 @@ def _chi2_quantile(p: float, degrees: int) -> float:
 
 
 def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, notes: list[str]) -> float:
-    """Return by how much the stated noise is raised; note outliers, other scatter than stated, and correlation."""
+    """Return the factor to the stated noise; note outliers, deviating scatter, and correlation."""
     for name, fit in zip(data.names, fits, strict=True):
         if fit.left_out.any():
-            places = ", ".join(str(i + 1) for i in np.flatnonzero(fit.left_out)[:8])
-            notes.append(f"{name}: {int(fit.left_out.sum())} readings left out as outliers: reading {places}.")
+            positions = ", ".join(str(i + 1) for i in np.flatnonzero(fit.left_out)[:8])
+            notes.append(
+                f"{name}: {int(fit.left_out.sum())} readings are outliers and were ignored: reading {positions}."
+            )
     used: list[Array] = [fit.whitened[np.isfinite(fit.whitened)] for fit in fits]
     freedom = sum(len(w) - UNKNOWNS for w in used)
     if freedom < 1:
@@ -171,23 +175,25 @@ def _noise_factor(data: Readings, fits: list[PlaneFit], settings: Settings, note
     if chi2 > high:
         raised = settings.noise == "auto"
         factor = times if raised else 1.0
-        what = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
-        notes.append(f"The readings scatter {times:.3g} times as much about their planes as stated; {what}.")
+        what = "the uncertainties are raised accordingly" if raised else "the stated noise was kept (noise = stated)"
+        notes.append(f"The scatter of the readings about their planes is {times:.3g} times the stated noise; {what}.")
     elif chi2 < low:
-        notes.append(f"The readings scatter only {times:.3g} times as much as stated; the stated noise was kept.")
+        notes.append(
+            f"The scatter of the readings is only {times:.3g} times the stated noise; the stated noise was kept."
+        )
     pairs = sum(float(w[1:] @ w[:-1]) for w in used) / (chi2 / sum(len(w) for w in used) or 1.0)
     count = sum(len(w) - 1 for w in used)
     if pairs / np.sqrt(count) > ndtri(1 - FALSE_ALARM):
         notes.append(
-            f"Residuals of neighbouring readings resemble each other (correlation {pairs / count:.2f}), so the "
+            f"Residuals of neighbouring readings are correlated (correlation {pairs / count:.2f}), so that the "
             "uncertainties are too small: speckle that is not stated (speckle, speckle_length), a plane that is not "
             "flat, or a stage that is not straight."
         )
     return factor
 
 
-def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: list[str]) -> float:
-    """Return by how much uncertainties are raised where planes do not close; name the plane that closes worst."""
+def _closure_factor(data: Readings, converged: Converged, found: Propagated, notes: list[str]) -> float:
+    """Return the factor to the uncertainties where planes do not close; note the plane that closes worst."""
     freedom = len(data.names) - 2
     if freedom < 1:
         return 1.0
@@ -195,43 +201,42 @@ def _closure_factor(data: Readings, settled: Settled, found: Propagated, notes: 
     if chi2 <= _chi2_quantile(1 - FALSE_ALARM, freedom):
         return 1.0
     times = float(np.sqrt(chi2 / freedom))
-    cause = (
-        "a calibration that does not hold" if settled.iterations else "the sensor's inclination error, uncompensated"
-    )
+    cause = "an invalid calibration" if converged.iterations else "the uncompensated inclination error of the sensor"
     notes.append(
         f"The planes contradict one another: chi-square {chi2:.4g} with {freedom} degrees of freedom; "
-        f"{_worst(data, found)}. Perhaps {cause}, or a plane that moved. "
+        f"{_worst(data, found)}. Possible causes: {cause}, or a plane that moved. "
         f"The uncertainties are raised {times:.3g} times."
     )
     return times
 
 
 def _worst(data: Readings, found: Propagated) -> str:
-    """Say which plane closes worst. Three planes have one contradiction, of the same size for each: none is worst."""
+    """Describe the plane that closes worst. Three planes have one contradiction, of the same size for each."""
     z = np.abs(found.closure) / np.sqrt(np.diag(found.closure_covariance))
     worst = int(np.argmax(z))
     if len(z) == 3:
-        return f"all by {z[worst]:.1f} standard uncertainties, since three planes do not tell which of them is wrong"
+        return f"all by {z[worst]:.1f} standard uncertainties, because three planes do not show which of them is wrong"
     return (
         f"worst is {data.names[worst].lower()}, off by {found.closure[worst]:.2g}, "
         f"{z[worst]:.1f} standard uncertainties"
     )
 
 
-def _note_roots(settled: Settled, data: Readings, notes: list[str]) -> None:
-    found = settled.direction
+def _note_roots(converged: Converged, data: Readings, notes: list[str]) -> None:
+    found = converged.direction
     if found.other_root is not None:
         other, u0 = found.other_root, data.nominal_direction
         angles = [float(np.degrees(np.arccos(np.clip(v @ u0, -1, 1)))) for v in (found.direction, other)]
         notes.append(
-            "Two directions fit the planes; the nominal direction decided. The other one is "
+            "Two directions fit the planes; the one nearer to nominal was taken. The other one is "
             "({:.5f}, {:.5f}, {:.5f}), ".format(*other)
-            + f"{angles[1]:.3g} deg off the nominal, where the one taken is {angles[0]:.3g} deg off."
+            + f"{angles[1]:.3g} deg off nominal; the one taken is {angles[0]:.3g} deg off."
         )
     if found.curvature > _BARELY_LINEAR:
         notes.append(
-            "The beam lies near the plane of the planes' normals: its uncertainty is large against the distance of the "
-            "two directions that would fit, and intervals hold only about. A plane tilted about another axis helps."
+            "The beam is near the plane of the normals of the planes: its uncertainty is large compared with the "
+            "distance "
+            "of the two possible directions, and intervals are approximate. Measure a plane tilted about another axis."
         )
 
 
@@ -239,28 +244,30 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
     known = int(np.isfinite(data.points).all(axis=1).sum())
     if origin is None:
         notes.append(
-            f"The zero point is not known: {known} planes with a known point (plane_point); expected three or more "
+            f"The zero point is unknown: {known} planes with a known point (plane_point); expected three or more "
             "with independent normals."
         )
         return
     if not data.point_uncertainty > 0:
-        notes.append("No plane_point_uncertainty in the data: the known points of the planes were taken as exact.")
+        notes.append("No plane_point_uncertainty in the data: the known points of the planes are assumed to be exact.")
     if not np.isfinite(data.nominal_origin).all():
         notes.append("No nominal_origin in the data: the zero point is in beam_origin, its error is unknown.")
     if known > 3 and origin.chi2 > _chi2_quantile(1 - FALSE_ALARM, known - 3):
         worst = int(np.nanargmax(np.abs(origin.misfit)))
         notes.append(
             f"The known points of the planes contradict one another: chi-square {origin.chi2:.4g} with {known - 3} "
-            f"degrees of freedom; {data.names[worst].lower()} misses its point by {origin.misfit[worst] * 1e6:.3g} um."
+            f"degrees of freedom; {data.names[worst].lower()} is {origin.misfit[worst] * 1e6:.3g} um off its point."
         )
 
 
-def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings: Settings, notes: list[str]) -> Array:
-    """Return the compensated readings (plane, reading), m; what was not calibrated is refused, or noted."""
-    if sensor is None or settled.tilt is None:
+def _corrected(
+    data: Readings, converged: Converged, sensor: Sensor | None, settings: Settings, notes: list[str]
+) -> Array:
+    """Return the compensated readings (plane, reading), m; uncalibrated tilts are refused, or noted."""
+    if sensor is None or converged.tilt is None:
         return data.raw
     values = []
-    for name, reading, at in zip(data.names, data.distance, settled.tilt, strict=True):
+    for name, reading, at in zip(data.names, data.distance, converged.tilt, strict=True):
         try:
             value = sensor.calibration.compensate(reading, at, sensor.mid_range).value
         except MethodError as error:
@@ -268,8 +275,8 @@ def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings
                 raise MethodError(f"{name}: {error}") from error
             value = sensor.calibration.compensate(reading, at, sensor.mid_range, extrapolate=True).value
             notes.append(
-                f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not speak for {tilt_text(at)}, or "
-                "not for all of the readings there."
+                f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not cover {tilt_text(at)}, or "
+                "not all of the readings there."
             )
         values.append(value)
     return np.array(values)
@@ -278,8 +285,8 @@ def _corrected(data: Readings, settled: Settled, sensor: Sensor | None, settings
 def _extras(
     data: Readings,
     fits: list[PlaneFit],
-    settled: Settled,
-    plain: Settled,
+    converged: Converged,
+    plain: Converged,
     found: Propagated,
     covariance: Array,
     corrected: Array,
@@ -287,7 +294,7 @@ def _extras(
     origin: Array,
     beam: str,
 ) -> dict[str, xr.DataArray]:
-    direction, planes = settled.direction, settled.planes
+    direction, planes = converged.direction, converged.planes
     coords: dict[str, Any] = {
         "beam": [beam],
         "direction": list("xyz"),
@@ -301,21 +308,21 @@ def _extras(
         return xr.DataArray(values, {d: coords[d] for d in dims if d in coords}, dims, attrs=attrs)
 
     vector, by_plane, by_reading = ("beam", "direction"), ("plane", "direction"), ("plane", "reading")
-    if settled.tilt is not None:
-        alpha, beta = inclination_rotation(settled.tilt)
+    if converged.tilt is not None:
+        alpha, beta = inclination_rotation(converged.tilt)
     else:
         alpha, beta = np.arccos(np.clip(-(planes.normals @ direction.direction), -1, 1)), np.full(len(fits), np.nan)
     out_of_range = np.isfinite(data.raw) & np.isnan(data.distance)
     left_out = np.array([fit.left_out for fit in fits]).astype(np.int8) + 2 * out_of_range.astype(np.int8)
-    residual = np.array([fit.residual for fit in fits]) / (1 + settled.slope)[:, None]
-    taken = data.raw - corrected if settled.iterations else np.full(data.raw.shape, np.nan)
+    residual = np.array([fit.residual for fit in fits]) / (1 + converged.slope)[:, None]
+    taken = data.raw - corrected if converged.iterations else np.full(data.raw.shape, np.nan)
     return {
         "beam_origin": array(origin[None], vector, "m"),
         "beam_direction": array(direction.direction[None], vector, "1"),
         "nominal_origin": array(data.nominal_origin[None], vector, "m"),
         "nominal_direction": array(data.nominal_direction[None], vector, "1"),
         "beam_covariance": array(covariance[None], ("beam", "p", "p_"), "", "SI: m for p, 1 for u"),
-        "gradient": array(planes.gradients, by_plane, "1", "of the reading with the stage's place"),
+        "gradient": array(planes.gradients, by_plane, "1", "of the reading with the stage position"),
         "gradient_covariance": array(planes.covariances[:, :3, :3], (*by_plane, "direction_"), "1"),
         "normal": array(planes.normals, by_plane, "1", "towards the sensor"),
         "inclination": array(alpha, ("plane",), "rad"),
@@ -329,11 +336,11 @@ def _extras(
         ),
         "residual": array(residual, by_reading, "m"),
         "left_out": array(left_out, by_reading, "", "1: outlier; 2: out of the sensor's range"),
-        "compensation": array(taken, by_reading, "m", "what was taken off the reading"),
+        "compensation": array(taken, by_reading, "m", "correction that was subtracted from the reading"),
         "distance_raw": array(data.raw, by_reading, "m"),
         "distance_compensated": array(corrected, by_reading, "m"),
         "stage": array(data.stage, (*by_reading, "direction"), "m", "of the sensor relative to the target"),
         "uncompensated_direction": array(plain.direction.direction[None], vector, "1"),
-        "iterations": array([settled.iterations], ("beam",), ""),
-        "noise": array([data.noise * factor], ("beam",), "m", "as the residuals show it where they show more"),
+        "iterations": array([converged.iterations], ("beam",), ""),
+        "noise": array([data.noise * factor], ("beam",), "m", "as stated, or by the residuals where these are larger"),
     }

@@ -1,4 +1,4 @@
-"""What noise, known points and shared sources make of the beam, through the loop of the compensation."""
+"""Propagation of noise, known points and shared sources to the beam, through the iteration of the compensation."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from errormotion.methods.beam_direction.identification.slopes import expected_co
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from errormotion.methods.beam_direction.identification.compensation import Settled
+    from errormotion.methods.beam_direction.identification.compensation import Converged
     from errormotion.methods.beam_direction.identification.origin import Origin
 
 
 @dataclass(frozen=True)
 class Propagated:
-    """How uncertain a beam is.
+    """Uncertainty of a beam.
 
     Attributes
     ----------
     covariance : ndarray (6, 6)
-        Of (origin, direction) by what each plane has for itself: noise, known point; SI. NaN where there is no origin.
+        Of (origin, direction) from the noise and the known point of each plane; SI. NaN without an origin.
     influence : ndarray (source, 6)
         Change of (origin, direction) with one standard uncertainty of each shared source.
     closure : ndarray (k,)
         g . u + 1 by plane.
     closure_covariance : ndarray (k, k)
-        What it should have, sources included; rank k - 2, so 0 for two planes.
+        Covariance of ``closure``, sources included; rank k - 2, so 0 for two planes.
     """
 
     covariance: Array
@@ -41,47 +41,49 @@ class Propagated:
     closure_covariance: Array
 
 
-def propagate(settled: Settled, origin: Origin | None, point_uncertainty: float) -> Propagated:
-    """Carry every uncertainty through to the beam, to first order.
+def propagate(converged: Converged, origin: Origin | None, point_uncertainty: float) -> Propagated:
+    """Propagate every uncertainty to the beam, to first order.
 
     Parameters
     ----------
-    settled : Settled
+    converged : Converged
         Direction and compensation.
     origin : Origin, optional
         Zero point, where it is known.
     point_uncertainty : float
         Standard uncertainty of the known points along the normals, m.
     """
-    direction, planes = settled.direction, settled.planes
+    direction, planes = converged.direction, converged.planes
     k = len(planes.offsets)
-    # What one slope does to its plane's (gradient, offset).
-    by_slope = -np.column_stack([planes.gradients, planes.offsets - settled.mid_range]) / (1 + settled.slope)[:, None]
+    # Change of (gradient, offset) of a plane with its slope.
+    by_slope = (
+        -np.column_stack([planes.gradients, planes.offsets - converged.mid_range]) / (1 + converged.slope)[:, None]
+    )
     by_reading = np.zeros((6, k, 4))
     by_reading[3:, :, :3] = direction.by_gradient
     by_reading[:3] = origin.by_reading if origin is not None else np.nan
-    H = settled.slope_by_direction
+    H = converged.slope_by_direction
     M = np.einsum("ikl,kl->ik", by_reading[3:], by_slope)
     direct = np.linalg.solve(np.eye(3) - M @ H, by_reading[3:].reshape(3, -1)).reshape(3, k, 4)
-    # Whatever turns the beam changes the slopes, and with them gradients and offsets.
+    # A rotation of the beam changes the slopes, and with them gradients and offsets.
     T = by_reading + np.einsum("ikl,kl,kj,jmn->imn", by_reading, by_slope, H, direct)
     covariance = np.einsum("ikl,klm,jkm->ij", T, planes.covariances, T)
     if origin is not None:
         covariance[:3, :3] += point_uncertainty**2 * origin.by_point @ origin.by_point.T
-    influence = np.einsum("ikl,kl,sk->si", T, by_slope, settled.slope_by_source)
+    influence = np.einsum("ikl,kl,sk->si", T, by_slope, converged.slope_by_source)
 
     u, fitted = direction.direction, direction.gradients_fitted
     sigma2 = np.einsum("i,kij,j->k", u, planes.covariances[:, :3, :3], u)
-    slopes = settled.slope_by_source + influence[:, 3:] @ H.T
+    slopes = converged.slope_by_source + influence[:, 3:] @ H.T
     closes = slopes * (by_slope[:, :3] @ u) + influence[:, 3:] @ fitted.T
     closing = np.diag(sigma2) - fitted @ direction.covariance @ fitted.T + closes.T @ closes
-    if k == 2:  # met exactly, but for rounding
+    if k == 2:  # met exactly, within rounding
         return Propagated(covariance, influence, np.zeros(2), np.zeros((2, 2)))
     return Propagated(covariance, influence, direction.discrepancy, closing)
 
 
 def closure_chi2(propagated: Propagated) -> float:
-    """Return how far the planes are from closing: chi-square with as many degrees of freedom as planes beyond two."""
+    """Return chi-square of the closure; its degrees of freedom are the number of planes minus 2."""
     k = len(propagated.closure)
     size = np.sqrt(np.diag(propagated.closure_covariance))
     if k < 3:
@@ -105,12 +107,12 @@ def expected_beam(
     point_uncertainty: float = 0.0,
     slope_by_source: Array | None = None,
 ) -> Propagated:
-    """Return how uncertain a beam is to be expected from readings on planes.
+    """Return the expected uncertainty of a beam from readings on planes.
 
     Parameters
     ----------
     stages : sequence of ndarray (n, 3)
-        Places of the stage on each plane, m.
+        Stage positions on each plane, m.
     normals : ndarray (k, 3)
         Unit normals of the planes.
     direction : ndarray (3,)
@@ -129,12 +131,12 @@ def expected_beam(
     Returns
     -------
     Propagated
-        NaN for the origin where ``origin`` or ``points`` is not given, or the planes leave it open.
+        NaN for the origin where ``origin`` or ``points`` is not given, or the planes do not determine it.
 
     Raises
     ------
     MethodError
-        Planes that leave the direction open.
+        Planes that do not determine the direction.
     """
     k = len(normals)
     gradients = -normals / (normals @ direction)[:, None]
@@ -143,8 +145,8 @@ def expected_beam(
     offsets = np.nan_to_num(np.sum(gradients * (p0 - P), axis=1))
     C = np.stack([expected_covariance(stage, noise, speckle, speckle_length) for stage in stages])
     names = tuple(f"Plane {i + 1}" for i in range(k))
-    settled = uncompensated(Planes(names, gradients, offsets, C), direction)
-    found = locate(settled.direction, offsets, C, P, point_uncertainty)
+    converged = uncompensated(Planes(names, gradients, offsets, C), direction)
+    found = locate(converged.direction, offsets, C, P, point_uncertainty)
     if slope_by_source is not None:
-        settled = replace(settled, slope_by_source=slope_by_source)
-    return propagate(settled, found, point_uncertainty)
+        converged = replace(converged, slope_by_source=slope_by_source)
+    return propagate(converged, found, point_uncertainty)

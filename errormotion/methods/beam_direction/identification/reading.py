@@ -1,4 +1,4 @@
-"""What a raw dataset says, checked as far as a schema cannot: range of the sensor, order of the stage, noise."""
+"""Readings of a raw dataset, checked beyond the schema: range of the sensor, order of the stage, noise."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Readings:
     Attributes
     ----------
     names : tuple of str
-        Of the planes, counted from 1 as people do.
+        Of the planes, counted from 1.
     raw, distance : ndarray (plane, reading)
-        As read, and without what lies out of the sensor's range.
+        As read, and without readings out of the range of the sensor.
     stage : ndarray (plane, reading, 3)
-        As the sensor moves, so reversed where the stage carries the target.
+        Motion of the sensor; reversed where the stage carries the target.
     moves : {"sensor", "target"}
     nominal_direction : ndarray (3,)
     nominal_origin : ndarray (3,)
-        NaN where it is not known.
+        NaN where unknown.
     points : ndarray (plane, 3)
-        A known point of each plane; NaN where there is none.
+        A known point of each plane; NaN where unknown.
     noise, speckle, speckle_length, point_uncertainty : float
     """
 
@@ -59,7 +59,7 @@ class Readings:
 
 
 def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
-    """Take the readings out of a raw dataset; ``notes`` get what a user should know.
+    """Return the readings of a raw dataset; ``notes`` are extended.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     if not noise > 0:
         raise MethodError("distance_noise is 0: expected the standard deviation of one reading at rest, m.")
     if speckle > 0 and "speckle_length" not in raw:
-        raise MethodError("The data state speckle but no speckle_length; expected the way on which it correlates, m.")
+        raise MethodError("The data state speckle but no speckle_length; expected the correlation length, m.")
     low, high = raw["reading_range"].values if "reading_range" in raw else (-np.inf, np.inf)
     within = distance.copy()
     for i, name in enumerate(names):
@@ -115,7 +115,7 @@ def _scalar(raw: xr.Dataset, name: str) -> float:
 def _in_range(
     name: str, distance: Array, placed: NDArray[np.bool_], low: float, high: float, notes: list[str]
 ) -> Array:
-    """Return the readings without those out of range; refuse a stroke that leaves it."""
+    """Return the readings without those out of range; MethodError for a stroke that leaves it."""
     out = (distance < low) | (distance > high)
     missing = placed & (out | np.isnan(distance))
     if not missing.any():
@@ -136,7 +136,7 @@ def _in_range(
 
 
 def _check_order(name: str, stage: Array) -> None:
-    """Refuse a place that lies back along an otherwise straight stroke: rows swapped, a counter lost, backlash."""
+    """Refuse a step back along a straight stroke: rows in wrong order, lost counts, backlash."""
     rows = np.flatnonzero(np.isfinite(stage).all(axis=1))
     steps = np.diff(stage[rows], axis=0)
     size = np.linalg.norm(steps, axis=1)
@@ -149,7 +149,8 @@ def _check_order(name: str, stage: Array) -> None:
     if wrong.any():
         at = int(np.argmax(wrong)) + 1
         raise MethodError(
-            f"{name}: at reading {rows[moving[at]] + 2} the stage steps back by {size[at] * 1e6:.4g} um along a stroke "
-            "and then goes on. Expected strokes that go one way: check that places and readings belong together, and "
-            "the stage for backlash. Where it went to its places in any order on purpose, set ordered = false."
+            f"{name}: at reading {rows[moving[at]] + 2} the stage moves back by {size[at] * 1e6:.4g} um along a "
+            "stroke. "
+            "Expected strokes in one direction: check that positions and readings belong together, and the stage for "
+            "backlash. For positions in any order set ordered = false."
         )

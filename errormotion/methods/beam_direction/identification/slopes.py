@@ -1,9 +1,9 @@
-"""How the reading changes with the stage's place, plane by plane.
+"""Change of the reading with the stage position on each plane.
 
-On a plane the reading is d = offset + g . s, s the place of the stage. Readings carry white noise and, along a stroke,
-speckle: errors whose correlation falls off with the distance of the places, speckle^2 exp(-|s_i - s_j| / length).
+On a plane the reading is d = offset + g . s, s the stage position. Readings carry white noise and, along a stroke,
+speckle: errors whose correlation falls off with the distance of the positions, speckle^2 exp(-|s_i - s_j| / length).
 Gradient and offset are estimated by generalised least squares, which is maximum likelihood for this model. Readings
-that lie far off any plane are found by a fit of least absolute deviations, left out, and named.
+that do not fit a plane are found by a fit of least absolute deviations; they are ignored and reported.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 UNKNOWNS = 4
 """Gradient (3) and offset."""
 OUTLIER = 6.0
-"""Readings further than this many (robust) standard deviations off are left out and named."""
+"""Robust standard deviations from which on a reading is an outlier."""
 LEAST_USED = 0.7
-"""Least share of the readings that must lie on a plane."""
+"""Smallest share of the readings that must be on a plane."""
 WEAKEST = 0.03
-"""Largest standard uncertainty of the gradient along any direction that counts as measured."""
+"""Largest standard uncertainty of the gradient along a measured direction."""
 _LEAST_FOR_SCATTER = 2 * UNKNOWNS
 _MOST_CORRELATED = 4000
 
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """How the reading changes on one plane.
+    """Fit of one plane.
 
     Attributes
     ----------
     gradient : ndarray (3,)
-        Change of the reading with the stage's place, 1.
+        Change of the reading with the stage position, 1.
     offset : float
-        Reading at the stage's place 0, m.
+        Reading at the stage position 0, m.
     covariance : ndarray (4, 4)
         Of (gradient, offset), SI, by the stated noise and speckle.
     residual : ndarray (n,)
-        Reading minus plane, m; NaN where there was no reading.
+        Reading minus plane, m; NaN where missing.
     whitened : ndarray (n,)
-        Residuals of the readings used, freed of their correlation and divided by their standard deviation, in the order
-        of the readings; NaN elsewhere.
+        Decorrelated residuals of the readings used, divided by their standard deviation, in the order of the readings;
+        NaN elsewhere.
     left_out : ndarray of bool (n,)
-        Readings left out as outliers.
+        Outliers.
     """
 
     gradient: Array
@@ -77,17 +77,17 @@ def fit_plane_readings(
     Parameters
     ----------
     distance : ndarray (n,)
-        Readings, m; NaN where there was none.
+        Readings, m; NaN where missing.
     stage : ndarray (n, 3)
-        Places of the stage, m. Strokes along three independent directions, in any order.
+        Stage positions, m. Strokes along three independent directions, in any order.
     noise : float
         Standard deviation of the white noise of one reading, m; above 0.
     speckle, speckle_length : float
         Standard deviation and correlation length of the correlated error, m.
     robust : bool
-        Leave outliers out.
+        Ignore outliers.
     name : str
-        What to call the plane in messages.
+        Name of the plane in messages.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def fit_plane_readings(
         used = kept
     if used.sum() < max(LEAST_USED * valid, UNKNOWNS):
         raise MethodError(
-            f"{name}: {valid - used.sum()} of {valid} readings lie far off any plane. Check that places and readings "
+            f"{name}: {valid - used.sum()} of {valid} readings do not fit any plane. Check that positions and readings "
             "belong together and that all of them are on one plane."
         )
     _check_strokes(design[used], total, name)
@@ -135,7 +135,7 @@ def fit_plane_readings(
 
 
 def expected_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
-    """Return the covariance (4, 4) that gradient and offset of readings at places (n, 3), m, will have."""
+    """Return the covariance (4, 4) that gradient and offset of readings at positions (n, 3), m, will have."""
     centre = stage.mean(axis=0)
     design = np.column_stack([stage - centre, np.ones(len(stage))])
     nothing = np.zeros(len(stage))
@@ -144,19 +144,19 @@ def expected_covariance(stage: Array, noise: float, speckle: float = 0.0, speckl
 
 
 def gradient_covariance(stage: Array, noise: float, speckle: float = 0.0, speckle_length: float = 0.0) -> Array:
-    """Return the covariance (3, 3) that the gradient of readings at places (n, 3), m, will have."""
+    """Return the covariance (3, 3) that the gradient of readings at positions (n, 3), m, will have."""
     return expected_covariance(stage, noise, speckle, speckle_length)[:3, :3]
 
 
 def _about_zero(covariance: Array, centre: Array) -> Array:
-    """Return the covariance (4, 4) of (gradient, reading at place 0) from that with the reading at ``centre``."""
+    """Return the covariance (4, 4) of (gradient, reading at position 0) from that with the reading at ``centre``."""
     to_zero = np.eye(UNKNOWNS)
     to_zero[3, :3] = -centre
     return np.asarray(to_zero @ covariance @ to_zero.T)
 
 
 def correlation_factor(stage: Array, noise: float, speckle: float, speckle_length: float) -> Array:
-    """Return the lower triangular factor (n, n) of the covariance of readings at places (n, 3); m."""
+    """Return the lower triangular factor (n, n) of the covariance of readings at positions (n, 3); m."""
     apart = np.linalg.norm(stage[:, None] - stage[None], axis=2)
     C = speckle**2 * (np.exp(-apart / speckle_length) if speckle_length > 0 else np.eye(len(stage)))
     C[np.diag_indices_from(C)] += noise**2
@@ -170,8 +170,8 @@ def _generalised(
     if speckle > 0 and speckle_length > 0:
         if len(stage) > _MOST_CORRELATED:
             raise MethodError(
-                f"{name}: {len(stage)} readings with speckle; expected at most {_MOST_CORRELATED}. Thin them out: "
-                f"readings closer than the correlation length ({speckle_length * 1e6:g} um) tell little more."
+                f"{name}: {len(stage)} readings with speckle; expected at most {_MOST_CORRELATED}. Use fewer: "
+                f"readings closer than the correlation length ({speckle_length * 1e6:g} um) add little information."
             )
         L = correlation_factor(stage, noise, speckle, speckle_length)
         A, b = (solve_triangular(L, part, lower=True) for part in (design, distance))
@@ -186,7 +186,7 @@ def _generalised(
 
 
 def _least_deviations(design: Array, distance: Array) -> Array:
-    """Return the solution (4,) of about least absolute deviations, by weights from the residuals before."""
+    """Return the solution (4,) of approximately least absolute deviations, by weights from the previous residuals."""
     weight = np.ones(distance.size)
     for _ in range(30):
         solution = np.linalg.lstsq(design * weight[:, None], distance * weight)[0]
@@ -196,13 +196,13 @@ def _least_deviations(design: Array, distance: Array) -> Array:
 
 
 def _far_off(residual: Array, used: Mask, total: float) -> Mask:
-    """Return which readings lie further off than noise explains, be it the stated noise or the scatter seen."""
+    """Return the outliers with respect to the stated noise and to the observed scatter."""
     scatter = 1.4826 * np.median(np.abs(residual[used] - np.median(residual[used])))
     return np.asarray(np.abs(residual) > OUTLIER * max(float(scatter), total))
 
 
 def _check_strokes(design: Array, total: float, name: str) -> None:
-    """Refuse places that do not spread along three directions: the gradient would be open along the missing one."""
+    """Refuse positions that do not spread along three directions, which would not determine the gradient."""
     values, vectors = np.linalg.eigh(design[:, :3].T @ design[:, :3])
     least = max((total / WEAKEST) ** 2, 1e-14 * float(values[2]))
     open_ = vectors.T[values <= least]
@@ -212,7 +212,7 @@ def _check_strokes(design: Array, total: float, name: str) -> None:
     spread = float(np.sqrt(max(values[0], 0.0) / len(design)))
     along = ", ".join("({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0)) for v in open_)
     raise MethodError(
-        f"{name}: the stage moves along {3 - len(open_)} of three independent directions; along {along} its places "
+        f"{name}: the stage moves along {3 - len(open_)} of three independent directions; along {along} its positions "
         f"spread by {spread * 1e6:.3g} um. Expected strokes along three directions, such as X, Y and Z, that spread by "
-        f"more than {np.sqrt(least / len(design)) * 1e6:.2g} um, or the gradient stays open along the missing ones."
+        f"more than {np.sqrt(least / len(design)) * 1e6:.2g} um, which determine the gradient."
     )

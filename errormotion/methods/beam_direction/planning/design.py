@@ -1,6 +1,6 @@
-"""Where to put the planes and how to move over them, so that a beam's direction becomes best known.
+"""Orientation of the planes and strokes for the smallest uncertainty of the direction of a beam.
 
-A plane of gradient g says one thing of the beam u: g.u = -1. The angles by which the beam may be off its nominal
+A plane of gradient g is one condition for the beam u: g.u = -1. The angles by which the beam may be off its nominal
 direction change this by t, the plane's tilt across the beam (|t| = tan of the inclination), and it is known as well as
 the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings in all, shared out
 as is best, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of the sensor limits
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 LEAST_READINGS = 3
-"""A stroke has so many readings at least, so that it shows whether it is straight."""
+"""Smallest number of readings of a stroke, so that its straightness can be checked."""
 _LEAST_SHARE = 0.02
 _PENALTY = 1e3
 _EVALUATIONS = 1000
@@ -43,12 +43,12 @@ _TOLERANCE = 1e-7
 _ROUNDING = 1e-9
 _ROUNDS = 2
 _TURNS = 3
-"""So many sets of planes evenly about the beam are tried as starts, beside the given one."""
+"""Number of sets of planes, evenly about the beam, from which the search starts in addition to the given one."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a set-up has to stay within, and what is known before.
+    """Limits of a set-up, and prior knowledge.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Limits:
 def limits_of(
     settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
 ) -> Limits:
-    """Return the limits that settings state; ``sensor_range``, m, where the sensor itself says its own."""
+    """Return the limits that settings state; ``sensor_range``, m, where the sensor states it."""
     p = settings.layout
     if sensor_range is None:
         sensor_range = p.reading_range[1] - p.reading_range[0]
@@ -127,7 +127,7 @@ class Design:
     readings : ndarray of int64 (k, 3)
         Readings of each stroke, equally spaced.
     path : ndarray (n, 3), optional
-        Places of the stage on every plane instead of strokes, m.
+        Stage positions on every plane instead of strokes, m.
     """
 
     planes: Array
@@ -136,7 +136,7 @@ class Design:
     path: Array | None = None
 
     def stages(self) -> list[Array]:
-        """Return for each plane the places (n, 3) of the stage, m, about the one where the reading is mid-range."""
+        """Return for each plane the positions (n, 3) of the stage, m, about the one where the reading is mid-range."""
         if self.path is not None:
             return [self.path] * len(self.planes)
         return [stroke_points(lengths, counts) for lengths, counts in zip(self.strokes, self.readings, strict=True)]
@@ -154,7 +154,7 @@ def plane_normals(planes: Array) -> Array:
 
 
 def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
-    """Return places (n, 3) on strokes along X, Y and Z whose middles meet in one place, m."""
+    """Return positions (n, 3) on strokes along X, Y and Z whose middles meet in one position, m."""
     parts = [
         np.linspace(-0.5, 0.5, count)[:, None] * length * axis
         for axis, length, count in zip(np.eye(3), lengths, counts, strict=True)
@@ -280,7 +280,7 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
     starts[0] = search(nlopt.GN_CRS2_LM, starts[0], _EVALUATIONS * number)
     starts = [search(nlopt.LN_SBPLX, x, _EVALUATIONS * number) for x in starts]
     x = min(starts, key=lambda x: cost(x, x))
-    # The larger of two variances has an edge along which a search creeps: begun anew it goes on.
+    # The larger of two variances has an edge along which a search is slow: it is restarted.
     for algorithm in (nlopt.LN_COBYLA, nlopt.LN_SBPLX) * _ROUNDS:
         x = search(algorithm, x, _EVALUATIONS * number)
     if cost(x, x) >= _PENALTY:
@@ -323,9 +323,7 @@ def check_numbers(planes: int, limits: Limits) -> None:
         Fewer than two planes, or fewer readings than `LEAST_READINGS` for each stroke.
     """
     if planes < 2:
-        raise MethodError(
-            f"One plane says nothing of one of the beam's two angles: expected two or more; found {planes}"
-        )
+        raise MethodError(f"One plane does not determine both angles of the beam: expected two or more; found {planes}")
     if limits.readings < (needed := 3 * LEAST_READINGS * planes):
         raise MethodError(
             f"{planes} planes with three strokes each need {needed} readings or more; found {limits.readings}"

@@ -42,12 +42,12 @@ SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
 def plan(method: Method, settings: Settings) -> xr.Dataset:
     """Return an error dataset of zeros with the covariance to expect of the set-up that the settings name.
 
-    What it holds beside, over ``setup``: the expected uncertainty of the worse angle of the beam, ``angle_uncertainty``
+    Further variables over ``setup``: the expected uncertainty of the worse angle of the beam, ``angle_uncertainty``
     (rad), and what the readings alone make of it, ``readings_uncertainty``: of the published set-up (two faces turned
     by 90 deg with strokes of one length), of that of the settings, and of the best that there is with two planes and
     with as many as the settings name, all with as many readings in all. The last one is ``best_inclination``,
     ``best_rotation`` (rad), ``best_stroke`` (m) and ``best_readings``; its ``gain`` is the factor over the published
-    set-up. ``notes`` say all of it in words.
+    set-up. ``notes`` state it as text.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
 
 
 def as_set(settings: Settings, limits: Limits) -> Design:
-    """Return the set-up that the settings name; places of a path count by their spread."""
+    """Return the set-up that the settings name; positions of a path count by their spread."""
     p, planes = settings.layout, _angles(settings)
     design.check_numbers(len(planes), limits)
     counts = np.full(3, p.readings // 3)
@@ -128,7 +128,7 @@ def expected_direction(setup: Design, settings: Settings, limits: Limits, left: 
     """Return the bound (3, 3) of the direction by its readings, and what single sources add to it (source, 3).
 
     The sources are the sensor's scale and its triangulation plane, common to all planes, and what the calibration
-    leaves of the inclination error at each plane, much where it does not speak for that plane.
+    leaves of the inclination error at each plane, large where it does not cover that plane.
     """
     p, u, stages = settings.layout, limits.beam, setup.stages()
     noise = p.noise / np.sqrt(p.average)
@@ -180,7 +180,7 @@ class Left:
     normal_uncertainty : float
         Standard uncertainty of the triangulation plane's angle about the beam, rad.
     extrapolate : bool
-        Whether tilts count that the calibration does not speak for.
+        Whether tilts that the calibration does not cover are allowed.
     """
 
     calibration: InclinationCalibration
@@ -192,7 +192,7 @@ class Left:
     def at(self, t: Array) -> tuple[Array, Array]:
         """Return what is left of the slope at tilts (k, 2), (k,) each: by the calibration, by the triangulation plane.
 
-        The latter is common to all planes. Where the calibration does not speak for a tilt, what is left is large.
+        The latter is common to all planes. Where the calibration does not cover a tilt, the remaining error is large.
         """
         q = self._tilt(t)
         c, s = np.cos(self.normal_uncertainty), np.sin(self.normal_uncertainty)
@@ -211,7 +211,7 @@ class Left:
     def table(self, max_inclination: float) -> Callable[[Array], Array]:
         """Return the uncertainty as a function of tilts (k, 2), from a table: a search asks for it often.
 
-        Beyond what the calibration speaks for it is as if nothing were compensated.
+        At tilts that the calibration does not cover, it is that without compensation.
         """
         steep = np.linspace(0.0, max_inclination, max(2, round(max_inclination / _TABLE_STEP) + 1))
         azimuth = np.linspace(-np.pi, np.pi, round(2 * np.pi / _TABLE_STEP) + 1)
@@ -265,7 +265,7 @@ def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limi
     notes = [
         f"With {total} readings in all the worse of the beam's two angles has a standard uncertainty of {own} as set, "
         f"and of {paper} with the published two planes at 20 deg, turned by 90 deg, strokes of one length"
-        + (", which this calibration does not speak for." if refused[0].size else "."),
+        + (", which this calibration does not cover." if refused[0].size else "."),
         f"The best two planes: {pair}, {angles[0] / angles[2]:.3g} times better than the published ones.",
     ]
     if setups[3] is not setups[2]:
@@ -282,8 +282,8 @@ def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limi
     for name, dumb in zip(("the published set-up", "the set-up as set"), refused, strict=True):
         if dumb.size:
             notes.append(
-                f"The calibration does not speak for plane {' and '.join(map(str, dumb))} of {name}: the "
-                "figures take what it says there all the same, and its uncertainty; a measurement would be refused."
+                f"The calibration does not cover plane {' and '.join(map(str, dumb))} of {name}: the "
+                "figures use its extrapolation and the uncertainty of it; a measurement would be refused."
             )
     for i, (face, strokes, counts) in enumerate(
         zip(setups[3].planes, setups[3].strokes, setups[3].readings, strict=True)

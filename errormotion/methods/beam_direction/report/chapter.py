@@ -14,16 +14,16 @@ from errormotion.methods.beam_direction.report import planes as beam_direction_p
 from errormotion.methods.beam_direction.report import surface as beam_direction_surface
 from errormotion.methods.beam_direction.report.view import STROKES, Found, found, is_direction
 from errormotion.report import budget, provenance, quality
-from errormotion.report.beams import angle_between
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
 from errormotion.report.fields import remarks, unit_of
+from errormotion.report.parts.beams import angle_between
 from errormotion.report.text import ARCSEC, DASH, finite, fixed, integer, listed, rounded, significant
 
 __all__ = ["is_direction", "part"]
 
 _UNKNOWN = "the direction was not determined"
-_NO_ORIGIN = "no plane has a known point, and without one the place of the beam is not determined"
+_NO_ORIGIN = "no plane has a known point, so that the position of the beam is not determined"
 _NO_NOMINAL = "no nominal is known"
 _ABOUT_ITSELF = "the turn of a beam about itself is not seen"
 _INDEPENDENT = "noise of the readings"
@@ -143,7 +143,7 @@ def _inclination_in_words(beam: Found) -> list[str]:
     if beam.known and beam.compensated:
         turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
         return [
-            f"Up to {fixed(1e6 * finite(np.max, taken), 1)} µm of inclination error were taken off the readings; "
+            f"Up to {fixed(1e6 * finite(np.max, taken), 1)} µm of inclination error were subtracted from the readings; "
             f"without that the direction would be {fixed(turned / ARCSEC, 0)} arcsec off."
         ]
     tilted = beam.planes.inclination[np.isfinite(beam.planes.inclination)]
@@ -243,7 +243,7 @@ def _compensation(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
             return taken
         return [
             Text(
-                "Nothing was taken off the readings. A triangulating sensor reads wrong on an inclined surface, in "
+                "The readings were not corrected. A triangulating sensor has an error on an inclined surface, in "
                 "proportion to depth; on a plane that is a wrong gradient, and so a wrong direction.",
                 "note",
             )

@@ -121,16 +121,16 @@ def _coordinate(value: float, u: float) -> Cell:
 
 
 def _named(bar: Bar) -> Table:
-    places = np.flatnonzero(bar.left_out)
+    positions = np.flatnonzero(bar.left_out)
     rows: list[list[Cell | str]] = [
         [
             f"point {k + 1}",
-            or_dash(fixed(np.rad2deg(bar.angle[k]), 1), "its place is not in the result"),
+            or_dash(fixed(np.rad2deg(bar.angle[k]), 1), "its position is not in the result"),
             fixed(1e6 * bar.residual[k], 1, signed=True),
         ]
-        for k in places[:_NAMED]
+        for k in positions[:_NAMED]
     ]
-    notes = [f"{len(places) - _NAMED} more are in the dataset."] if len(places) > _NAMED else []
+    notes = [f"{len(positions) - _NAMED} more are in the dataset."] if len(positions) > _NAMED else []
     caption = "Points of the bar that were left out, because they contradict the others."
     return Table(caption, ["point", "azimuth / °", "residual / µm"], rows, notes=notes)
 
@@ -188,18 +188,26 @@ def _circle(axes: Axes, bar: Bar, factor: float, shown: NDArray[np.bool_]) -> No
     order = [k for k in np.argsort(np.angle(np.exp(1j * (bar.angle - _middle(bar.angle[shown]))))) if shown[k]]
     use = np.array([k for k in order if not bar.left_out[k]])
     far = r * (1 + 1.4 * _DRAWN)
-    place = np.clip(r + 1e3 * factor * bar.residual, r * (1 - 1.4 * _DRAWN), far)
-    axes.plot(place[use] * np.cos(bar.angle[use]), place[use] * np.sin(bar.angle[use]), color=canvas.VERMILLION, lw=0.8)
+    position = np.clip(r + 1e3 * factor * bar.residual, r * (1 - 1.4 * _DRAWN), far)
+    axes.plot(
+        position[use] * np.cos(bar.angle[use]), position[use] * np.sin(bar.angle[use]), color=canvas.VERMILLION, lw=0.8
+    )
     for k in use:
         c, s = math.cos(bar.angle[k]), math.sin(bar.angle[k])
-        axes.plot([r * c, place[k] * c], [r * s, place[k] * s], color=canvas.VERMILLION, lw=0.5)
+        axes.plot([r * c, position[k] * c], [r * s, position[k] * s], color=canvas.VERMILLION, lw=0.5)
     axes.plot(
-        place[use] * np.cos(bar.angle[use]), place[use] * np.sin(bar.angle[use]), "o", color=canvas.VERMILLION, ms=2.4
+        position[use] * np.cos(bar.angle[use]),
+        position[use] * np.sin(bar.angle[use]),
+        "o",
+        color=canvas.VERMILLION,
+        ms=2.4,
     )
     for k in np.flatnonzero(shown & bar.left_out):
         c, s = math.cos(bar.angle[k]), math.sin(bar.angle[k])
-        axes.plot(place[k] * c, place[k] * s, "x", color="#222222", ms=5, mew=1.1)
-        axes.annotate(str(k + 1), (place[k] * c, place[k] * s), xytext=(5, 3), textcoords="offset points", fontsize=7)
+        axes.plot(position[k] * c, position[k] * s, "x", color="#222222", ms=5, mew=1.1)
+        axes.annotate(
+            str(k + 1), (position[k] * c, position[k] * s), xytext=(5, 3), textcoords="offset points", fontsize=7
+        )
     axes.set(xlim=(-1.02 * far, 1.02 * far), ylim=(-1.02 * far, 1.02 * far), aspect="equal")
     axes.set_xlabel(f"{bar.names[0]} from the centre / mm")
     axes.set_ylabel(f"{bar.names[1]} from the centre / mm")

@@ -1,4 +1,4 @@
-"""The beam against nominal: in space, its deviation enlarged, and seen along itself with what each plane says."""
+"""The beam and the nominal beam: in space, with enlarged deviation, and along the beam with the planes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OF_PLANES = (canvas.BLUE, canvas.GREEN, canvas.PURPLE, canvas.ORANGE, canvas.SK
 
 
 def space(beam: Found, key: str) -> Figure | None:
-    """Return the beam beside nominal, in space and seen along nominal; None where either is unknown."""
+    """Return beam and nominal beam, in space and along nominal; None where either is unknown."""
     if not (beam.known and np.isfinite(beam.nominal).all()) or beam.direction @ beam.nominal <= 0:
         return None
     e, names = across(beam.nominal)
@@ -123,7 +123,7 @@ def _along(room: Axes, names: tuple[str, str], tips: dict[str, Array], cone: Arr
 
 
 def lines(beam: Found, key: str) -> Figure | None:
-    """Return what each plane says of the direction, seen along the beam; None where no plane is known.
+    """Return the condition of each plane for the direction, along the beam; None where no plane is known.
 
     To first order g.u = -1 is a line across the beam at the distance (1 + g.u) / |g across|.
     """
@@ -135,7 +135,7 @@ def lines(beam: Found, key: str) -> Figure | None:
     ring = ellipse(C)
     seen = beam.planes.gradient[known] @ axes_across.T
     steep = np.linalg.norm(seen, axis=1)
-    steady = steep > 0.02  # flatter planes say nothing of the direction
+    steady = steep > 0.02  # flatter planes do not determine the direction
     if not steady.any():
         return None
     offset = -beam.planes.gradient[known] @ beam.direction - 1
@@ -164,7 +164,7 @@ def lines(beam: Found, key: str) -> Figure | None:
         room.set_xlabel(f"towards {names[0]} / arcsec")
         room.set_ylabel(f"towards {names[1]} / arcsec")
         flat = [beam.planes.names[plane] for i, plane in enumerate(known) if not steady[i]]
-        _beside(room, beam, [int(plane) for i, plane in enumerate(known) if steady[i]], flat)
+        _legend(room, beam, [int(plane) for i, plane in enumerate(known) if steady[i]], flat)
 
     words = [
         f"plane {beam.planes.names[plane]} passes at {significant(abs(distance[i]) / ARCSEC)} arcsec"
@@ -173,7 +173,7 @@ def lines(beam: Found, key: str) -> Figure | None:
     ]
     check = " Two planes always meet in one point: they do not check one another." if steady.sum() == 2 else ""
     caption = (
-        "What each plane says of the direction, seen along the beam, which is in the middle: to each plane every "
+        "Condition of each plane for the direction, along the beam, which is in the middle: to each plane every "
         "direction on its line is right. Bands: noise of its readings, k = 2; the steeper a plane, the narrower."
     )
     return Figure(
@@ -311,8 +311,8 @@ def _line(room: Axes, normal: Array, distance: float, half: float, reach: float,
     room.plot(*ends.T, color=colour, lw=1.1)
 
 
-def _beside(room: Axes, beam: Found, planes: list[int], flat: list[str]) -> None:
-    """Name the planes, the ellipse, and how far nominal and the uncompensated beam are, beside the drawing."""
+def _legend(room: Axes, beam: Found, planes: list[int], flat: list[str]) -> None:
+    """Name the planes, the ellipse, and the deviations of nominal and of the uncompensated beam."""
     degrees = np.rad2deg(np.stack([beam.planes.inclination, beam.planes.rotation]))
     handles: list[Line2D | Patch] = []
     for plane in planes:

@@ -1,4 +1,4 @@
-"""The planes that a beam was found from: how they lay, what they leave, and what was taken off their readings."""
+"""The planes of a beam: orientation, residuals, and corrections of the readings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CLOSED = 3.0  # closures beyond this many standard uncertainties are spoken of
 def blocks(planes: Planes, key: str) -> list[Block]:
     """Return the section on the planes; ``key`` keeps its figure's identifiers apart."""
     if not len(planes):
-        return [Text("The result says nothing of the planes.", "note")]
+        return [Text("The result does not describe the planes.", "note")]
     found: list[Block] = [_table(planes), *_closures(planes)]
     drawn = residuals(planes, key)
     return found + ([drawn] if drawn else [Text("The result holds no residuals.", "note")]) + left_out(planes)
@@ -93,7 +93,7 @@ def _closures(planes: Planes) -> list[Block]:
 
 
 def residuals(planes: Planes, key: str) -> Figure | None:
-    """Return the residuals of each plane, stroke beside stroke; None where there are none."""
+    """Return the residuals of each plane, stroke by stroke; None without residuals."""
     shown = [k for k in range(len(planes)) if np.isfinite(planes.residual[k]).any()]
     if not shown:
         return None
@@ -156,26 +156,26 @@ def _residuals_of(axes: Axes, planes: Planes, k: int, strokes: np.ndarray) -> No
 
 def left_out(planes: Planes) -> list[Block]:
     """Return the table that names every reading that was left out."""
-    places = np.argwhere(planes.left_out)
-    if not len(places):
+    positions = np.argwhere(planes.left_out)
+    if not len(positions):
         return []
     strokes = planes.strokes
     rows: list[list[Cell | str]] = []
-    for k, i in places[:_NAMED]:
+    for k, i in positions[:_NAMED]:
         stroke = str(strokes[k, i])
         at = planes.stage[k, i]
         where = "; ".join(f"{name} {fixed(1e3 * value, 3)}" for name, value in zip(STROKES, at, strict=True))
         rows.append(
             [
                 f"plane {planes.names[k]}, reading {i + 1}",
-                stroke or Cell(DASH, reason="the places of the stage are not in the result"),
-                where if np.isfinite(at).all() else Cell(DASH, reason="the places of the stage are not in the result"),
+                stroke or Cell(DASH, reason="the stage positions are not in the result"),
+                where if np.isfinite(at).all() else Cell(DASH, reason="the stage positions are not in the result"),
                 or_dash(fixed(1e3 * planes.raw[k, i], 4, signed=True), "the reading is not in the result"),
                 or_dash(fixed(1e6 * planes.residual[k, i], 1, signed=True), "it was not compared with the plane"),
                 "out of range" if planes.beyond[k, i] else "off its plane",
             ]
         )
-    notes = [f"{len(places) - _NAMED} more are in the dataset."] if len(places) > _NAMED else []
+    notes = [f"{len(positions) - _NAMED} more are in the dataset."] if len(positions) > _NAMED else []
     return [
         Table(
             "Readings that were left out: far off the plane of the others, or out of the sensor's range.",
@@ -187,7 +187,7 @@ def left_out(planes: Planes) -> list[Block]:
 
 
 def compensation(planes: Planes, key: str) -> list[Block]:
-    """Return what was taken off the readings, by plane; empty where nothing was."""
+    """Return the corrections of the readings by plane; empty without corrections."""
     known = [k for k in range(len(planes)) if np.isfinite(planes.compensation[k]).any()]
     if not known:
         return []
@@ -199,10 +199,10 @@ def compensation(planes: Planes, key: str) -> list[Block]:
         spans = [finite(np.min, 1e6 * taken), finite(np.max, 1e6 * taken)]
         rows.append([planes.names[k], *cells, *(fixed(v, 2, signed=True) for v in spans), _per_depth(taken, raw)])
     table = Table(
-        "What was taken off the raw readings, by plane.",
+        "Corrections of the raw readings, by plane.",
         ["plane", "lowest / mm", "highest / mm", "least / µm", "most / µm", "µm per mm"],
         rows,
-        [("", 1), ("raw reading", 2), ("taken off", 3)],
+        [("", 1), ("raw reading", 2), ("correction", 3)],
     )
 
     def paint(figure: Canvas) -> None:
@@ -215,7 +215,7 @@ def compensation(planes: Planes, key: str) -> list[Block]:
             axes.plot(x, y, color=look_of(k), linewidth=1.2)
             ends.append((float(y[np.isfinite(y)][-1]), f"plane {planes.names[k]}", look_of(k)))
         axes.set_xlabel("raw reading / mm")
-        axes.set_ylabel("taken off / µm")
+        axes.set_ylabel("correction / µm")
         axes.margins(x=0.0)
         canvas.label_ends(axes, ends)
 
@@ -226,14 +226,14 @@ def compensation(planes: Planes, key: str) -> list[Block]:
         table,
         Figure(
             canvas.draw(paint, key, canvas.stack_height([1.5])),
-            "Inclination error that was taken off the readings, over the raw reading.",
+            "Inclination error that was subtracted from the readings, over the raw reading.",
             f"Taken off: {words}.",
         ),
     ]
 
 
 def cell_text(cell: Cell | str) -> str:
-    """Return what a cell says."""
+    """Return the text of a cell."""
     return str(cell.text) if isinstance(cell, Cell) else cell
 
 

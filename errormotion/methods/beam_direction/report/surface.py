@@ -71,12 +71,12 @@ def calibration_of(source: Source, planes: Planes) -> tuple[InclinationCalibrati
     except DatasetError as error:
         return None, f"the calibration '{named}' cannot be shown here: {error}"
     if not _agrees(calibration, planes):
-        return None, f"the calibration '{named}' that is found here is not the one that was taken off the readings"
+        return None, f"the calibration '{named}' that is found here is not the one of the correction"
     return calibration, ""
 
 
 def _agrees(calibration: InclinationCalibration, planes: Planes) -> bool:
-    """Return whether what was taken off at each plane is what the calibration says there."""
+    """Return whether the correction at each plane is that of the calibration."""
     k = calibration.slope(tilt_vector(planes.inclination, planes.rotation))[0]
     for taken, raw, slope in zip(planes.compensation, planes.raw, k, strict=True):
         known = np.isfinite(taken) & np.isfinite(raw)
@@ -89,7 +89,7 @@ def _agrees(calibration: InclinationCalibration, planes: Planes) -> bool:
 
 
 def blocks(beam: Found, calibration: InclinationCalibration | None, why: str, key: str) -> list[Block]:
-    """Return the section on the calibration; ``why`` says what is the matter where it is None."""
+    """Return the section on the calibration; ``why`` states the reason where it is None."""
     if calibration is None:
         return [Text(f"No map: {why.rstrip('.')}.", "note")]
     return [Text(in_words(calibration)), *_extrapolated(beam.planes, calibration), maps(beam.planes, calibration, key)]
@@ -103,9 +103,7 @@ def _extrapolated(planes: Planes, calibration: InclinationCalibration) -> list[B
         return []
     names = listed([planes.names[k] for k in np.flatnonzero(bare)])
     lies = f"planes {names} lie" if bare.sum() > 1 else f"plane {names} lies"
-    words = (
-        f"To the beam, {lies} where the calibration has no settings around: what was taken off there is extrapolated."
-    )
+    words = f"To the beam, {lies} outside the settings of the calibration: the correction there is extrapolated."
     return [Text(words, "warning")]
 
 
@@ -121,7 +119,7 @@ def in_words(calibration: InclinationCalibration) -> str:
     return (
         f"Calibration '{calibration.name}': slope k of the error with depth at {integer(n)} tilts{left}, fitted by a "
         f"polynomial of order {calibration.order}, depths {fixed(1e3 * low, 1)} to {fixed(1e3 * high, 1)} mm from mid "
-        f"range. Remaining error of k at tilts that the fit did not know: {significant(1e3 * remaining)} µm per mm "
+        f"range. Remaining error of k at tilts that were left out of the fit: {significant(1e3 * remaining)} µm per mm "
         f"(95 %: {significant(1e3 * interval[0])} to {significant(1e3 * interval[1])}), which is "
         f"{significant(1e6 * remaining * farthest)} µm at {fixed(1e3 * farthest, 1)} mm."
     )
@@ -143,20 +141,20 @@ def maps(planes: Planes, calibration: InclinationCalibration, key: str) -> Figur
     def paint(figure: Canvas) -> None:
         wide, high = figure.get_figwidth(), figure.get_figheight()
 
-        def place(left: float, bottom: float, width: float, height: float) -> tuple[float, float, float, float]:
+        def area(left: float, bottom: float, width: float, height: float) -> tuple[float, float, float, float]:
             return left / wide, bottom / high, width / wide, height / high
 
-        room = figure.add_axes(place(0.5, 0.9, 2.75, 2.75))
+        room = figure.add_axes(area(0.5, 0.9, 2.75, 2.75))
         _draw_disc(room, disc, across, slope_scale, tilts, planes)
-        _bar(figure, slope_scale, place(0.5, 0.3, 2.75, 0.08), "slope k / µm per mm")
+        _bar(figure, slope_scale, area(0.5, 0.3, 2.75, 0.08), "slope k / µm per mm")
         for i, (rotation, error) in enumerate(zip(_SECTIONS, sections, strict=True)):
-            room = figure.add_axes(place(3.85, 0.9 + (1 - i) * 1.55, 2.9, 1.2))
+            room = figure.add_axes(area(3.85, 0.9 + (1 - i) * 1.55, 2.9, 1.2))
             _draw_section(room, error, across, depth, error_scale, rotation, tilts, planes, calibration.mid_range)
             if i == 0:
                 room.tick_params(labelbottom=False)
             else:
                 room.set_xlabel("inclination / °")
-        _bar(figure, error_scale, place(3.85, 0.3, 2.9, 0.08), "error / µm")
+        _bar(figure, error_scale, area(3.85, 0.3, 2.9, 0.08), "error / µm")
 
     caption = (
         "Inclination error of the sensor, error = depth times k. Left: k over inclination (from the middle) and "
@@ -318,9 +316,9 @@ def _readings_on(tilts: _Tilts, rotation: float) -> tuple[Array, Array, Array, N
     aside = np.abs(np.sin(tilts.rotation - rotation) * tilts.inclination)
     chosen: dict[int, int] = {}
     for k in (int(k) for k in np.flatnonzero(near & ~tilts.left_out)):
-        place = round(float(np.rad2deg(signed[k])))
-        if place not in chosen or aside[k] < aside[chosen[place]]:
-            chosen[place] = k
+        position = round(float(np.rad2deg(signed[k])))
+        if position not in chosen or aside[k] < aside[chosen[position]]:
+            chosen[position] = k
     picks = [np.zeros(0, dtype=int)]
     for k in chosen.values():
         mine = np.flatnonzero(tilts.group == k)
@@ -330,9 +328,9 @@ def _readings_on(tilts: _Tilts, rotation: float) -> tuple[Array, Array, Array, N
     return signed[tilts.group[some]], tilts.depth[some], tilts.error[some], tilts.group_left_out[some]
 
 
-def _bar(figure: Canvas, scale: ScalarMappable, place: tuple[float, float, float, float], label: str) -> None:
+def _bar(figure: Canvas, scale: ScalarMappable, area: tuple[float, float, float, float], label: str) -> None:
     """Draw a lying colour bar with its label below."""
-    bar = figure.colorbar(scale, cax=figure.add_axes(place), orientation="horizontal", spacing="proportional")
+    bar = figure.colorbar(scale, cax=figure.add_axes(area), orientation="horizontal", spacing="proportional")
     bar.outline.set_linewidth(0.4)
     bounds = np.asarray(scale.norm.boundaries)  # type: ignore[attr-defined]
     zero = int(np.argmin(np.abs(bounds)))

@@ -12,7 +12,8 @@ from errormotion.arrays import Array
 from errormotion.report.fields import field
 
 STROKES = "XYZ"
-_BEYOND = 2  # in `left_out`: out of range
+_OUT_OF_RANGE = 2
+"""Code in `left_out`."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,14 @@ class Planes:
     def strokes(self) -> NDArray[np.str_]:
         """Which axis moved for each reading, (plane, reading): ``X``, ``Y``, ``Z`` or ``path``.
 
-        Empty where the stage's places are not known, or where it did not move.
+        Empty where the stage positions are not known, or where it did not move.
         """
         found = np.full(self.given.shape, "", dtype="U4")
-        for plane, (places, given) in enumerate(zip(self.stage, self.given, strict=True)):
-            known = np.flatnonzero(given & np.isfinite(places).all(axis=1))
+        for plane, (positions, given) in enumerate(zip(self.stage, self.given, strict=True)):
+            known = np.flatnonzero(given & np.isfinite(positions).all(axis=1))
             if known.size < 2:
                 continue
-            steps = np.diff(places[known], axis=0)
+            steps = np.diff(positions[known], axis=0)
             names = np.array([_axis_of(step) for step in steps])
             # A reading belongs to the step that leads to it; after a move to the next stroke to the one that follows.
             before, after = np.concatenate([names[:1], names]), np.concatenate([names, names[-1:]])
@@ -112,7 +113,7 @@ class Found:
 
     @property
     def compensated(self) -> bool:
-        """Whether anything was taken off the readings."""
+        """Whether the readings were corrected."""
         return bool(np.nan_to_num(self.planes.compensation).any()) and bool(np.isfinite(self.uncompensated).all())
 
 
@@ -123,7 +124,7 @@ def is_direction(errors: xr.Dataset) -> bool:
 
 
 def found(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Found:
-    """Return the view of a result; ``raw`` gives the stage's places where the result does not hold them."""
+    """Return the view of a result; ``raw`` gives the stage positions where the result does not hold them."""
     name = str(errors["beam"].values[0]) if "beam" in errors.coords else "beam"
     direction, nominal = (_of_beam(errors, f"{kind}_direction") for kind in ("beam", "nominal"))
     covariance = np.full((6, 6), np.nan)
@@ -176,7 +177,7 @@ def _planes(errors: xr.Dataset, raw: xr.Dataset | None) -> Planes:
         compensated,
         (code > 0) & given,
         given,
-        (code >= _BEYOND) & given,
+        (code >= _OUT_OF_RANGE) & given,
         stage,
     )
 

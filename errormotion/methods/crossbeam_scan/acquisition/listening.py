@@ -1,4 +1,4 @@
-"""Lines of a profiler while the axis passes: with their places and times, until the pass is over or breaks."""
+"""Lines of a profiler during a pass, with positions and times, until the pass ends or the stream fails."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 BLOCK_LINES = 64
-"""Most lines that are asked for at once."""
+"""Most lines that are requested in one call."""
 
 
 class BrokenPassError(InstrumentError):
-    """The stream broke in a pass; what came before it has been handed over."""
+    """The stream failed in a pass; the lines before the failure have been delivered."""
 
     def __init__(self, reason: str, position: float) -> None:
         self.reason, self.position = reason, position
@@ -43,13 +43,13 @@ class Lines:
     heights : ndarray, float32, (line, point)
         m.
     encoder, position, time : ndarray, (line,)
-        Count and place (m) of the axis, NaN where the line was lost; when it was taken, s by the mover's clock.
+        Count and position (m) of the axis, NaN where the line was lost; time of the line, s on the mover's clock.
     x : ndarray, (point,)
         m.
     dropped : int
-        Lines lost on the way.
+        Lines lost in transfer.
     invalid : mapping of str to int
-        Why points have no value, counted.
+        Number of points without a value, by reason.
     """
 
     heights: NDArray[np.float32]
@@ -61,7 +61,7 @@ class Lines:
     invalid: Mapping[str, int]
 
     def within(self, low: Array, high: Array) -> Lines:
-        """Return the lines between places (m, one or several pairs); a lost one stays where its neighbour does."""
+        """Return the lines between positions (m, one or several pairs); a lost line is kept with its neighbour."""
         place = filled(self.position)[:, None]
         kept = ((place >= low) & (place <= high)).any(axis=1)
         if kept.all():
@@ -75,7 +75,7 @@ class Lines:
 def listen(
     profiler: Any, mover: Mover, program: Program, settings: Settings, low: float, high: float
 ) -> Generator[Lines]:
-    """Have a pass made and yield its lines until the axis is past its last scan.
+    """Start a pass and yield its lines until the axis is past its last scan.
 
     Parameters
     ----------
@@ -85,24 +85,24 @@ def listen(
         The pass.
     settings : Settings
     low, high : float
-        From where to where the axis goes with the measuring feed, m; behind the last scan there is ``margin``.
+        Ends of the motion with the measuring feed, m; ``margin`` after the last scan is included.
 
     Raises
     ------
     BrokenPassError
-        The stream fell silent in the pass, or did not begin; the profiler failed.
+        The stream stopped in the pass or did not start, or the profiler failed.
     """
     size = max(1, min(BLOCK_LINES, int(settings.margin / settings.line_pitch / 2)))
     middle = ((low + high) / 2 - settings.encoder_zero) / settings.encoder_pitch
     passing, last = False, math.nan
-    mover.begin(program, listening=True)
+    mover.start(program, listening=True)
     while True:
         try:
             with closing(profiler.stream(block=size)) as stream:
                 for block in stream:
                     lines = _located(block, middle, mover.now(), settings)
                     reached = np.nanmax(lines.position, initial=-np.inf)
-                    # Lines on the way to the start are none of the pass: the axis rests there.
+                    # Lines from the move to the start do not belong to the pass: the axis dwells there.
                     passing = passing or bool(
                         np.any((lines.position > low + settings.margin / 4) & (lines.position < high))
                     )
@@ -112,7 +112,7 @@ def listen(
                         return
             raise BrokenPassError("the profiler's stream has ended", last)
         except InstrumentTimeoutError as error:
-            if passing or not mover.may_still_come():
+            if passing or not mover.may_still_move():
                 raise BrokenPassError(str(error), last) from error
         except BrokenPassError:
             raise
@@ -137,7 +137,7 @@ def _located(block: Any, middle: float, now: float, settings: Settings) -> Lines
 
 
 def filled(values: Array) -> Array:
-    """Return values with each NaN replaced between its neighbours, or by the next known one at an end."""
+    """Return values with each NaN interpolated between its neighbours, or equal to the nearest one at an end."""
     known = np.isfinite(values)
     if known.all() or not known.any():
         return values

@@ -1,4 +1,4 @@
-"""A campaign while it is being measured: which pass and artefact, and how the last scan lies on its cold one."""
+"""Progress of a campaign: the present pass and artefact, and the last registration."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-LONGEST_QUEUE = 2
-"""So many scans may wait before a warm one is passed over."""
+QUEUE_LENGTH = 2
+"""Number of scans that may wait before a warm scan is skipped."""
 _ARCSEC = np.degrees(1.0) * 3600.0
 
 
 class LiveScans:
-    """Follow a record of scans; hold the scan that is being made, and every artefact's cold one reduced to blocks.
+    """Collect the present scan, and keep the cold scan of every artefact reduced to blocks.
 
-    A view for the person at the machine: rigid registration, no strain, no consistency. What counts is identified from
-    the whole record afterwards. Whole scans are registered one after the other in a thread that ends when there is none
-    left; a warm scan that would have to wait behind others is passed over, so that the measurement never waits.
+    The display is for the operator: rigid registration, without drift along the scan and without checks of the
+    artefacts. The result is identified from the complete record afterwards. Complete scans are registered one after the
+    other in a thread, which ends when none is left. A warm scan is skipped if others wait: the measurement never waits.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -41,13 +41,13 @@ class LiveScans:
         self._parts: list[xr.Dataset] = []
         self._at = (-1, -1)
         self._waiting: deque[_Job] = deque()
-        self._queued: set[int] = set()  # artefacts whose cold scan is known, or waits
+        self._queued: set[int] = set()  # artefacts whose cold scan is known or queued
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._found = ""
 
     def update(self, chunk: xr.Dataset) -> str:
-        """Take in a chunk of the raw dataset; return in a line of text how far things are."""
+        """Process a chunk of the raw dataset; return the progress as a line of text."""
         if "record" not in chunk:
             return f"pocket, scan at a lift of {float(chunk['stage'].values[-1, 0, 2]) * 1e3:g} mm"
         position = chunk["position"].values
@@ -61,7 +61,7 @@ class LiveScans:
         starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1), axis=1))
         for low, high in zip(starts, [*starts[1:], known.size], strict=True):
             self._take(chunk.isel(line=known[low:high]), (int(keys[low, 0]), int(keys[low, 1])))
-        self._whole(place[known])
+        self._complete(place[known])
         return self.text(chunk.sizes["cycle"], position.size)
 
     def _take(self, part: xr.Dataset, at: tuple[int, int]) -> None:
@@ -70,21 +70,21 @@ class LiveScans:
             self._at = at
         self._parts.append(part)
 
-    def _whole(self, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
-        """Begin to register as soon as the axis is past the scan."""
+    def _complete(self, place: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+        """Submit the scan when the axis is past it."""
         if self._at[1] < 0 or not place.size:
             return
         if place[-1] > self._settings.positions[self._at[1]] + self._settings.scan_length / 2:
             self._submit()
 
     def _submit(self) -> None:
-        """Have the scan that was collected registered, unless others wait and it is a warm one."""
+        """Queue the collected scan; skip a warm one if others wait."""
         parts, self._parts = self._parts, []
         if not parts:
             return
         job = _Job(parts, *self._at)
         with self._lock:
-            if job.artefact in self._queued and len(self._waiting) >= LONGEST_QUEUE:
+            if job.artefact in self._queued and len(self._waiting) >= QUEUE_LENGTH:
                 return
             self._queued.add(job.artefact)
             self._waiting.append(job)
@@ -112,17 +112,17 @@ class LiveScans:
                 self._found = where + _text(cold, warm, job.parts[0])
         except MethodError as error:
             self._found = f"{where}{error}"
-        except Exception:  # whatever it is, the measurement goes on without this view
-            log.exception("%s cannot be shown while measuring", where)
+        except Exception:  # any error: the measurement continues without this display
+            log.exception("%sregistration for the display failed", where)
 
     def text(self, cycles: int, artefacts: int) -> str:
-        """Return where the campaign is, and what the last registration found."""
+        """Return the present pass and artefact, and the result of the last registration."""
         cycle, artefact = self._at
         text = f"pass {cycle + 1} of {cycles}, artefact {artefact + 1} of {artefacts}" if artefact >= 0 else ""
         return f"{text}; {self._found}" if self._found else text
 
     def wait(self) -> None:
-        """Wait until every scan that was taken in is registered."""
+        """Wait until every queued scan is registered."""
         with self._lock:
             thread = self._thread
         if thread is not None:

@@ -1,6 +1,6 @@
-"""Who moves the axis: a control that takes programs, or the operator; and whose clock counts.
+"""Motion of the axis, by a control that runs programs or by the operator, and the clock of the campaign.
 
-A virtual machine has a clock of its own, which stands still until somebody lets its time pass.
+A virtual machine has its own clock. It advances only by `elapse`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,17 @@ if TYPE_CHECKING:
     from errormotion.plugins import Bench
 
 STEP = 0.1
-"""How closely the first motion is looked for, s."""
-NAP = 0.5
-"""Longest sleep at once, s, and how often a control is asked whether it is ready."""
-SLACK = 30.0
-"""A program may take this much longer than planned, s, and a tenth of its duration."""
-OPERATOR_SECONDS = 180.0
-"""The operator is given so long to start a program after saying so."""
-WARNING = 30.0
-"""So long before a pass is due the operator is told, s."""
-
-
-STANDS = 4
-"""So many times in a row a virtual machine may be listened to in vain; one that keeps a pace is slow to come."""
+"""Interval at which the first motion is looked for, s."""
+POLL_INTERVAL = 0.5
+"""Longest sleep, and interval at which the state of a control is read, s."""
+TIMEOUT_MARGIN = 30.0
+"""Timeout of a program beyond 1.1 times its planned duration, s."""
+OPERATOR_TIMEOUT = 180.0
+"""Time for the operator to start a program after the confirmation, s."""
+NOTICE_TIME = 30.0
+"""Time before a pass is due at which the operator is notified, s."""
+STALL_LIMIT = 4
+"""Number of successive checks without progress of a virtual clock after which a program counts as ended."""
 
 
 class Mover(Protocol):
@@ -36,7 +34,7 @@ class Mover(Protocol):
     Attributes
     ----------
     virtual : bool
-        Whether time can be let pass at will.
+        Whether the clock is that of a virtual machine.
     """
 
     virtual: bool
@@ -44,70 +42,70 @@ class Mover(Protocol):
     def now(self) -> float:
         """Return the time, s: of the day (since 1970), or of the virtual machine."""
 
-    def begin(self, program: Program, *, listening: bool = False) -> float:
-        """Have a program begun; return when its motion began, where that is known.
+    def start(self, program: Program, *, listening: bool = False) -> float:
+        """Start a program; return the time at which its motion started, where that is known.
 
-        With ``listening`` it returns before the motion begins, so that the profiler can be ready.
+        With ``listening`` it returns before the motion starts, so that the profiler can be ready.
         """
 
     def wait_until(self, when: float) -> None:
-        """Let time pass."""
+        """Wait until a time, s."""
 
-    def may_still_come(self) -> bool:
-        """Whether a program that was begun may still move, while the profiler has seen nothing of it yet."""
+    def may_still_move(self) -> bool:
+        """Return whether a started program may still cause motion although the profiler has delivered no line yet."""
 
     def finish(self) -> None:
         """Wait until the program has ended."""
 
 
 def mover(bench: Bench) -> Mover:
-    """Return the control of a bench, or the operator where it has none that takes programs."""
+    """Return the control of a bench, or the operator where it has none that runs programs."""
     controller = bench.of_kind("controller") if bench.has_kind("controller") else None
     return Controlled(controller) if hasattr(controller, "run_program") else Operated(bench)
 
 
 class Controlled:
-    """A control that takes programs."""
+    """A control that runs programs."""
 
     def __init__(self, controller: Any) -> None:
         self._control = controller
         self.virtual = hasattr(controller, "elapse")
         self._deadline = float("inf")
-        self._asked, self._stood = float("nan"), 0
+        self._checked_at, self._stalled = float("nan"), 0
 
     def now(self) -> float:
         """Return the time of the machine."""
         return float(self._control.state()["time"]) if self.virtual else time.time()
 
-    def begin(self, program: Program, *, listening: bool = False) -> float:
-        """Hand a program over; wait for its first motion, unless somebody listens for it."""
+    def start(self, program: Program, *, listening: bool = False) -> float:
+        """Transfer a program and wait for its first motion; with ``listening`` return immediately."""
         self.finish()
         before = self._place()
         answer = self._control.run_program(program.text())
         lead_in = float(answer.get("longest_lead_in", 0.0))
-        begun = self.now()
+        started = self.now()
         duration = float(answer.get("duration", program.seconds()))
-        self._deadline = begun + lead_in + duration * 1.1 + SLACK
-        self._asked, self._stood = float("nan"), 0
+        self._deadline = started + lead_in + duration * 1.1 + TIMEOUT_MARGIN
+        self._checked_at, self._stalled = float("nan"), 0
         if listening:
-            return begun
+            return started
         while self._place() == before:
-            if self.now() > begun + lead_in + STEP:
-                return begun + lead_in / 2  # it begins with a rest, or where it stands
+            if self.now() > started + lead_in + STEP:
+                return started + lead_in / 2  # it starts with a dwell, or at its first position
             self._pass(STEP)
         return self.now() - STEP / 2
 
     def wait_until(self, when: float) -> None:
-        """Let time pass."""
+        """Wait until a time, s."""
         while (left := when - self.now()) > 1e-6:
             self._pass(left)
 
-    def may_still_come(self) -> bool:
-        """Whether the program runs; a virtual machine whose time stands still again and again does not."""
+    def may_still_move(self) -> bool:
+        """Return whether the program runs; not so where the virtual clock no longer advances."""
         now = self.now()
-        self._stood = self._stood + 1 if self.virtual and now == self._asked else 0
-        self._asked = now
-        return self._stood < STANDS and bool(self._control.state().get("running", True)) and now < self._deadline
+        self._stalled = self._stalled + 1 if self.virtual and now == self._checked_at else 0
+        self._checked_at = now
+        return self._stalled < STALL_LIMIT and bool(self._control.state().get("running", True)) and now < self._deadline
 
     def finish(self) -> None:
         """Wait until no program runs.
@@ -115,15 +113,15 @@ class Controlled:
         Raises
         ------
         InstrumentError
-            It takes far longer than planned.
+            The program takes far longer than planned.
         """
         while self._control.state().get("running", False):
             if self.now() > self._deadline:
                 raise InstrumentError(
-                    "The control still runs a program long after it should have ended: has it stopped, is its feed "
-                    "turned down? Let it finish and resume."
+                    "The control still runs a program long after its planned end. Check whether it has stopped and "
+                    "whether the feed override is reduced; let the program finish and resume the run."
                 )
-            self._pass(NAP)
+            self._pass(POLL_INTERVAL)
 
     def _place(self) -> Any:
         return self._control.state().get("position")
@@ -132,7 +130,7 @@ class Controlled:
         if self.virtual:
             self._control.elapse(seconds)
         else:
-            time.sleep(min(seconds, NAP))
+            time.sleep(min(seconds, POLL_INTERVAL))
 
 
 class Operated:
@@ -149,35 +147,35 @@ class Operated:
         """Return the time of the day."""
         return time.time()
 
-    def begin(self, program: Program, *, listening: bool = False) -> float:
-        """Ask the operator to start a program."""
+    def start(self, program: Program, *, listening: bool = False) -> float:
+        """Prompt the operator to start a program."""
         ended = f"When {self._running} has ended: " if self._running else ""
         what = f"{program.name} ({program.purpose}; {_duration(program.seconds())})"
         if listening:
             self._bench.ask(
-                f"{ended}make {what} ready, confirm, and start it within {OPERATOR_SECONDS / 60:.0f} minutes after "
+                f"{ended}make {what} ready, confirm, and start it within {OPERATOR_TIMEOUT / 60:.0f} minutes after "
                 "that: the profiler waits for the motion."
             )
         else:
             self._bench.ask(
-                f"{ended}start {what}, and confirm at the moment it begins to move. In a campaign that goes on "
-                "after an interruption the program may be longer than that: stop it when the time is over."
+                f"{ended}start {what}, and confirm at the moment it starts to move. In a resumed campaign the "
+                "program may be longer than this duration: stop it when the time is over."
             )
         self._running = program.name
-        self._deadline = time.time() + OPERATOR_SECONDS + program.seconds()
+        self._deadline = time.time() + OPERATOR_TIMEOUT + program.seconds()
         return time.time()
 
     def wait_until(self, when: float) -> None:
-        """Wait until the operator must get ready."""
-        while (left := when - WARNING - time.time()) > 0:
-            time.sleep(min(left, NAP))
+        """Wait until `NOTICE_TIME` before a time, s."""
+        while (left := when - NOTICE_TIME - time.time()) > 0:
+            time.sleep(min(left, POLL_INTERVAL))
 
-    def may_still_come(self) -> bool:
-        """Whether the operator may still be about to start."""
+    def may_still_move(self) -> bool:
+        """Return whether the time of the operator to start has not expired."""
         return time.time() < self._deadline
 
     def finish(self) -> None:
-        """Do nothing: the next question waits for it."""
+        """Do nothing: the next prompt waits for the end."""
 
 
 def _duration(seconds: float) -> str:

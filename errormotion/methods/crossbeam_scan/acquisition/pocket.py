@@ -1,4 +1,4 @@
-"""Measuring where the profiler is: a pass over a circular pocket at each of several heights of the spindle."""
+"""Scans for the pose of the profiler: a pass over a circular pocket at each of several heights of the spindle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
 from errormotion.methods.crossbeam_scan.acquisition.programs import Program, pocket_pass
-from errormotion.methods.crossbeam_scan.acquisition.scans import PATIENCE, SCHEMA, prepare_profiler, reopen
+from errormotion.methods.crossbeam_scan.acquisition.scans import FAILURE_LIMIT, SCHEMA, prepare_profiler, reopen
 from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
 
 if TYPE_CHECKING:
@@ -34,22 +34,22 @@ log = logging.getLogger(__name__)
 def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield scans of a pocket, one chunk along ``scan`` for each lift of the spindle.
 
-    A pass whose stream breaks, or that an interruption cut off, is made again.
+    A pass that fails or was interrupted is repeated.
 
     Parameters
     ----------
     bench : Bench
-        With a ``line_profiler``; a ``controller`` where there is one, else the operator is asked.
+        With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
     settings : Settings
     done : Dataset, optional
-        What an interrupted run holds: whole scans.
+        The complete scans of an interrupted run.
 
     Raises
     ------
     MethodError
-        The scans are files, or lines come but none of them over the pocket.
+        The scans are files, or no line is over the pocket.
     InstrumentError
-        A pass broke three times.
+        A pass failed three times.
     """
     profiler = bench.of_kind("line_profiler")
     if hasattr(profiler, "scans"):
@@ -98,16 +98,16 @@ def _static(bench: Bench, settings: Settings, programs: dict[str, str]) -> xr.Da
 def _scan(
     profiler: Any, move: Mover, program: Program, settings: Settings
 ) -> tuple[Array, Heights, Array, dict[str, Any]]:
-    """Return y (profile,), heights (profile, point) and x (point,) of a pass, and what was lost; tries again."""
-    for attempt in range(1, PATIENCE + 1):
+    """Return y (profile,), heights (profile, point) and x (point,) of a pass, and counts of losses; with retries."""
+    for attempt in range(1, FAILURE_LIMIT + 1):
         try:
             return _cut(list(_pass(profiler, move, program, settings)), settings)
         except BrokenPassError as error:
             log.warning("%s: %s", program.name, error)
-            if attempt == PATIENCE:
+            if attempt == FAILURE_LIMIT:
                 raise InstrumentError(
-                    f"{program.name} broke {PATIENCE} times, at last, its last line at {error.position:g} m (nan: none "
-                    f"came): {error.reason}"
+                    f"{program.name} failed {FAILURE_LIMIT} times. The last line of the last attempt was at "
+                    f"{error.position:g} m (nan: there was none): {error.reason}"
                 ) from error
             reopen(profiler)
     raise InstrumentError(f"{program.name} was not made")
@@ -126,19 +126,19 @@ def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> I
 
 
 def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array, dict[str, Any]]:
-    """Put the lines on as many even places as every scan has; a place without a line stays NaN."""
+    """Return the lines on an even grid, the same for every scan; positions without a line stay NaN."""
     count = int(settings.pocket_scan_length / settings.line_pitch)
     if not parts:
         raise MethodError(
-            f"No line came over the pocket at {settings.pocket_position:g} m: check pocket_position, encoder_pitch "
-            f"({settings.encoder_pitch:g} m a count) and encoder_zero ({settings.encoder_zero:g} m)."
+            f"No line was received over the pocket at {settings.pocket_position:g} m: check pocket_position, "
+            f"encoder_pitch ({settings.encoder_pitch:g} m a count) and encoder_zero ({settings.encoder_zero:g} m)."
         )
     y = np.concatenate([part.position for part in parts]) - settings.pocket_position
     heights = np.concatenate([part.heights for part in parts])
     known = np.isfinite(y)
     y, heights = y[known], heights[known]
     pitch = settings.line_pitch
-    phase = y[0] - pitch * round(y[0] / pitch)  # of the lines that came: none is on the verge of two places
+    phase = y[0] - pitch * round(y[0] / pitch)  # of the received lines: none is midway between two positions
     place = np.rint((y - phase) / pitch).astype(np.int64) + count // 2
     inside = (place >= 0) & (place < count)
     if np.unique(place[inside]).size < 0.9 * count:

@@ -1,7 +1,7 @@
-"""NC programs of a campaign: moves of the axis in ISO 6983, what they do, and how long they take.
+"""NC programs of a campaign in ISO 6983, their purpose and their duration.
 
-A program is plain: absolute places in mm, feeds in mm/min, dwells in seconds. Its duration is that of constant feed;
-a real machine takes a little longer where it speeds up and slows down.
+Positions are absolute and in mm, feeds in mm/min, dwells in s. The duration is computed with constant feed; a real
+machine takes slightly longer because of its acceleration.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 DWELL = 2.0
-"""Rest before the measuring move, s: the axis comes to a stop, and the profiler is ready."""
+"""Dwell before the measuring move, s: the axis comes to rest and the profiler becomes ready."""
 MM, MINUTE = 1000.0, 60.0
 _SHORTEST = 1e-3
 """Moves below this, m, are left out."""
@@ -26,7 +26,7 @@ PASS = "pass.nc"
 
 @dataclass(frozen=True)
 class Move:
-    """A move of one axis to a place, m, with a feed, m/s."""
+    """A move of one axis to a position, m, with a feed, m/s."""
 
     place: float
     feed: float
@@ -35,7 +35,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Dwell:
-    """A rest, s."""
+    """A dwell, s."""
 
     seconds: float
 
@@ -49,7 +49,7 @@ class Program:
     name : str
         Of its file.
     purpose : str
-        What it does, in words.
+        A short description.
     steps : tuple of Move or Dwell
     """
 
@@ -58,9 +58,9 @@ class Program:
     steps: tuple[Move | Dwell, ...]
 
     def seconds(self, start: float | None = None) -> float:
-        """Return how long it takes from a place of Y, m; by default from where it ends, as when it is repeated.
+        """Return the duration from a start position of Y, m; by default its own end, as in a repetition.
 
-        Moves of other axes than Y count as nothing.
+        Moves of other axes than Y are neglected.
         """
         place = self.end if start is None else start
         total = 0.0
@@ -74,7 +74,7 @@ class Program:
 
     @property
     def end(self) -> float:
-        """Place of Y behind the last move, m."""
+        """Position of Y after the last move, m."""
         return [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"][-1]
 
     def text(self) -> str:
@@ -94,31 +94,31 @@ class Program:
         return "\n".join([*lines, "M30", "%", ""])
 
     def reach(self) -> tuple[float, float]:
-        """Return lowest and highest place of Y, m."""
-        places = [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"]
-        return min(places), max(places)
+        """Return lowest and highest position of Y, m."""
+        positions = [step.place for step in self.steps if isinstance(step, Move) and step.axis == "Y"]
+        return min(positions), max(positions)
 
     def check(self, travel: tuple[float, float] | None) -> None:
-        """Refuse to leave the travel of the axis (m), where that is known.
+        """Check that the program stays within the travel of the axis (m), where that is known.
 
         Raises
         ------
         MethodError
-            It names the program, the place and the end.
+            The program leaves the travel.
         """
         if travel is None:
             return
         low, high = self.reach()
         if low < travel[0] - 1e-9 or high > travel[1] + 1e-9:
             raise MethodError(
-                f"{self.name} would go from Y{_mm(low)} to Y{_mm(high)} and the axis travels from {_mm(travel[0])} to "
-                f"{_mm(travel[1])} mm (setting 'travel'): move the artefacts, or make 'margin' or 'warm_up_travel' "
-                "smaller. No program was written."
+                f"{self.name} would move from Y{_mm(low)} to Y{_mm(high)} and the axis travels from {_mm(travel[0])} "
+                f"to {_mm(travel[1])} mm (setting 'travel'): move the artefacts, or reduce 'margin' or "
+                "'warm_up_travel'. No program was written."
             )
 
 
 def measuring_pass(settings: Settings) -> Program:
-    """Return the pass over all artefacts in +Y. It moves with the measuring feed only: the machine stays cold."""
+    """Return the pass over all artefacts in +Y, with the measuring feed only, so that the machine stays cold."""
     low, high = pass_ends(settings)
     count = len(settings.positions)
     height = () if settings.scan_z is None else (Move(settings.scan_z, settings.warm_up_feed, "Z"),)
@@ -130,11 +130,11 @@ def measuring_pass(settings: Settings) -> Program:
 
 
 def pass_ends(settings: Settings) -> tuple[float, float]:
-    """Return where a measuring pass begins and where it turns, m."""
+    """Return start and end of a measuring pass, m."""
     if not settings.positions:
         raise MethodError(
-            "The scans need the places of the artefacts: give 'positions', where the axis is when the profiler stands "
-            "over the middle of each, such as ['350 mm', '550 mm']."
+            "The scans need the positions of the artefacts: give 'positions', those of the axis with the profiler over "
+            "the middle of each, such as ['350 mm', '550 mm']."
         )
     beyond = settings.scan_length / 2 + settings.margin
     return settings.positions[0] - beyond, settings.positions[-1] + beyond
@@ -158,18 +158,18 @@ def _pass(low: float, high: float, settings: Settings) -> tuple[Move | Dwell, ..
 
 
 def warm_up_piece(settings: Settings, number: int, seconds: float, start: float) -> Program:
-    """Return warm-up moves back and forth that take so many seconds from a start (m), the last stroke a shorter one.
+    """Return warm-up moves to and fro of a given duration from a start (m); the last stroke is shorter.
 
     Raises
     ------
     MethodError
-        The ends of the moves are one place.
+        The ends of the moves coincide.
     """
     low, high = sorted(settings.warm_up_travel or pass_ends(settings))
     feed = settings.warm_up_feed
     if high - low < _SHORTEST:
         raise MethodError(
-            f"warm_up_travel: expected two ends apart; found Y{_mm(low)} and Y{_mm(high)}, where the axis rests."
+            f"warm_up_travel: expected two ends apart, so that the axis moves; found Y{_mm(low)} and Y{_mm(high)}."
         )
     steps: list[Move] = [Move(low, feed)]
     left = seconds - abs(start - low) / feed
@@ -188,7 +188,7 @@ def texts(programs: Sequence[Program], settings: Settings) -> dict[str, str]:
     Raises
     ------
     MethodError
-        One does not.
+        A program leaves the travel.
     """
     for program in programs:
         program.check(settings.travel)

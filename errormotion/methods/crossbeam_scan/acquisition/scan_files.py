@@ -1,4 +1,4 @@
-"""Scans that exist already as files, brought into the form of scans as recorded: what follows is the same for both."""
+"""Scans from files, converted to the variant "scans as recorded"."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def record_files(
     static : Dataset
         See ``acquisition.static_part``.
     done : Dataset, optional
-        What an interrupted run holds; files that are in it whole are passed over.
+        The record of an interrupted run; files that it holds completely are skipped.
 
     Raises
     ------
     MethodError
-        Not one file for each artefact and pass; the points on the line differ from file to file.
+        The number of files is not that of artefacts times passes, or the points of a line differ between files.
     """
     artefacts = len(settings.positions)
     names = list(profiler.identify().details["files"])

@@ -1,7 +1,7 @@
 """Measuring scans: pass after pass over the artefacts while the machine warms up, each line with its encoder count.
 
-Every line goes into the raw dataset before anything is computed from it; scans are cut out of it later (``cutting``).
-A line of NaN, encoder and all, marks where the warm-up begins (its time is 0) and where a stream broke.
+Every line is stored in the raw dataset before anything is computed from it; scans are cut out later (``cutting``).
+A line of NaN, encoder included, marks the start of the warm-up (its time is 0) and each failure of the stream.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
-HAND_OVER_SECONDS = 0.4
-"""A chunk is handed over at least this often, so that a crash loses little."""
-HAND_OVER_LINES = 512
-PATIENCE = 3
-"""So many passes in a row may break before the campaign is given up."""
+CHUNK_INTERVAL = 0.4
+"""Longest time between two chunks, s: limits the loss in a crash."""
+CHUNK_LINES = 512
+"""Lines of a chunk."""
+FAILURE_LIMIT = 3
+"""Number of successive failed passes after which the campaign ends."""
 
 
 def record_scans(
@@ -50,20 +51,20 @@ def record_scans(
     Parameters
     ----------
     bench : Bench
-        With a ``line_profiler``; a ``controller`` where there is one, else the operator is asked.
+        With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
     settings : Settings
     pose : Dataset, optional
         Error dataset of a test that found the profiler's pose; without it ``settings.profiler_pose`` counts.
     done : Dataset, optional
-        What an interrupted run holds. Its last pass stays as it is. On a real machine the warm-up went on meanwhile: of
-        the passes that are overdue only the last one is made.
+        The record of an interrupted run. Its last pass is not repeated. On a real machine the warm-up has continued: of
+        the overdue passes only the last one is made.
 
     Raises
     ------
     MethodError
-        No pose, no places, times too close; lines come, but none of them where a scan is.
+        No pose, no positions, times too close, or no line is within a scan.
     InstrumentError
-        Three passes in a row broke.
+        Three successive passes failed.
     """
     profiler = bench.of_kind("line_profiler")
     plan = schedule(settings)
@@ -76,7 +77,7 @@ def record_scans(
 
 
 def expected_lines(settings: Settings) -> int:
-    """Return how many lines a campaign keeps, about: what its progress counts."""
+    """Return the approximate number of lines that a campaign stores: the total of its progress."""
     length = settings.scan_length + 2 * settings.margin
     return (
         (1 + settings.cold_repeats + len(settings.warm_up))
@@ -118,7 +119,7 @@ def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]
     Raises
     ------
     MethodError
-        Neither says it.
+        Neither states it.
     """
     if found is not None:
         return np.asarray(found["profiler_pose"].values, float), np.asarray(found["pose_covariance"].values, float)
@@ -134,7 +135,7 @@ def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]
 
 
 class _Campaign:
-    """One campaign from here to its end."""
+    """The part of a campaign that is still to be measured."""
 
     def __init__(
         self,
@@ -151,21 +152,21 @@ class _Campaign:
         self.scans = middles - half, middles + half
         self.windows = self.scans[0] - settings.margin, self.scans[1] + settings.margin
         self.origin = move.now()
-        self.zero: float | None = None  # when the warm-up began, by the mover's clock
+        self.zero: float | None = None  # start of the warm-up on the mover's clock
         self.next = 0
         self.pending = Pending(static)
         if done is None:
             static.attrs["start"] = datetime.now(UTC).isoformat(timespec="milliseconds")
         else:
-            self._take_up(done)
+            self._resume(done)
 
-    def _take_up(self, done: xr.Dataset) -> None:
-        """Find out what was done, and when the warm-up began."""
+    def _resume(self, done: xr.Dataset) -> None:
+        """Determine the passes that were made and the start of the warm-up."""
         cycle, since, clock = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
         self.pending.x = np.asarray(done["x"].values, dtype=float)
         tried = cycle[since != 0]  # time 0 is that of the mark
         self.next = int(tried.max()) + 1 if tried.size else 0
-        if 0 < self.next <= self.plan.cold and not _whole(done, self.next - 1, self.high - self.settings.margin):
+        if 0 < self.next <= self.plan.cold and not _complete(done, self.next - 1, self.high - self.settings.margin):
             self.next -= 1  # nothing has warmed up yet: a cold pass can be made again
         if self.move.virtual:
             return
@@ -174,8 +175,8 @@ class _Campaign:
             self.origin = datetime.fromisoformat(start).timestamp()
         except ValueError as error:
             raise MethodError(
-                f"The interrupted record does not say when it began (attribute start = '{start}'; expected UTC such as "
-                "2025-03-01T08:00:00+00:00), so that it cannot be gone on with. Start a new run."
+                f"The interrupted record does not state when it started (attribute start = '{start}'; expected UTC "
+                "such as 2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
             ) from error
         warm = np.flatnonzero(cycle >= self.plan.cold)
         if warm.size:
@@ -185,11 +186,11 @@ class _Campaign:
     def _skip_overdue(self, now: float) -> None:
         self.next = max(self.next, self.plan.cold)
         while self.next + 1 < self.plan.cycles and self.plan.warm_up[self.next + 1] < now:
-            log.warning("pass %d was due while nobody measured; it is left out", self.next)
+            log.warning("pass %d was due during the interruption; it is skipped", self.next)
             self.next += 1
 
     def chunks(self) -> Iterator[xr.Dataset]:
-        """Yield all that is still to be measured."""
+        """Yield the remaining chunks."""
         broken = 0
         if not self.move.virtual:
             prepare_profiler(self.profiler)
@@ -202,31 +203,31 @@ class _Campaign:
                 log.warning("pass %d: %s", self.next, error)
                 broken += 1
                 yield from self._interrupted(error)
-                if broken == PATIENCE:
+                if broken == FAILURE_LIMIT:
                     raise InstrumentError(
-                        f"{PATIENCE} passes in a row broke, the last one, number {self.next}: {error.reason}"
+                        f"{FAILURE_LIMIT} successive passes failed, the last one is number {self.next}: {error.reason}"
                     ) from error
                 reopen(self.profiler)
                 if self.next < self.plan.cold:
-                    continue  # the machine is still cold: once more
+                    continue  # the machine is still cold: repeat the pass
             else:
                 broken = 0
             self.next += 1
 
     def _warm_up(self) -> Iterator[xr.Dataset]:
-        """Have the axis move until the next pass is due; the first time, mark when it began."""
+        """Move the axis until the next pass is due; mark the start the first time."""
         item, due = self.plan.before(self.next), self.plan.warm_up[self.next]
         if item is not None and (piece := self._piece(item.program, due)) is not None:
-            begun = self.move.begin(piece)
+            started = self.move.start(piece)
             if self.zero is None:
-                self.zero = begun
+                self.zero = started
                 if self.next == self.plan.cold:
-                    yield from self._mark(0.0, begun)
+                    yield from self._mark(0.0, started)
         if self.zero is not None:
             self.move.wait_until(self.zero + due)
 
     def _piece(self, name: str, due: float) -> Program | None:
-        """Return the warm-up moves for the time that is left, None where there is hardly any."""
+        """Return the warm-up moves for the remaining time; None where it is shorter than `PAUSE`."""
         planned = self.plan.programs[name]
         if self.zero is None:
             return planned
@@ -242,39 +243,39 @@ class _Campaign:
         item = self.plan.of_cycle(self.next)
         ordered = self.move.now()
         zero = ordered - item.start if self.zero is None or self.next < self.plan.cold else self.zero
-        came, kept, reach = 0, 0, [np.inf, -np.inf]
+        received, kept, reach = 0, 0, [np.inf, -np.inf]
         program = self.plan.programs[item.program]
         try:
             with closing(listen(self.profiler, self.move, program, self.settings, self.low, self.high)) as listening:
                 for lines in listening:
                     part = lines.within(*self.windows)
-                    if lines.within(*self.scans) is not lines:  # points beside the artefacts are not missed
+                    if lines.within(*self.scans) is not lines:  # missing points outside the scans are not counted
                         part = replace(part, invalid={})
-                    came, kept = came + lines.encoder.size, kept + part.encoder.size
+                    received, kept = received + lines.encoder.size, kept + part.encoder.size
                     reach = [
                         np.nanmin(lines.position, initial=reach[0]), np.nanmax(lines.position, initial=reach[1])
                     ]  # fmt: skip
                     self.pending.add(part, self.next, zero, self.origin)
                     if self.pending.due:
-                        yield self.pending.hand_over()
+                        yield self.pending.chunk()
         except BrokenPassError:
-            if came and not kept:
-                raise MethodError(self._missed(came, *reach)) from None
+            if received and not kept:
+                raise MethodError(self._missed(received, *reach)) from None
             raise
         if self.pending.lines:
-            yield self.pending.hand_over()
+            yield self.pending.chunk()
 
-    def _missed(self, came: int, low: float, high: float) -> str:
+    def _missed(self, received: int, low: float, high: float) -> str:
         s = self.settings
         return (
-            f"Pass {self.next}: {came} lines came, at positions from {low:.6g} to {high:.6g} m, and none of them in a "
-            f"scan; those are at {', '.join(f'{y:g}' for y in s.positions)} m. Check encoder_pitch "
+            f"Pass {self.next}: {received} lines were received, at positions from {low:.6g} to {high:.6g} m, and none "
+            f"of them in a scan; the scans are at {', '.join(f'{y:g}' for y in s.positions)} m. Check encoder_pitch "
             f"({s.encoder_pitch:g} m a count, negative where it counts backwards), encoder_zero ({s.encoder_zero:g} m) "
-            "and which way of the axis triggers the profiler."
+            "and the direction of the axis in which the profiler is triggered."
         )
 
     def _interrupted(self, error: BrokenPassError) -> Iterator[xr.Dataset]:
-        """Hand over what came, with a mark behind it and the reason among the counts of what is invalid."""
+        """Yield the received lines, a mark after them, and the reason among the counts of invalid data."""
         text = interruption(self.next, error.position, error.reason)
         self.pending.invalid[text] = self.pending.invalid.get(text, 0) + 1
         now = self.move.now()
@@ -283,7 +284,7 @@ class _Campaign:
         yield from self._mark(since, now)
 
     def _mark(self, since: float, now: float) -> Iterator[xr.Dataset]:
-        """Yield a line of NaN, where the length of a line is known yet."""
+        """Yield a line of NaN if the length of a line is already known."""
         if self.pending.x is None:
             return
         unknown = np.full(1, np.nan)
@@ -292,35 +293,35 @@ class _Campaign:
             0, {},
         )  # fmt: skip
         self.pending.add(line, self.next, now - since, self.origin)
-        yield self.pending.hand_over()
+        yield self.pending.chunk()
 
 
 def reopen(profiler: Any) -> None:
-    """Begin anew with a profiler; where it does not come back the next pass breaks as well."""
+    """Reconnect a profiler; if that fails, the next pass fails as well."""
     with suppress(InstrumentError):
         profiler.close()
     try:
         profiler.open()
     except InstrumentError as error:
-        log.warning("the profiler does not come back: %s", error)
+        log.warning("the profiler does not reconnect: %s", error)
 
 
 def prepare_profiler(profiler: Any) -> None:
-    """Listen once while nothing moves: whatever a driver has to prepare is prepared when the axis begins."""
+    """Open the stream once at rest, so that the preparation of the driver is done when the axis starts."""
     with suppress(InstrumentError), closing(profiler.stream(block=1)) as stream:
         next(stream, None)
 
 
-def _whole(done: xr.Dataset, cycle: int, end: float) -> bool:
-    """Whether a pass came past its last scan, m."""
+def _complete(done: xr.Dataset, cycle: int, end: float) -> bool:
+    """Return whether a pass has reached the end of its last scan, m."""
     counts = np.asarray(done["encoder"].values, dtype=float)[np.asarray(done["cycle_of_line"].values) == cycle]
-    places = float(done["encoder_zero"]) + float(done["encoder_pitch"]) * counts
-    return bool(np.nanmax(places, initial=-np.inf) >= end - 1e-3)
+    positions = float(done["encoder_zero"]) + float(done["encoder_pitch"]) * counts
+    return bool(np.nanmax(positions, initial=-np.inf) >= end - 1e-3)
 
 
 @dataclass
 class Pending:
-    """Lines on their way from the profiler to the next chunk."""
+    """Lines received since the last chunk."""
 
     static: xr.Dataset
     x: Array | None = None
@@ -332,12 +333,12 @@ class Pending:
 
     @property
     def due(self) -> bool:
-        """Whether there is a chunk, and it is large or old enough."""
-        old = time.monotonic() - self._since >= HAND_OVER_SECONDS
-        return self.lines >= HAND_OVER_LINES or (self.lines > 0 and old)
+        """Whether there are lines, and the next chunk is due."""
+        old = time.monotonic() - self._since >= CHUNK_INTERVAL
+        return self.lines >= CHUNK_LINES or (self.lines > 0 and old)
 
     def add(self, lines: Lines, cycle: int, zero: float, origin: float) -> None:
-        """Take in lines of a pass; ``zero`` is when the warm-up began, ``origin`` when the record did."""
+        """Add lines of a pass; ``zero`` is the start of the warm-up, ``origin`` that of the record, s."""
         self.x = lines.x
         size = lines.encoder.size
         if not size:
@@ -356,7 +357,7 @@ class Pending:
         for reason, count in lines.invalid.items():
             self.invalid[reason] = self.invalid.get(reason, 0) + count
 
-    def hand_over(self) -> xr.Dataset:
+    def chunk(self) -> xr.Dataset:
         """Return all pending lines as a dataset."""
         units = {"record": "m", "line_time": "s", "line_clock": "s"}
         found = {name: np.concatenate(parts) for name, parts in self._parts.items()}

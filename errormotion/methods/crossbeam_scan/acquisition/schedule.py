@@ -1,7 +1,7 @@
-"""What is done when: cold passes, then for each warm-up time the moves until then and a measuring pass.
+"""Schedule of a campaign: cold passes, then for each warm-up time the warm-up moves and a measuring pass.
 
-Time 0 is when the warm-up begins. A warm-up time counts everything since then, the measuring passes included: they move
-the axis as well, if more slowly. A pass begins at its warm-up time; when each of its artefacts was scanned is measured.
+Time 0 is the start of the warm-up. Warm-up times include the measuring passes, which move the axis as well, although
+more slowly. A pass starts at its warm-up time; the time of each scan is measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 PAUSE = 5.0
-"""Time between two programs, s: until the control has begun the next one."""
+"""Time between two programs, s: the control starts the next one."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Item:
     program : str
         Name of its file.
     start, seconds : float
-        When it begins, since the warm-up began, and how long it takes, by the plan; s.
+        Planned start since the start of the warm-up, and planned duration; s.
     cycle : int
         Number of the measuring pass; -1 for warm-up moves.
     """
@@ -51,7 +51,7 @@ class Item:
 
     @property
     def end(self) -> float:
-        """When it ends, s."""
+        """Planned end, s."""
         return self.start + self.seconds
 
 
@@ -84,7 +84,7 @@ class Schedule:
 
     @property
     def seconds(self) -> float:
-        """How long all of it takes."""
+        """Duration of the campaign, s."""
         return self.items[-1].end - self.items[0].start
 
     def of_cycle(self, cycle: int) -> Item:
@@ -102,7 +102,7 @@ class Schedule:
 
 
 def schedule(settings: Settings) -> Schedule:
-    """Return what a campaign does when.
+    """Return the schedule of a campaign.
 
     Raises
     ------
@@ -113,13 +113,13 @@ def schedule(settings: Settings) -> Schedule:
     low, high = pass_ends(settings)
     first, again = passing.seconds(low), passing.seconds(high)
     cold = 1 + settings.cold_repeats
-    begin = -(first + PAUSE + settings.cold_repeats * (again + PAUSE))
+    start = -(first + PAUSE + settings.cold_repeats * (again + PAUSE))
     items: list[Item] = []
     for number in range(cold):
-        items.append(Item(passing.name, begin, again if number else first, number))
-        begin = items[-1].end + PAUSE
+        items.append(Item(passing.name, start, again if number else first, number))
+        start = items[-1].end + PAUSE
     programs = {passing.name: passing}
-    free = 0.0  # when the axis is free
+    free = 0.0  # end of the previous program
     for number, due in enumerate(settings.warm_up, 1):
         seconds = due - PAUSE - free
         if seconds <= 0:
@@ -138,10 +138,10 @@ def schedule(settings: Settings) -> Schedule:
 
 
 def scan_times(plan: Schedule, settings: Settings) -> list[list[float]]:
-    """Return when each pass is over the middle of each artefact, s since the warm-up began, by the plan."""
+    """Return the planned times over the middle of each artefact, by pass, s since the start of the warm-up."""
     low, _ = pass_ends(settings)
-    begins = [item.end - plan.programs[item.program].seconds(low) for item in plan.items if item.cycle >= 0]
-    return [[begin + DWELL + (y - low) / settings.measuring_feed for y in settings.positions] for begin in begins]
+    starts = [item.end - plan.programs[item.program].seconds(low) for item in plan.items if item.cycle >= 0]
+    return [[start + DWELL + (y - low) / settings.measuring_feed for y in settings.positions] for start in starts]
 
 
 def program_texts(settings: Settings) -> dict[str, str]:

@@ -1,8 +1,8 @@
-"""From the registrations of a campaign to the errors of the carriage over time and position, with what they share.
+"""From the registrations of a campaign to the errors of the carriage over time and position, with their correlation.
 
 All is linear in the registrations once the weights of the guide are fixed: E = A(H, lever) K W(H) y, with W from maps
-to the profiler's motion, K what the guide makes of it (1 without) and A the adjoint to the carriage. What a wrong pose
-or lever does is found by moving H and the lever by one standard uncertainty both ways.
+to the profiler's motion, K what the guide makes of it (1 without) and A the adjoint to the carriage. The effect
+of pose and lever is found by changing each by one standard uncertainty up and down.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from errormotion.methods.crossbeam_scan.identification.registrations import Regi
 
 @dataclass(frozen=True)
 class Rig:
-    """How the profiler hangs on the carriage, and how well that is known.
+    """Pose of the profiler and lever, with their uncertainty.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Carriage:
     predicted : ndarray, (artefact, 6, 6)
         Covariance by surface and stated noise alone.
     drift : ndarray, (cycle, artefact, 3)
-        g, change of the profiler's place per metre of feed, profiler frame.
+        g, change of the profiler's position per metre of feed, profiler frame.
     """
 
     profiler: Array
@@ -88,19 +88,19 @@ class Carriage:
     drift: Array
 
 
-def carriage(found: Registrations, places: ArrayLike, rig: Rig, *, guide: float | None) -> Carriage:
+def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: float | None) -> Carriage:
     """Return the errors of the carriage from all registrations.
 
     Parameters
     ----------
     found : Registrations
-    places : (artefact,)
+    positions : (artefact,)
         Positions of the axis, m, rising.
     rig : Rig
     guide : float or None
         Standard uncertainty, rad, with which the carriage follows its guide, see `strain.guided`; None: not used.
     """
-    y = np.asarray(places, dtype=float)
+    y = np.asarray(positions, dtype=float)
     cycles, artefacts = found.cold_share.shape
     W, A = strain.from_maps(rig.pose), chain.carriage_adjoint(rig.pose, rig.lever)
     changed = rig.changed()
@@ -116,7 +116,7 @@ def carriage(found: Registrations, places: ArrayLike, rig: Rig, *, guide: float 
         if used.size == 0:
             continue
         maps = found.twist[c, used]
-        seen = maps @ W.T
+        seen = np.einsum("kj,ij->ki", maps, W)  # the same bits for any number of artefacts
         noise = W[:6] @ found.covariance[c, used] @ W[:6].T
         e[c, used], C[c, used], gain = _settled(seen[:, :6], noise, y[used], A, guide)
         drift[c, used] = seen[:, 6:]
@@ -140,12 +140,12 @@ def carriage(found: Registrations, places: ArrayLike, rig: Rig, *, guide: float 
 
 
 def _settled(
-    twist: Array, covariance: Array, places: Array, to_carriage: Array, guide: float | None
+    twist: Array, covariance: Array, positions: Array, to_carriage: Array, guide: float | None
 ) -> tuple[Array, Array, Array]:
     """Return twists, covariance and gain of one cycle, the guide taken into account where it is to be."""
     if guide is None:
         return twist, covariance, np.eye(twist.size)
-    found = strain.guided(twist, covariance, places, to_carriage, guide)
+    found = strain.guided(twist, covariance, positions, to_carriage, guide)
     return found.twist, found.covariance, found.gain
 
 

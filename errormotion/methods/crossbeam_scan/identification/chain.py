@@ -1,9 +1,9 @@
-"""From the registered motion of the profiler's frame to the six errors of the carriage, and what a wrong pose does.
+"""From the registered motion of the profiler's frame to the six errors of the carriage, and the effect of a wrong pose.
 
 A warm scan registers onto the cold one with M: a point seen at p in the warm profiler frame is seen at M p in the cold
 one. With H the pose of the profiler in the tool frame and S the shift by the lever (x_y, 0, z_y), the error of the
 carriage is the conjugate E = S H M (S H)^-1 (eq. 3 of Zhao et al.), for small motions the adjoint of S H applied to the
-twist of M. What is left out is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
+twist of M. The remainder is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
 
 A scan is put together along the feed. The carriage travels along Y of the machine, so line y lies off the profiler's
 plane by y times `feed_direction`, which is Y turned into the profiler's frame, and not by y along the frame's own Y.

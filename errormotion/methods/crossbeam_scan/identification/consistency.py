@@ -1,4 +1,4 @@
-"""Artefacts that moved between two scans, or were scanned off their place, found by what cannot be.
+"""Artefacts that moved between two scans, or were scanned off their position.
 
 A cold scan repeated must find no motion. And the errors of an axis are smooth over its position, so that those of one
 artefact follow from the others: one that moved adds the same step to all its later scans, which its neighbours lack.
@@ -21,7 +21,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.smoothing import ORDER, smooth
 
-#: artefacts without which their neighbours say nothing
+#: artefacts without which their neighbours carry no information
 FEWEST = 4
 #: order of the curves that predict an artefact from the others: seven artefacts do not tell in one cycle how rough a
 #: guide is, and with order 3 one whose curvature jumps about would alarm nearly always
@@ -32,7 +32,7 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True)
 class ColdRepeats:
-    """What repeated cold scans say.
+    """Result of the repeated cold scans.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Moved:
     score : float
         Chi-squared of the step in its six freedoms.
     probability : float
-        That a score is as high without a cause, for the few artefacts that tell how smooth the rest is.
+        Probability of such a score by chance, given the few artefacts that determine the smoothness.
     """
 
     artefact: int
@@ -85,14 +85,14 @@ class Moved:
 
 @dataclass(frozen=True)
 class Consistency:
-    """What the artefacts say of one another.
+    """Result of the comparison of the artefacts.
 
     Attributes
     ----------
     moved : tuple of Moved
         Worst first.
     tested : bool
-        Whether there were enough artefacts to tell; if not, ``moved`` is empty and says nothing.
+        Whether there were enough artefacts; if not, ``moved`` is empty and carries no information.
     limit : float
         Probability of a false alarm of one test; NaN where nothing was tested.
     """
@@ -238,15 +238,15 @@ class _Scans:
             for sign, which in ((1.0, after), (-1.0, before)):
                 share[row, d, which, k] = sign
                 share[row[:, None], d, which[:, None], left[others]] = -sign * W[:, others]
-        told = np.isfinite(excess).all(axis=-1)
-        if not told.any():
+        usable = np.isfinite(excess).all(axis=-1)
+        if not usable.any():
             return None
-        share, excess = share[told], excess[told]
+        share, excess = share[usable], excess[usable]
         N = np.nan_to_num(np.concatenate([self.cold[None], self.noise]))
         V = np.einsum("idtn,jetn,tnde->idje", share, share, N)
-        V = V.reshape(excess.size, excess.size) + np.diag(np.maximum(doubt[told], 0.0).ravel())
-        spare = np.isfinite(gain[told][:, others]).all(axis=-1).sum(axis=-1) - CAUTIOUS
-        return _greatest(k, cycles[told], excess, V, np.maximum(doubt[told], 0.0), spare)
+        V = V.reshape(excess.size, excess.size) + np.diag(np.maximum(doubt[usable], 0.0).ravel())
+        spare = np.isfinite(gain[usable][:, others]).all(axis=-1).sum(axis=-1) - CAUTIOUS
+        return _greatest(k, cycles[usable], excess, V, np.maximum(doubt[usable], 0.0), spare)
 
     def relief(self, step: Moved, left: NDArray[np.intp]) -> float:
         """Return by how much more likely all gains are, each freedom smooth, without one of one artefact (log).
@@ -258,9 +258,11 @@ class _Scans:
         _, _, gain, noise = self.gains(k, left)
         without = gain.copy()
         without[np.flatnonzero(self.there[:, k]) == step.since, left == k] = np.nan
-        places, order = self.position[left], _order(left)
+        positions, order = self.position[left], _order(left)
         likelihood = [
-            smooth(places, points[..., d], noise[..., d, d], places[:1], order=order, together=True).log_likelihood
+            smooth(
+                positions, points[..., d], noise[..., d, d], positions[:1], order=order, together=True
+            ).log_likelihood
             for points in (gain, without)
             for d in range(6)
         ]

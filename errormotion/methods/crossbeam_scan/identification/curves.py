@@ -1,4 +1,4 @@
-"""Smooth curves of the axis errors over position and over time, beside the points of the registrations.
+"""Smooth curves of the axis errors over position and over time.
 
 The curves are drawn in the profiler's frame, where a displacement is not yet mixed with the rotations over the lever,
 and then taken through the chain as the points are, with the share of pose and lever.
@@ -25,7 +25,7 @@ def curves(
     axis: Carriage,
     found: Registrations,
     rig: Rig,
-    places: Array,
+    positions: Array,
     time: Array,
     warm: list[int],
     wrong: NDArray[np.bool_],
@@ -37,7 +37,7 @@ def curves(
     axis : Carriage
     found : Registrations
     rig : Rig
-    places : (artefact,)
+    positions : (artefact,)
         m.
     time : (warm cycle,)
         s, above 0.
@@ -54,8 +54,8 @@ def curves(
     """
     e = np.where(wrong[warm][..., None], np.nan, axis.profiler[warm])
     C = axis.profiler_covariance[warm]
-    place = np.linspace(places[0], places[-1], PLACES) if places.size > 1 else places.copy()
-    over = smooth_twists(places, e, C, place)
+    place = np.linspace(positions[0], positions[-1], PLACES) if positions.size > 1 else positions.copy()
+    over = smooth_twists(positions, e, C, place)
     position, position_u = _chained(over.values, over.covariance, rig)
     cold = np.zeros((1, *position.shape[1:]))
 

@@ -1,7 +1,7 @@
 """Scans cut out of a record of lines, one at a time: a campaign may be larger than memory.
 
-A scan is the lines whose encoder says that the axis was within half a scan's length of an artefact. They are put in
-order, lines that came twice are taken once, and lines that were lost stand as NaN where they would have been.
+A scan is the lines whose encoder says that the axis was within half a scan's length of an artefact. They are
+sorted, repeated lines are used once, and lost lines are NaN at their positions.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Scan = tuple[NDArray[np.float32], Array, Array, float]
 log = logging.getLogger(__name__)
 
 GAP = 0.5e-3
-"""Longest piece without lines, m, that is left open in a scan."""
+"""Longest gap without lines, m, that is accepted in a scan."""
 LOST_SHARE = 0.05
-"""Share of its lines that a scan may have lost."""
+"""Largest accepted share of lost lines of a scan."""
 END = 0.01
-"""Share of a scan's length that may lack at each end."""
+"""Largest accepted share of a scan's length that is missing at each end."""
 DISORDER = 0.05
-"""Share of lines that may lie behind the one before them."""
+"""Largest accepted share of lines with a position before that of the previous line."""
 FEWEST_LINES = 16
 FINEST_PITCH = 1e-6
 """m; lines closer than this come from a wrong encoder_pitch."""
@@ -42,13 +42,13 @@ _INTERRUPTION = re.compile(r"pass (\d+) broke at (\S+) m: (.*)", re.DOTALL)
 
 
 def interruption(cycle: int, position: float, reason: str) -> str:
-    """Return how the raw dataset's counts of what is invalid name a pass that broke (``interruptions`` reads it)."""
+    """Return the key of an interrupted pass among the counts of invalid data, as `interruptions` reads it."""
     return f"pass {cycle} broke at {position:.3f} m: {reason}"
 
 
 @dataclass(frozen=True)
 class Interruption:
-    """A pass that broke: its number, the last place (m; NaN where it had not begun), and why."""
+    """An interrupted pass: its number, the last position (m; NaN where it had not started), and the reason."""
 
     cycle: int
     position: float
@@ -56,7 +56,7 @@ class Interruption:
 
 
 def interruptions(raw: xr.Dataset) -> list[Interruption]:
-    """Return the passes that broke, as a raw dataset tells them."""
+    """Return the interrupted passes that a raw dataset states."""
     counts = raw.attrs.get("invalid", "{}")
     counts = json.loads(counts) if isinstance(counts, str) else counts
     found = [_INTERRUPTION.fullmatch(str(text)) for text in counts]
@@ -64,12 +64,12 @@ def interruptions(raw: xr.Dataset) -> list[Interruption]:
 
 
 class Scans:
-    """The scans of a campaign, each loaded when it is asked for; of both variants of the raw dataset.
+    """The scans of a campaign, each loaded on request; for both variants of the raw dataset.
 
     Parameters
     ----------
     raw : Dataset
-        Schema ``errormotion.raw.crossbeam_scan/1``, variant "scans" or "scans as recorded". Stays as it is.
+        Schema ``errormotion.raw.crossbeam_scan/1``, variant "scans" or "scans as recorded". Not changed.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class Scans:
     ----------
     cycles, artefacts : int
     notes : list of str
-        What was mended so far, in sentences.
+        Corrections made so far, as sentences.
     """
 
     def __init__(self, raw: xr.Dataset) -> None:
@@ -104,7 +104,7 @@ class Scans:
         Raises
         ------
         MethodError
-            There is no such scan, or not all of it; or its places make no sense. The message says why.
+            There is no such scan, it is incomplete, or its positions are inconsistent.
         """
         if self._record is not None:
             height, y, time = self._record.scan(cycle, artefact)
@@ -138,11 +138,11 @@ class _Record:
         self._length = float(raw["scan_length"])
         counts = np.asarray(raw["encoder"].values, dtype=float)
         pitch, zero = float(raw["encoder_pitch"]), float(raw["encoder_zero"])
-        mended = folded(counts, (float(self._positions.mean()) - zero) / pitch)
-        jumped = np.isfinite(counts) & (mended != counts)
+        corrected = folded(counts, (float(self._positions.mean()) - zero) / pitch)
+        jumped = np.isfinite(counts) & (corrected != counts)
         if jumped.any():
-            note(f"The encoder's count had overflowed ({OVERFLOW:.0f}) in {int(jumped.sum())} lines; it was mended.")
-        self._place = zero + pitch * mended
+            note(f"The encoder's count overflowed ({OVERFLOW:.0f}) in {int(jumped.sum())} lines; this was corrected.")
+        self._place = zero + pitch * corrected
         self._cycle = np.asarray(raw["cycle_of_line"].values).astype(np.int64)
         self._time = np.asarray(raw["line_time"].values, dtype=float)
         planned = int(raw.sizes["cycle"]) if "warm_up" in raw else 0
@@ -184,11 +184,11 @@ class _Record:
         time = float(np.mean(self._time[rows]))
         height, y, lost = _evened(height, y)
         if lost:
-            self._note(f"{at}: {lost} lost lines of {y.size} are left open.")
+            self._note(f"{at}: {lost} of {y.size} lines are lost and NaN.")
         return height, y, time
 
     def _attempts(self, cycle: int, middle: float) -> Iterator[tuple[NDArray[np.int64], Array]]:
-        """Yield, for each time that the axis passed, the lines within the scan (n,) and their places y (n,), m."""
+        """Yield, for each time that the axis passed, the lines within the scan (n,) and their positions y (n,), m."""
         lines = np.flatnonzero((self._cycle == cycle) & np.isfinite(self._place))
         if not lines.size:
             return
@@ -203,7 +203,7 @@ class _Record:
                 yield rows[inside], y[inside]
 
     def _ordered(self, y: Array, at: str) -> tuple[NDArray[np.int64], Array]:
-        """Return the order that makes y rise, each place once, and y in that order."""
+        """Return the order that makes y rise, each position once, and y in that order."""
         steps = np.diff(y)
         if np.count_nonzero(steps < 0) > steps.size / 2:
             backwards = np.arange(y.size)[::-1]
@@ -215,9 +215,9 @@ class _Record:
         order = np.argsort(y, kind="stable")
         fresh = np.concatenate([[True], np.diff(y[order]) > FINEST_PITCH / 10])
         if behind:
-            self._note(f"{at}: {behind} lines lay behind the one before them; all were put in order.")
+            self._note(f"{at}: {behind} lines were before the previous one; all lines were sorted.")
         if not fresh.all():
-            self._note(f"{at}: {int(np.count_nonzero(~fresh))} lines came twice.")
+            self._note(f"{at}: {int(np.count_nonzero(~fresh))} lines were repeated.")
         order = order[fresh]
         return order, y[order]
 
@@ -255,7 +255,7 @@ class _Record:
         return f"{what} in pass {cycle}"
 
     def _load(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return lines of the record, read in one go."""
+        """Return lines of the record, read in one block."""
         first = int(rows.min())
         block = self._record.isel(line=slice(first, int(rows.max()) + 1)).values
         if rows.size == len(block) and rows[0] == first and np.all(np.diff(rows) == 1):
@@ -264,7 +264,7 @@ class _Record:
 
 
 def _evened(height: NDArray[np.float32], y: Array) -> tuple[NDArray[np.float32], Array, int]:
-    """Put a line of NaN where one lacks; return heights, y, and how many lines are lost."""
+    """Insert a line of NaN for each missing line; return heights, y, and the number of missing lines."""
     steps = np.diff(y)
     pitch = float(np.median(steps))
     lacking = np.maximum(np.rint(steps / pitch).astype(np.int64) - 1, 0)
@@ -284,6 +284,6 @@ def _refuse_disorder(y: Array) -> None:
         k = int(np.argmax(steps <= 0))
         raise MethodError(
             f"expected y to rise from line to line; {behind} of {y.size} lines lie behind the one before them "
-            f"or on it, the first at {y[k]:.6f} m followed by {y[k + 1]:.6f} m. Is there noise on the encoder's "
-            "wires, did the axis stand or turn?"
+            f"or on it, the first at {y[k]:.6f} m followed by {y[k + 1]:.6f} m. Check the encoder "
+            "signal for noise, and whether the axis stopped or reversed."
         )

@@ -1,7 +1,7 @@
-"""Every warm scan of a campaign laid on its cold one: what the maps say, what it is worth, and why there is none.
+"""Registrations of all warm scans of a campaign onto their cold scans.
 
-Scans are read one at a time, artefact by artefact, while the last one is being registered: the campaign may be larger
-than memory.
+Scans are read one by one, artefact by artefact, while the previous one is registered: the campaign may be larger than
+memory.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ Scan = tuple[NDArray[np.float32], Array, Array, float]
 log = logging.getLogger(__name__)
 
 COARSE = 1.5
-"""Bending of a block over the noise of a point, beyond which registrations are said to be doubtful."""
+"""Ratio of the bending of a block to the noise of a point beyond which a note is given."""
 MAP_SIZE = 40
-"""Differences of surfaces are kept thinned to about so many places along both directions."""
+"""Number of points along both directions of the stored maps."""
 
 
 class Scans(Protocol):
-    """The scans of a campaign, each loaded when it is asked for."""
+    """The scans of a campaign, each loaded on request."""
 
     @property
     def cycles(self) -> int:
@@ -43,10 +43,10 @@ class Scans(Protocol):
 
     @property
     def artefacts(self) -> int:
-        """Places."""
+        """Number of artefacts."""
 
     def scan(self, cycle: int, artefact: int) -> Scan:
-        """Return heights (profile, point), x (point,), y (profile,), m, and time, s; MethodError says what is wrong."""
+        """Return heights (profile, point), x (point,), y (profile,), m, and time, s; MethodError if there is none."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Registrations:
     Attributes
     ----------
     cold : ndarray of int, (artefact,)
-        Cycle that the others are laid on; -1 where no cold scan is usable.
+        Cycle that the others are registered onto; -1 where no cold scan is usable.
     twist : ndarray, (cycle, artefact, 9)
         (T_Q, R_Q, drift per feed) at the map's origin; NaN where there is none.
     covariance : ndarray, (cycle, artefact, 9, 9)
@@ -66,7 +66,7 @@ class Registrations:
     bound : ndarray, (artefact, 9, 9)
         Covariance by surface and stated noise alone.
     reason : ndarray of str, (cycle, artefact)
-        Why there is none.
+        Why there is no registration; empty where there is one.
     quality : dict of str to ndarray, (cycle, artefact)
         residual_rms, noise_found, jitter_z, jitter_y (m), condition, points_used.
     time : ndarray, (cycle, artefact)
@@ -74,7 +74,7 @@ class Registrations:
     maps : list of Maps or None
         By artefact.
     notes : list of str
-        What to know of them.
+        Notes for the user.
     """
 
     cold: NDArray[np.int64]
@@ -88,16 +88,16 @@ class Registrations:
     maps: list[Maps | None] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def without(self, gone: NDArray[np.bool_]) -> Registrations:
+    def without(self, excluded: NDArray[np.bool_]) -> Registrations:
         """Return these with NaN for some, (cycle, artefact)."""
         twist, covariance = self.twist.copy(), self.covariance.copy()
-        twist[gone], covariance[gone] = np.nan, np.nan
+        twist[excluded], covariance[excluded] = np.nan, np.nan
         return replace(self, twist=twist, covariance=covariance)
 
 
 @dataclass
 class Maps:
-    """Thinned maps of one artefact: places (m), cold heights, and warm minus cold before and after registration, m."""
+    """Thinned maps of one artefact, m: positions, cold heights, warm minus cold before and after registration."""
 
     x: Array
     y: Array
@@ -110,13 +110,13 @@ QUALITY = ("residual_rms", "noise_found", "jitter_z", "jitter_y", "condition", "
 
 
 def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, settings: Settings) -> Registrations:
-    """Lay every scan on the first usable cold scan of its artefact.
+    """Register every scan onto the first usable cold scan of its artefact.
 
     Parameters
     ----------
     scans : Scans
     cold_cycles : sequence of int
-        Cycles that may serve as reference, the one to prefer first.
+        Cycles that may be the reference, in order of preference.
     height_noise : float
         Stated standard deviation of one height, m: for the bound.
     settings : Settings
@@ -147,7 +147,7 @@ def _artefact(
     maps: Maps | None = None
     for cycle, scan in zip(order, _ahead(scans, order, k), strict=True):
         if cold is None and cycle not in cold_cycles:
-            found.reason[cycle, k] = "there is no cold scan to lay it on"
+            found.reason[cycle, k] = "there is no cold scan to register it onto"
             continue
         try:
             if isinstance(scan, MethodError):
@@ -165,10 +165,10 @@ def _artefact(
                 found.quality["noise_found"][cycle, k] = cold.noise
                 found.quality["points_used"][cycle, k] = cold.points.sum()
                 continue
-            result = _lay(cold, warm, settings)
-            _keep(result, found, cycle, k)
-            _keep_maps(maps, cold, warm, result, cycle)
-            _judge(result, warm, found.quality, cycle, k)
+            result = _register(cold, warm, settings)
+            _store(result, found, cycle, k)
+            _store_maps(maps, cold, warm, result, cycle)
+            _store_quality(result, warm, found.quality, cycle, k)
         except MethodError as error:
             found.reason[cycle, k] = str(error)
             log.warning("cycle %d, artefact %d: %s", cycle, k, error)
@@ -176,18 +176,18 @@ def _artefact(
 
 
 def _coarse(cold: BlockMap, artefact: int) -> list[str]:
-    """Return what to say of points that are too far apart for the relief."""
+    """Return a note if the points are too far apart for the relief."""
     if cold.bending < COARSE * cold.noise:
         return []
     return [
         f"Artefact {artefact + 1}: blocks of 16 points and 4 lines are bent by {cold.bending * 1e6:.1f} um, where the "
-        f"noise is {cold.noise * 1e6:.1f} um; the uncertainty of its registrations may be stated too small. Take "
-        "points and lines closer to one another, or a smoother artefact."
+        f"noise is {cold.noise * 1e6:.1f} um; the stated uncertainty of its registrations may be too small. "
+        "Reduce the pitch of points and lines, or use a smoother artefact."
     ]
 
 
 def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan | MethodError]:
-    """Yield scans, the next one being loaded meanwhile."""
+    """Yield scans; the next one is loaded meanwhile."""
 
     def load(cycle: int) -> Scan | MethodError:
         try:
@@ -204,7 +204,7 @@ def _ahead(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[Scan 
         yield coming.result()
 
 
-def _lay(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
+def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
     extra: dict[str, float] = {}
     if settings.registration == "height_map":
         if settings.strain != "rigid":
@@ -219,8 +219,8 @@ def _lay(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
     )  # fmt: skip
 
 
-def _keep(result: Registration, found: Registrations, cycle: int, k: int) -> None:
-    """Take over the twist and the drift along the feed; what is not a parameter is 0 and certain."""
+def _store(result: Registration, found: Registrations, cycle: int, k: int) -> None:
+    """Store the twist and the drift along the feed; where it is no parameter, the drift is 0 without uncertainty."""
     names = [name for name in FEED if name in result.extra_names]
     chosen = [*range(6), *(6 + result.extra_names.index(name) for name in names)]
     there = [*range(6), *(6 + FEED.index(name) for name in names)]
@@ -231,7 +231,7 @@ def _keep(result: Registration, found: Registrations, cycle: int, k: int) -> Non
     found.cold_share[cycle, k] = result.cold_share
 
 
-def _judge(result: Registration, warm: BlockMap, quality: dict[str, Array], cycle: int, k: int) -> None:
+def _store_quality(result: Registration, warm: BlockMap, quality: dict[str, Array], cycle: int, k: int) -> None:
     values: dict[str, Any] = {
         "residual_rms": result.rms,
         "noise_found": warm.noise,
@@ -276,7 +276,7 @@ def _thin(block_map: BlockMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows, columns
 
 
-def _keep_maps(maps: Maps | None, cold: BlockMap, warm: BlockMap, result: Registration, cycle: int) -> None:
+def _store_maps(maps: Maps | None, cold: BlockMap, warm: BlockMap, result: Registration, cycle: int) -> None:
     if maps is None or result.residual.size == 0:
         return
     rows, columns = _thin(warm)

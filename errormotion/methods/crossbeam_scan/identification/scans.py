@@ -15,11 +15,11 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.arrays import Array
 from errormotion.datasets import DOF, build_errors, provenance
 from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, ArtefactCheck, check_artefacts
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig, carriage
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.curves import curves
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
-from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, Trust, judge
 from errormotion.methods.crossbeam_scan.identification.registrations import Maps, Registrations, register_all
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _METRES = {"units": "m"}
-_SPOILT = 10.0
-"""EYY that is so many times less certain than EXY and EZY is worth a note."""
+DOMINANCE = 10.0
+"""A note is given if the uncertainty of EYY exceeds that of EXY and EZY by this factor."""
 _STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]
 
 
@@ -48,40 +48,42 @@ def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: st
     Raises
     ------
     MethodError
-        Not one scan could be registered; the reasons are named.
+        No scan could be registered; the reasons are named.
     """
     scans = Scans(raw)
-    places = np.asarray(raw["position"].values, dtype=float)
-    if np.any(np.diff(places) <= 0):
-        raise MethodError(f"position: expected places of the artefacts that rise; found {places.tolist()} m")
+    positions = np.asarray(raw["position"].values, dtype=float)
+    if np.any(np.diff(positions) <= 0):
+        raise MethodError(f"position: expected positions of the artefacts that rise; found {positions.tolist()} m")
     cold = cold_cycles(raw, scans.cycles)
-    # The hash of the raw data reads all of it once more: meanwhile scans are registered.
+    # The hash reads all raw data once more; meanwhile the scans are registered.
     with ThreadPoolExecutor(1) as pool:
         origin = pool.submit(provenance.make, settings, raw, None, steps=_STEPS)
         found = register_all(scans, cold, float(raw["height_noise"]), settings)
     rig = rig_of(raw)
-    axis = carriage(found, places, rig, guide=None)
+    axis = carriage(found, positions, rig, guide=None)
     warm = [c for c in range(scans.cycles) if c not in cold]
     if not warm:
         raise MethodError(f"Expected warm scans after the cold ones; found {scans.cycles} cycles, all of them cold")
     if not np.isfinite(axis.values[warm]).any():
         reasons = sorted({reason for reason in found.reason.ravel() if reason})
         raise MethodError(
-            f"Not one of {len(warm) * places.size} warm scans could be laid on its cold one: " + "; ".join(reasons[:3])
+            f"None of {len(warm) * positions.size} warm scans could be registered onto its cold scan: "
+            + "; ".join(reasons[:3])
         )
     rows = [cold[0], *warm]
     time = cycle_times(found.time, rows, _planned(raw, scans.cycles))
-    trust = judge(axis, found, settings, places, time[1:], cold, warm)  # each by itself: a guide joins neighbours
+    # Before a guide couples neighbours.
+    check = check_artefacts(axis, found, settings, positions, time[1:], cold, warm)
     if settings.strain == "guided":
-        gone = trust.wrong & (settings.moved == "exclude")
-        axis = carriage(found.without(gone), places, rig, guide=settings.guide_uncertainty)
+        excluded = check.wrong & (settings.moved == "exclude")
+        axis = carriage(found.without(excluded), positions, rig, guide=settings.guide_uncertainty)
     return _dataset(
-        raw, settings, method, version, found, axis, rig, trust, cold, rows, time, scans.notes, origin.result()
+        raw, settings, method, version, found, axis, rig, check, cold, rows, time, scans.notes, origin.result()
     )
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
-    """Return the cycles without a warm-up before them: cycle 0, and those that ``warm_up`` says."""
+    """Return the cycles without a warm-up before them: cycle 0, and those whose ``warm_up`` is 0."""
     if "warm_up" not in raw:
         return [0]
     warm_up = np.asarray(raw["warm_up"].values, dtype=float)[:cycles]
@@ -89,7 +91,7 @@ def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
 
 
 def rig_of(raw: xr.Dataset) -> Rig:
-    """Return how the profiler hangs on the carriage, as a raw dataset states it."""
+    """Return pose and lever as a raw dataset states them."""
     matrix = np.asarray(raw["profiler_pose"].transpose("row", "column").values, dtype=float)
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(matrix[:3, :3]) < 0:
         raise MethodError("profiler_pose: expected a rotation in its first three rows and columns; found none")
@@ -114,33 +116,33 @@ def _dataset(
     found: Registrations,
     axis: Carriage,
     rig: Rig,
-    trust: Trust,
+    check: ArtefactCheck,
     cold: list[int],
     rows: list[int],
     time: Array,
-    mended: list[str],
+    corrected: list[str],
     origin: Mapping[str, Any],
 ) -> xr.Dataset:
     warm = rows[1:]
     place = np.asarray(raw["position"].values, dtype=float)
     reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
     values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
-    values[0] = np.where(reference[:, None], 0.0, np.nan)  # whichever cold scan the others are laid on
+    values[0] = np.where(reference[:, None], 0.0, np.nan)  # for any choice of the cold scan
     own[0] = np.where(reference[:, None, None], 0.0, np.nan)
     influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
     reason = found.reason[rows]
     reason[0, reference] = ""
     if settings.moved == "exclude":
-        gone = trust.wrong[rows]
-        values[gone], own[gone], influence[:, gone] = np.nan, np.nan, np.nan
-        reason[gone] = MOVED
-    notes = [*_notes(reason, place, rig), *trust.notes, *mended]
+        excluded = check.wrong[rows]
+        values[excluded], own[excluded], influence[:, excluded] = np.nan, np.nan, np.nan
+        reason[excluded] = MOVED
+    notes = [*_notes(reason, place, rig), *check.notes, *corrected]
     notes += found.notes
     if settings.strain == "free":
         notes += _pitch_note(own)
     for note in notes:
         log.warning(note)
-    curve = curves(axis, found, rig, place, time[1:], warm, trust.wrong)
+    curve = curves(axis, found, rig, place, time[1:], warm, check.wrong)
     rig_share = influence[: len(SOURCES)]  # the noise of the cold scans is in `own` already
     total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
     ds = build_errors(
@@ -159,16 +161,16 @@ def _dataset(
         influence=influence,
         sources=axis.sources,
         source_groups=axis.source_groups,
-        extras=_extras(found, axis, rig, rows, cold, reason, own, curve | trust.extras()),
+        extras=_extras(found, axis, rig, rows, cold, reason, own, curve | check.extras()),
     )
     return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
 
 
 def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:
-    """Return the time of every cycle, s since the warm-up began: the middle of its scans; the cold one is 0.
+    """Return the time of every cycle, s since the warm-up started: the mean of its scans; the cold one is 0.
 
-    A cycle without a scan is put between its neighbours, or behind the last one, as it was ``planned`` (cycle,); evenly
-    where no plan is known.
+    The time of a cycle without a scan is interpolated between its neighbours, or extrapolated, by the ``planned`` times
+    (cycle,); evenly where no plan is known.
     """
     time = np.array([np.nanmean(scan_time[c]) if np.isfinite(scan_time[c]).any() else np.nan for c in rows])
     first = max(time[0], 0.0) if np.isfinite(time[0]) else 0.0
@@ -199,25 +201,25 @@ def _notes(reason: NDArray[np.object_], place: Array, rig: Rig) -> list[str]:
     if len(lost):
         where = sorted({f"{place[k]:g} m" for _, k in lost}, key=lambda text: float(text.split()[0]))
         notes.append(
-            f"{len(lost)} of {reason[1:].size} warm scans gave no errors (at {', '.join(where)}); the table of "
-            "registrations says why."
+            f"{len(lost)} of {reason[1:].size} warm scans have no errors (at {', '.join(where)}); the variable "
+            "`reason` states why."
         )
     if rig.pose_covariance is None:
-        notes.append("The pose of the profiler is taken as exact: the raw dataset states no pose_covariance.")
+        notes.append("The pose of the profiler is assumed exact: the raw dataset states no pose_covariance.")
     if not rig.lever_uncertainty.any():
-        notes.append("The lever is taken as exact: the raw dataset states no lever_uncertainty.")
+        notes.append("The lever is assumed exact: the raw dataset states no lever_uncertainty.")
     return notes
 
 
 def _pitch_note(own: Array) -> list[str]:
-    """Return what to do where the pitch, told by the relief alone, spoils EYY over the lever."""
+    """Return a note if the pitch, determined by the relief alone, dominates the uncertainty of EYY over the lever."""
     u = np.sqrt(np.nanmedian(np.diagonal(own[1:], axis1=-2, axis2=-1), axis=(0, 1)))
-    if not u[1] > _SPOILT * u[[0, 2]].max():
+    if not u[1] > DOMINANCE * u[[0, 2]].max():
         return []
     return [
-        f"EYY is known to {u[1] * 1e6:.1f} um only (standard uncertainty): the pitch EAY ({u[3] * 1e6:.1f} urad) is "
-        "told by the artefacts' relief alone and acts over the lever. Both together are known far better, so move "
-        "the errors to the tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' says more."
+        f"The standard uncertainty of EYY is {u[1] * 1e6:.1f} um: the pitch EAY ({u[3] * 1e6:.1f} urad) is determined "
+        "by the relief of the artefacts alone and acts over the lever. Both are correlated: state the errors at the "
+        "tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' gives smaller uncertainties."
     ]
 
 

@@ -6,7 +6,7 @@ unknown, the amplitude of that noise: 0 is a polynomial of degree order - 1, inf
 sets it: curves of all amplitudes are averaged, each weighted by its evidence (the marginal likelihood of the points). A
 single best amplitude is 0 for about every other set of eight points, and its band then holds too little.
 
-What the virtual gantry says of the choices (eight places, nine times, leaving one point out each time):
+Results of the choices on the virtual gantry (eight positions, nine times, leaving one point out each time):
 
 * Order 3 predicts the point that was left out far better than order 2, and its band is half as wide. A beam in a smooth
   field of temperature has a continuous curvature, which order 3 grants and order 2 does not.
@@ -37,7 +37,7 @@ TURN = 1500.0
 
 #: amplitudes that are looked at, and that are averaged
 _LOOKED_AT, _AVERAGED = 400, 24
-#: the amplitude ends below where it could be told from none, and above where the evidence falls for good
+#: the amplitude ends below where it is not distinguishable from zero, and above where the evidence decreases
 _BELOW, _ABOVE = 1e-2, 1e2
 #: amplitudes with less than this of the best evidence do not matter
 _NEGLIGIBLE = 1e-5
@@ -45,7 +45,7 @@ _NEGLIGIBLE = 1e-5
 
 @dataclass(frozen=True)
 class Smooth:
-    """Curves at the places asked for; NaN where the points do not determine them.
+    """Curves at the positions requested; NaN where the points do not determine them.
 
     Attributes
     ----------
@@ -54,12 +54,12 @@ class Smooth:
     weights : ndarray, (..., m, n)
         The curve is ``weights @ values`` of the points; 0 for a point that is NaN.
     amplitude : ndarray, (...)
-        Of the white noise, best by evidence, in units of the value per place**(order - 1/2) of the more likely order;
-        0: a polynomial.
+        Of the white noise, best by evidence, in units of the value per position**(order - 1/2) of the more likely
+        order; 0: a polynomial.
     evidence : ndarray, (...)
         Log of the likelihood of that amplitude over that of a polynomial; 0 where a polynomial is enough.
     log_likelihood : ndarray, (...)
-        Of that amplitude, comparable between points at the same ``places`` with others of them left out. Curves that
+        Of that amplitude, comparable between points at the same ``positions`` with others of them left out. Curves that
         share an amplitude share this and the evidence.
     rough : ndarray, (...)
         Probability of the lower order.
@@ -87,14 +87,14 @@ class Smooth:
 
 @dataclass(frozen=True)
 class SmoothTwists:
-    """Curves of six freedoms at the places asked for.
+    """Curves of six freedoms at the positions requested.
 
     Attributes
     ----------
     values : ndarray, (..., m, 6)
         m and rad.
     covariance : ndarray, (..., m, 6, 6)
-        Between the freedoms at each place.
+        Between the freedoms at each position.
     freedoms : Smooth
         The curves one by one, (..., 6, m).
     """
@@ -115,7 +115,7 @@ def warm_up_scale(time: ArrayLike) -> Array:
 
 
 def smooth(
-    places: ArrayLike,
+    positions: ArrayLike,
     values: ArrayLike,
     variance: ArrayLike,
     at: ArrayLike,
@@ -129,14 +129,14 @@ def smooth(
 
     Parameters
     ----------
-    places : (n,)
+    positions : (n,)
         Of the points: position, or time on the `warm_up_scale`.
     values, variance : (..., n)
         Points, and the variance of what is independent between them; NaN for a point that is not there.
     at : (m,)
-        Where the curves are asked for.
+        Where the curves are requested.
     exact_zero : bool
-        Whether all curves begin at place 0 with value 0; places below 0 are then taken as 0.
+        Whether all curves start at position 0 with value 0; positions below 0 are then taken as 0.
     together : bool
         Whether all curves share one amplitude.
     order : {1, 2, 3}, optional
@@ -147,7 +147,7 @@ def smooth(
     Returns
     -------
     Smooth
-        A curve needs ``order`` points at different places (one less with ``exact_zero``) to be determined, and one of
+        A curve needs ``order`` points at different positions (one less with ``exact_zero``) to be determined, one of
         those that share an amplitude needs one more for evidence on it; without these it is NaN. The variance is that
         of a mixture over amplitudes: with one or two points more than the order it is very wide.
 
@@ -156,7 +156,7 @@ def smooth(
     MethodError
         Shapes that do not fit, a variance that is not above 0, an order that there is not.
     """
-    x, y, v, to = (np.asarray(given, dtype=float) for given in (places, values, variance, at))
+    x, y, v, to = (np.asarray(given, dtype=float) for given in (positions, values, variance, at))
     _check(x, y, v, to, exact_zero)
     batch, n = y.shape[:-1], x.size
     y, v = y.reshape(prod(batch), n), v.reshape(prod(batch), n)
@@ -199,7 +199,7 @@ def smooth(
 
 
 def smooth_twists(
-    places: ArrayLike,
+    positions: ArrayLike,
     values: ArrayLike,
     covariance: ArrayLike,
     at: ArrayLike,
@@ -215,12 +215,12 @@ def smooth_twists(
 
     Parameters
     ----------
-    places : (n,)
+    positions : (n,)
         Of the points: position, or time on the `warm_up_scale`.
     values, covariance : (..., n, 6), (..., n, 6, 6)
         Twists, m and rad, and the covariance of what is independent between them; NaN for a freedom that is not there.
     at : (m,)
-        Where the curves are asked for.
+        Where the curves are requested.
     exact_zero, order
         As in `smooth`.
 
@@ -233,7 +233,8 @@ def smooth_twists(
     if y.ndim < 2 or y.shape[-1] != 6 or C.shape != (*y.shape, 6):
         raise MethodError(f"Twists need values (..., n, 6) and covariance (..., n, 6, 6); found {y.shape}, {C.shape}.")
     each = [
-        smooth(places, y[..., d], C[..., d, d], at, exact_zero=exact_zero, together=True, order=order) for d in range(6)
+        smooth(positions, y[..., d], C[..., d, d], at, exact_zero=exact_zero, together=True, order=order)
+        for d in range(6)
     ]
     batch = y.ndim - 2
     merged = Smooth(
@@ -249,7 +250,7 @@ def smooth_twists(
     )
     W = merged.weights  # (..., 6, m, n)
     noise = np.einsum("...imn,...nij,...jmn->...mij", W, np.nan_to_num(C), W)
-    own = np.swapaxes(merged.variance, -1, -2) - np.diagonal(noise, axis1=-2, axis2=-1)  # of the curves beside noise
+    own = np.swapaxes(merged.variance, -1, -2) - np.diagonal(noise, axis1=-2, axis2=-1)  # of the curves without noise
     total = noise + np.maximum(own, 0.0)[..., None] * np.eye(6)
     return SmoothTwists(np.swapaxes(merged.values, -1, -2), total, merged)
 
@@ -258,25 +259,25 @@ def _check(x: Array, y: Array, v: Array, to: Array, exact_zero: bool) -> None:
     """Raise MethodError where the arguments of `smooth` do not fit."""
     if x.ndim != 1 or to.ndim != 1 or y.shape[-1:] != x.shape or v.shape != y.shape:
         raise MethodError(
-            "Smoothing needs places (n,), values and variance (..., n), and where to (m,); found "
+            "Smoothing needs positions (n,), values and variance (..., n), and where to (m,); found "
             f"{x.shape}, {y.shape}, {v.shape} and {to.shape}."
         )
     if not (np.isfinite(x).all() and np.isfinite(to).all()):
-        raise MethodError("Places must be finite numbers; a point that is not there has a NaN value.")
+        raise MethodError("Positions must be finite numbers; a point that is not there has a NaN value.")
     if exact_zero and (x <= 0).any():
-        raise MethodError(f"Points of curves that begin at place 0 lie above 0; found {x.min():g}.")
+        raise MethodError(f"Points of curves that start at position 0 lie above 0; found {x.min():g}.")
 
 
 @dataclass(frozen=True)
 class _Basis:
-    """Polynomials and covariances of integrated noise of amplitude 1, places over their span."""
+    """Polynomials and covariances of integrated noise of amplitude 1, positions over their span."""
 
     unit: float  # of amplitudes
     T: Array  # polynomials at the points, (n, p)
     K: Array  # covariance of the points, (n, n)
     T_at: Array  # (m, p)
-    K_at: Array  # of the places asked for with the points, (m, n)
-    own: Array  # variance at the places asked for, (m,)
+    K_at: Array  # of the positions requested with the points, (m, n)
+    own: Array  # variance at the positions requested, (m,)
 
     @classmethod
     def of(cls, x: Array, to: Array, free: int, order: int, exact_zero: bool) -> _Basis:
@@ -300,11 +301,11 @@ def _integrated(s: Array, t: Array, order: int) -> Array:
 
 @dataclass(frozen=True)
 class _Design:
-    """What points at known places with known noise say of a curve, whatever their values.
+    """Information of points at known positions with known noise about a curve, independent of their values.
 
     In units of its noise, a set of points is what a polynomial fits, and contrasts that no polynomial moves:
     uncorrelated combinations of the points, of variance 1 + amplitude * gain. A curve is the polynomial fitted, plus
-    the reach of the contrasts to the places asked for. (Keeping the two apart is accurate where the noise is tiny.)
+    the reach of the contrasts to the positions requested. (Keeping the two apart is accurate where the noise is tiny.)
     """
 
     known: NDArray[np.bool_]
@@ -352,7 +353,7 @@ class _Series:
         self.contrast = self.design.to_contrast @ self.y
 
     def log_likelihood(self, amplitudes: Array) -> Array:
-        """Return that of each amplitude, whatever the polynomial."""
+        """Return that of each amplitude, for any polynomial."""
         grown = 1 + amplitudes[:, None] * self.design.gain
         return np.asarray(self.design.unit - (self.contrast**2 / grown + np.log(grown)).sum(axis=1) / 2)
 
@@ -383,7 +384,7 @@ def _series(basis: _Basis, y: Array, v: Array, known: NDArray[np.bool_], rows: N
 
 
 def _weigh_all(ways: list[list[_Series]]) -> Array:
-    """Return how likely each order is for the curves of a group, (order,); nothing where nothing tells."""
+    """Return how likely each order is for the curves of a group, (order,); empty without contrasts."""
     if not sum(one.contrast.size for one in ways[0]):
         return np.empty(0)
     log = np.array([_weigh(group) for group in ways])

@@ -1,4 +1,4 @@
-"""From what the maps say to how the profiler moved: a scan is no rigid picture, because the carriage turns on its way.
+"""From registered maps to the motion of the profiler: a scan is not rigid, because the carriage turns during the feed.
 
 A line at the feed s shows (x, 0, z) in the profiler's frame. In the cold frame of the artefact's middle it lies at
 (x, 0, z) + s f, with f the feed's direction. What is registered is the map Q = (x, s, z), so P = B Q with
@@ -12,7 +12,7 @@ displacements c per metre of feed. By equal coefficients of 1, x, z and s,
 
     EC = f_y EC_Q,   EA = f_y EA_Q,   EB = EB_Q - f_z EC_Q,   T = B T_Q,   g = B (c + R_Q x e_y) .
 
-A line shows nothing of its own yaw and pitch but what its relief tells: pitch EA moves a point along the feed by -z EA.
+A line determines its own yaw and pitch by its relief alone: pitch EA moves a point along the feed by -z EA.
 A rigid picture would show both by its slope along the feed, but that is g, and the carriage may turn without it. Where
 the carriage follows a guide, pitch and yaw are the slopes of the guide, EA = dEZ/dY and EC = -dEX/dY: `guided` adds
 this with a stated uncertainty, the slopes being those of a spline through the artefacts.
@@ -77,15 +77,15 @@ def from_maps(profiler_pose: RigidTransform) -> Array:
     return W
 
 
-def slopes(places: ArrayLike) -> tuple[Array, Array]:
-    """Return two matrices (n, n) that take values at places to their slopes there: by a cubic spline, and by less.
+def slopes(positions: ArrayLike) -> tuple[Array, Array]:
+    """Return two matrices (n, n) from values at positions to their slopes: by a cubic spline, and by differences.
 
-    The second uses one neighbour on each side; for two places it says 0. Its difference from the first is a measure of
-    what the first misses.
+    The second uses one neighbour on each side; for two positions it is 0. Its difference from the first is a measure of
+    the error of the first.
     """
     from scipy.interpolate import CubicSpline
 
-    y = np.asarray(places, dtype=float)
+    y = np.asarray(positions, dtype=float)
     n = y.size
     if n < 2:
         return np.zeros((n, n)), np.zeros((n, n))
@@ -96,26 +96,26 @@ def slopes(places: ArrayLike) -> tuple[Array, Array]:
 
 
 def guided(
-    twist: ArrayLike, covariance: ArrayLike, places: ArrayLike, to_carriage: ArrayLike, uncertainty: float
+    twist: ArrayLike, covariance: ArrayLike, positions: ArrayLike, to_carriage: ArrayLike, uncertainty: float
 ) -> Guided:
-    """Return the twists of one cycle when pitch and yaw of the carriage follow the guide: least squares of all places.
+    """Return the twists of one cycle by least squares, with pitch and yaw of the carriage following the guide.
 
     Parameters
     ----------
     twist, covariance : (n, 6), (n, 6, 6)
         (T, r) of every artefact by its registration alone, m and rad.
-    places : (n,)
+    positions : (n,)
         Of the artefacts along the axis, m, rising.
     to_carriage : (6, 6)
         Takes twists of the profiler to errors of the carriage.
     uncertainty : float
-        Standard uncertainty of EA - dEZ/dY and of EC + dEX/dY, rad. What the spline misses of the slopes is added.
+        Standard uncertainty of EA - dEZ/dY and of EC + dEX/dY, rad. The error of the spline's slopes is added.
     """
     e, C, A = (np.asarray(value, dtype=float) for value in (twist, covariance, to_carriage))
     n = len(e)
     if n < 2:
         return Guided(e.copy(), C.copy(), np.eye(6 * n), np.zeros(2))
-    fine, coarse = slopes(places)
+    fine, coarse = slopes(positions)
     E = e @ A.T
     rows, errors = np.zeros((2, n, n, 6)), np.zeros(2)
     missed = fine - coarse

@@ -104,18 +104,20 @@ def _extent(seen: Campaign, i: int) -> float:
 
 def _what_was_done(seen: Campaign) -> str:
     n, position = seen.position.size, np.sort(seen.position)
-    places = f"one artefact at {at_y(position[0])}"
+    positions = f"one artefact at {at_y(position[0])}"
     if n > 1:
-        places = f"{n} artefacts from {at_y(position[0])} to {at_y(position[-1])}"
+        positions = f"{n} artefacts from {at_y(position[0])} to {at_y(position[-1])}"
     times = seen.time[seen.warm]
     cycles = f"once, after {after(times[0])} of warm-up"
     if times.size > 1:
         cycles = f"{times.size} times between {after(times[0])} and {after(times[-1])} of warm-up"
-    return f"A line profiler scanned {places} cold and then {cycles}; each warm scan was registered onto the cold one."
+    return (
+        f"A line profiler scanned {positions} cold and then {cycles}; each warm scan was registered onto the cold one."
+    )
 
 
 def _still_moving(seen: Campaign, i: int, artefact: int) -> list[str]:
-    """Say what the error with the largest value did between the last two cycles."""
+    """Return the change of the largest error between the last two cycles."""
     last = [int(k) for k in seen.warm if math.isfinite(seen.values[k, artefact, i])][-2:]
     if len(last) < 2:
         return []
@@ -136,15 +138,15 @@ def _still_moving(seen: Campaign, i: int, artefact: int) -> list[str]:
 
 
 def _holes(seen: Campaign) -> list[str]:
-    told: dict[str, list[str]] = {}
+    by_reason: dict[str, list[str]] = {}
     for k in seen.warm:
         for j in np.flatnonzero(~seen.known[k]):
-            told.setdefault(str(seen.reason[k, j]), []).append(seen.where(int(k), int(j)))
+            by_reason.setdefault(str(seen.reason[k, j]), []).append(seen.where(int(k), int(j)))
     words = []
-    for reason, places in told.items():
-        shown = "; ".join(places[:3]) + (f"; and {len(places) - 3} more" if len(places) > 3 else "")
+    for reason, positions in by_reason.items():
+        shown = "; ".join(positions[:3]) + (f"; and {len(positions) - 3} more" if len(positions) > 3 else "")
         words.append(f"No value at {shown}: {reason}.")
-    return words[:6] + ([f"{len(words) - 6} further reasons stand under quality."] if len(words) > 6 else [])
+    return words[:6] + ([f"{len(words) - 6} further reasons are listed under quality."] if len(words) > 6 else [])
 
 
 def _errors(seen: Campaign, key: str) -> list[Block]:
@@ -173,7 +175,7 @@ def _last(seen: Campaign) -> Table:
 def _uncertainty(seen: Campaign) -> list[Block]:
     place = seen.shown()
     if place is None:
-        return [Text("There is no value to state an uncertainty of.", "warning")]
+        return [Text("There is no value.", "warning")]
     there = seen.errors.isel(time=place[0], position=place[1])
     point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(seen.errors.attrs["functional_point"]))
     return [
@@ -182,7 +184,7 @@ def _uncertainty(seen: Campaign) -> list[Block]:
         Text(
             f"Functional point ({point}) mm in the frame '{seen.errors.attrs.get('frame', 'not stated')}'. Pose and "
             "lever are one draw for all values; the cold scan of an artefact is one for all its warm scans. "
-            "Differences take that into account. The budget covers the sources that it names and no others.",
+            "Differences take that into account. The budget covers the named sources only.",
             "note",
         ),
     ]

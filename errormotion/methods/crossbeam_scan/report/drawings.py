@@ -203,7 +203,7 @@ def _six(
     *,
     right: float = 0.0,
 ) -> Markup:
-    """Return six panels, displacements above rotations; those that are not observed say so."""
+    """Return six panels, displacements above rotations; those that are not observed are labelled."""
     foot = _FOOT + (_LEGEND + 0.17 * ((len(legend) - 1) // 10) if legend else 0.0)
     high = _HEAD + 2 * _ROW + _GAP + foot
     panel = (canvas.WIDTH - _LEFT - 2 * _BETWEEN - _END - 3 * right) / 3

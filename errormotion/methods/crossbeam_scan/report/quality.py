@@ -31,7 +31,7 @@ def made(seen: Campaign) -> tuple[int, int]:
 
 
 def lost(seen: Campaign) -> str:
-    """Say how many registrations are missing and why; empty where none is."""
+    """Return how many registrations are missing, by reason; empty where none is."""
     holes, absent = ~seen.known[seen.warm], seen.absent[seen.warm]
     silent = holes & ~absent & (seen.reason[seen.warm] == NO_REASON)
     kinds = (
@@ -141,10 +141,13 @@ def _by_cycle(seen: Campaign) -> Table:
         worst = [finite(np.min if i == 5 else np.max, column) for i, column in enumerate(each.T)]
         rows.append([of_cycle, *_cells(np.array(worst))])
     holes = [(k, j) for k in seen.warm for j in range(seen.position.size) if not seen.known[k, j]]
-    told: dict[str, list[str]] = {}
+    by_reason: dict[str, list[str]] = {}
     for k, j in holes:
-        told.setdefault(str(seen.reason[k, j]), []).append(seen.where(k, j))
-    notes = [f"{reason}: {'; '.join(places[:6])}{' …' if len(places) > 6 else ''}." for reason, places in told.items()]
+        by_reason.setdefault(str(seen.reason[k, j]), []).append(seen.where(k, j))
+    notes = [
+        f"{reason}: {'; '.join(positions[:6])}{' …' if len(positions) > 6 else ''}."
+        for reason, positions in by_reason.items()
+    ]
     return Table(
         "Quality of the registrations: the worst of each cycle (of the points: the fewest), and how many were made.",
         ["cycle", *_HEAD, *_JITTER],
@@ -168,7 +171,7 @@ def _drift(seen: Campaign) -> Text | None:
 
 
 def stability(seen: Campaign) -> list[Block]:
-    """Return whether artefacts stood still: what the cold repeats say, and what was found to have moved."""
+    """Return the result of the cold repeats and of the check for moved artefacts."""
     found: list[Block] = [*_moved(seen)]
     repeat = _repeats(seen)
     if repeat is None:
@@ -178,24 +181,24 @@ def stability(seen: Campaign) -> list[Block]:
 
 def _moved(seen: Campaign) -> list[Block]:
     if "moved" not in seen.errors or seen.errors["moved"].dims != ("position",):
-        return [Text("The result does not say whether artefacts moved.", "note")]
+        return [Text("The result does not state whether artefacts moved.", "note")]
     moved = np.nan_to_num(np.asarray(seen.errors["moved"].values, float)).astype(bool)
     if not moved.any():
         return [Text("No artefact was found to have moved on the table.")]
     since = np.full(moved.size, np.nan)
     if "moved_since" in seen.errors and seen.errors["moved_since"].dims == ("position",):
         since = np.asarray(seen.errors["moved_since"].values, float)
-    told: list[Block] = []
+    warnings: list[Block] = []
     for j in np.flatnonzero(moved):
         when = f" since the scan at {after(since[j])}" if math.isfinite(since[j]) else ""
-        told.append(
+        warnings.append(
             Text(
                 f"The artefact at {at_y(seen.position[j])} moved on the table{when}. From then on its values "
-                "hold that movement beside the error of the axis.",
+                "contain that movement in addition to the error of the axis.",
                 "warning",
             )
         )
-    return told
+    return warnings
 
 
 def _repeats(seen: Campaign) -> list[Block] | None:

@@ -1,4 +1,4 @@
-"""One registration as a picture: the cold surface, and what is left of warm minus cold before and after."""
+"""Figure of one registration: the cold surface, and warm minus cold before and after."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
     if math.isfinite(noise):
         words += f"; noise of a point {_length(noise)}"
     turned = _wrong_pose(seen, cycle, artefact)
-    words += ". The residual is what noise and jitter leave of two scans, and says nothing about the pose"
+    words += (
+        ". The residual shows noise and jitter of two scans; it gives no information about the accuracy of the pose"
+    )
     if turned is not None:
         name, sigma, added = turned
         words += (
@@ -53,7 +55,7 @@ def _words(seen: Campaign, cycle: int, artefact: int) -> list[Block]:
             f"µrad, and a pose that is wrong by {_WRONG} times as much would bring the residual from "
             f"{_length(rms, 4)} to {_length(math.hypot(rms, added), 4)}"
         )
-    return [Text(f"{words}. What a registration is worth is stated by its covariance.")]
+    return [Text(f"{words}. The accuracy of a registration is stated by its covariance.")]
 
 
 def _wrong_pose(seen: Campaign, cycle: int, artefact: int) -> tuple[str, float, float] | None:

@@ -122,8 +122,8 @@ def _figure(seen: Campaign, setup: Setup, key: str) -> Figure:
     moved = _moved(seen)
     if moved.any():
         caption += " Vermillion: artefacts that moved."
-    places = ", ".join(f"{millimetres(value)} mm" for value in seen.position)
-    return Figure(canvas.draw(paint, key, tall), caption, f"Set-up in two views, artefacts at y = {places}.")
+    positions = ", ".join(f"{millimetres(value)} mm" for value in seen.position)
+    return Figure(canvas.draw(paint, key, tall), caption, f"Set-up in two views, artefacts at y = {positions}.")
 
 
 def _moved(seen: Campaign) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""What a campaign of crossbeam scans holds, as plain arrays over (time, position), whatever of it is missing."""
+"""A campaign of crossbeam scans as arrays over (time, position); any part may be missing."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def is_pose(errors: xr.Dataset) -> bool:
 
 @dataclass(frozen=True)
 class Campaign:
-    """The six errors of an axis over warm-up time and position, and what the method says of each.
+    """The six errors of an axis over warm-up time and position, with the statements of the method.
 
     Attributes
     ----------
     errors : Dataset
-        Where it comes from.
+        The error dataset.
     time : (t,)
         Warm-up time of each cycle, s.
     position : (p,)
@@ -114,7 +114,7 @@ class Campaign:
         return None
 
     def where(self, cycle: int, artefact: int) -> str:
-        """Return place and time of one registration in words."""
+        """Return position and time of one registration in words."""
         return f"{at_y(self.position[artefact])}, {after(self.time[cycle])}"
 
 
@@ -132,7 +132,7 @@ def campaign(errors: xr.Dataset) -> Campaign:
         scan_time = np.where(np.isfinite(stated), stated, scan_time)
     zero = np.nan_to_num(values) == 0
     reference = (zero & (np.nan_to_num(sigma) == 0)).all(axis=(1, 2)) & (time <= 0)
-    scan_time = np.where(reference[:, None], time[:, None], scan_time)  # the cold scan stands for time 0
+    scan_time = np.where(reference[:, None], time[:, None], scan_time)  # the cold scan is at time 0
     return Campaign(errors, time, _positions(errors), scan_time, values, sigma, _reasons(errors, values), reference)
 
 

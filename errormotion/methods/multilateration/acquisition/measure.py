@@ -1,8 +1,8 @@
-"""Measuring: a tracker at one place after the other, and for each the machine goes to all targets.
+"""Measurement: a tracker at one station after the other, and for each the machine goes to all targets.
 
-An interferometer counts from where its beam was last taken up. Where the beam breaks during a set-up, the count begins
-anew (Measurement.dead_path tells), and what was read before belongs to another dead path: these targets are visited
-once more. A set-up that comes again, because it was poor or because the settings say so, replaces the earlier one.
+An interferometer counts from the position at which its beam was last acquired. Where the beam breaks during a set-up,
+the count restarts (Measurement.dead_path), and earlier readings have another dead path: these targets are visited
+again. A repeated set-up, because it was poor or because of the settings, replaces the earlier one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NO_VALUE = "no value"
 _AIR = ("air_temperature", "air_pressure", "relative_humidity", "refractive_index")
 _UNITS = {"displacement": "m", "reading_time": "s", **dict(zip(_AIR, ("degC", "Pa", "1", "1"), strict=True))}
 LOST = "count lost"
-_POLL = 0.05  # s, real time
+_POLL_INTERVAL = 0.05  # s, real time
 _FIT = 4
 """Readings from which the tracker's place and direction are reckoned."""
 _FAR = 2.0
@@ -72,15 +72,15 @@ def measure_stations(
     stand = Stand(bench, settings, measuring or settings.measuring)
     held = deque(_held(done))
     if done is not None:
-        stand.air_told = _AIR[0] in done
+        stand.air_reported = _AIR[0] in done
     for number in stand.sequence:
         for _ in range(1 + stand.measuring.repeats):
             if held:
                 name, share = held.popleft()
                 if name != stand.names[number]:
                     raise MethodError(
-                        f"The set-ups that are there go on with {name}; expected {stand.names[number]}. Go on with "
-                        "the sequence that the run was begun with, or begin anew."
+                        f"The existing set-ups continue with {name}; expected {stand.names[number]}. Continue with "
+                        "the sequence with which the run was started, or start a new run."
                     )
             else:
                 chunk = stand.measure(number)
@@ -129,14 +129,14 @@ class Stand:
         self.tracker: Any = bench.of_kind("laser_tracker")
         if not hasattr(self.tracker, "measure"):
             raise MethodError(
-                "A tracker that measures one target at a time is needed (measure); found one that hands over what was "
-                "measured before. Make raw data of its table and identify those."
+                "Expected a tracker that measures one target at a time (measure); found one that reads earlier "
+                "measurements. Import its table and identify it."
             )
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
             raise MethodError(
-                "The machine is moved to the targets, which needs an instrument of kind 'controller' that can move "
-                "to a place (move_to); the bench has none. Export the tracker's readings as a table instead."
+                "Expected an instrument of kind 'controller' that can move the machine to a position (move_to); the "
+                "bench has none. Add it, or import a table of the tracker."
             )
         position, target = layout.grid(settings.layout)
         self.order = layout.route(settings.layout)
@@ -151,7 +151,7 @@ class Stand:
         if strange := [k for k in wanted if not 1 <= k <= len(self.station)]:
             raise MethodError(f"expected numbers of stations from 1 to {len(self.station)}; found {strange}")
         self.sequence = [k - 1 for k in wanted]
-        self.air_told: bool | None = None  # not known before the first set-up
+        self.air_reported: bool | None = None  # not known before the first set-up
         self.scales = Scales(bench, measuring.scale_sensors)
 
     def place(self, number: int) -> None:
@@ -162,8 +162,8 @@ class Stand:
             return
         where = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(self.station[number] * 1e3))
         self.bench.ask(
-            f"Station {self.names[number]}: put the tracker near {where} in the machine's coordinates, level it, turn "
-            "the reflector to it and let it take up the beam."
+            f"Station {self.names[number]}: set up the tracker near {where} in the machine's coordinates, level it, "
+            "turn the reflector to it and let it acquire the beam."
         )
 
     def move(self, i: int) -> None:
@@ -185,9 +185,9 @@ class Stand:
             if time.monotonic() > limit:
                 raise MethodError(
                     f"Target {i + 1}: the control is {off * 1e3:.4g} mm off after {self.measuring.timeout:g} s. Is the "
-                    "feed held, or the place out of travel?"
+                    "feed held, or the position out of travel?"
                 )
-            time.sleep(_POLL)
+            time.sleep(_POLL_INTERVAL)
         self.wait(self.measuring.settle)
 
     def wait(self, seconds: float) -> None:
@@ -237,7 +237,7 @@ class Stand:
             row = (reading.distance, when, air.temperature, air.pressure, air.humidity / 100, reading.refraction_index)
             for name, value in zip(_UNITS, row, strict=True):
                 values[name][i] = value
-        wanted = list(_UNITS) if self._tells_air(number, values) else ["displacement", "reading_time"]
+        wanted = list(_UNITS) if self._reports_air(number, values) else ["displacement", "reading_time"]
         variables: dict[str, Any] = {
             name: (("station", "target"), values[name][None], {"units": _UNITS[name]}) for name in wanted
         }
@@ -265,27 +265,27 @@ class Stand:
         }
         return xr.Dataset(variables, coords, attrs)
 
-    def _tells_air(self, number: int, values: dict[str, Array]) -> bool:
+    def _reports_air(self, number: int, values: dict[str, Array]) -> bool:
         """Return whether the state of the air is recorded: with all set-ups, or with none."""
         read = np.isfinite(values["displacement"])
-        told = all(np.isfinite(values[name][read]).all() for name in _AIR)
-        if self.air_told is None:
-            self.air_told = told and bool(read.any())
-        if self.air_told and not told:
+        reported = all(np.isfinite(values[name][read]).all() for name in _AIR)
+        if self.air_reported is None:
+            self.air_reported = reported and bool(read.any())
+        if self.air_reported and not reported:
             raise MethodError(
-                f"Station {self.names[number]}: the tracker no longer tells the state of the air, as it did at the "
-                "first. See to its weather station, and resume."
+                f"Station {self.names[number]}: the tracker no longer reports the state of the air, as it did at the "
+                "first. Check its weather station, and resume."
             )
-        return self.air_told
+        return self.air_reported
 
     def noise(self) -> float:
-        """Return the standard deviation of a reading, m: the tracker's own word, else that of the settings."""
+        """Return the standard deviation of a reading, m: of the tracker, else of the settings."""
         stated = getattr(self.tracker.settings, "noise", None)
         return float(stated or self.settings.layout.displacement_noise)
 
 
 class SetUp:
-    """A tracker at one station: where the machine's places are for it, as far as its readings tell."""
+    """A tracker at one station, and the pose of the machine in its frame where readings determine it."""
 
     def __init__(self, stand: Stand, number: int) -> None:
         self.stand, self.number = stand, number
@@ -339,7 +339,7 @@ class SetUp:
         return R, b.mean(axis=0) - R @ a.mean(axis=0)
 
     def _check(self) -> None:
-        """Refuse a tracker that stands at another station's place, as soon as that can be told.
+        """Refuse a tracker at the position of another station, as soon as that is determined.
 
         Raises
         ------
@@ -356,6 +356,6 @@ class SetUp:
         ):
             names = self.stand.names
             raise MethodError(
-                f"Set-up {names[self.number]}: the tracker stands near ({here[0]:.2f}, {here[1]:.2f}, {here[2]:.2f}) "
-                f"m, the place of {names[nearest]}. Put it to its place and resume, or correct layout.stations."
+                f"Set-up {names[self.number]}: the tracker is near ({here[0]:.2f}, {here[1]:.2f}, {here[2]:.2f}) "
+                f"m, the position of {names[nearest]}. Move it to its position and resume, or correct layout.stations."
             )

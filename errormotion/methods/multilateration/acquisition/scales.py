@@ -44,7 +44,7 @@ class Scales:
             )
 
     def poll(self) -> None:
-        """Read the sensors once; a failure is told and counts as not known."""
+        """Read the sensors once; a failure is logged and gives NaN."""
         if self.sensors is None:
             return
         try:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, fdtri
 
 from errormotion.arrays import Array
 from errormotion.methods.multilateration.identification.expansion import Shared
@@ -113,7 +113,7 @@ def estimate_drift(
         terms = np.concatenate([np.ones((m, 1)), e[j]], axis=1) * since[:, None]
         returns[j] = (terms, *_within(groups, displacement[j], terms, noise[j]))
     scatter = _scatter([(d, A) for _, d, A in returns.values()])
-    if certain and scatter[0] * scatter[1] <= stats.chi2.ppf(1 - FALSE_ALARM, max(scatter[1], 1)):
+    if certain and scatter[0] * scatter[1] <= chdtri(max(scatter[1], 1), FALSE_ALARM):
         scatter = (1.0, 0)
     square, freedom, pairs = 0.0, 0, 0
     for j, (terms, d, A) in returns.items():
@@ -132,7 +132,7 @@ def estimate_drift(
     mean = float(np.sqrt(np.nanmean(noise**2)))
     ratio = square / freedom if freedom else np.nan
     repeatability = mean * float(np.sqrt(max(ratio - 1, 0.0)))
-    if freedom and square > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if freedom and square > chdtri(freedom, FALSE_ALARM):
         notes.append(
             f"Positions visited again differ {np.sqrt(ratio):.2g} times as much as expected from the noise of the "
             f"readings: a repeatability of {repeatability * 1e6:.2g} um, or a drift that is not linear."
@@ -190,11 +190,7 @@ def _order(d: Array, A: Array, scatter: tuple[float, int]) -> int:
     for order in _orders(d, A):
         part, more = A[:, :order], order - found
         left = d - part @ np.linalg.lstsq(part, d)[0]
-        limit = (
-            more * stats.f.ppf(1 - DRIFT_SIGNIFICANCE, more, freedom)
-            if freedom
-            else stats.chi2.ppf(1 - DRIFT_SIGNIFICANCE, more)
-        )
+        limit = more * fdtri(more, freedom, 1 - DRIFT_SIGNIFICANCE) if freedom else chdtri(more, DRIFT_SIGNIFICANCE)
         if square - float(left @ left) > variance * limit:
             square, found = float(left @ left), order
     return found

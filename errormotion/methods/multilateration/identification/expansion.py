@@ -1,7 +1,7 @@
 """The scale of everything: air along the beam, the tracker's own scale, and the machine's scales at 20 degC.
 
 A correction or an uncertainty of scale is a change of the readings that all of them share, (station, target) in m. The
-network says what such a change does to the targets.
+network gives the effect of such a change on the targets.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
     if missing:
         if "refractive_index" in raw:
             raise MethodError(
-                f"The data state the refractive index of the displacements, so these are computed anew; this needs "
+                "The data state the refractive index of the displacements, so these are corrected again. This needs "
                 f"{', '.join(missing)} (station, target). Add them, or leave refractive_index out."
             )
         notes.append(
@@ -98,7 +98,7 @@ def _refuse_unknown_air(raw: xr.Dataset, air: dict[str, Array]) -> None:
                 for dim, k in (("station", j), ("target", i))
             ]
             raise MethodError(
-                f"{name}: expected its value with every reading, since displacements are computed anew from the air; "
+                f"{name}: expected its value with every reading, since displacements are corrected again for the air; "
                 f"found NaN at {int(lost.sum())} of {int(read.sum())}, first at {first[0]}, {first[1]}. Add them, or "
                 "leave refractive_index out."
             )

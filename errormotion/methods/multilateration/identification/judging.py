@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -62,7 +62,7 @@ def _judge_scatter(state: State) -> None:
         action = "the uncertainties are raised to match" if raised else "the stated noise was kept (noise = stated)"
         cause = "" if settings.together or machine.sources else " Possible cause: repeatability of the machine."
         state.notes.append(f"The readings scatter {network.sigma0:.3g} times as much as stated; {action}.{cause}")
-    elif freedom > 0 and known_to == 0 and network.sigma0**2 * freedom < stats.chi2.ppf(FALSE_ALARM, freedom):
+    elif freedom > 0 and known_to == 0 and network.sigma0**2 * freedom < chdtri(freedom, 1 - FALSE_ALARM):
         state.notes.append(
             f"The readings scatter only {network.sigma0:.3g} times as much as stated; the stated noise was kept."
         )

@@ -3,7 +3,7 @@
 Displacements of the reflector are linear in the errors (`errormotion.kinematics.machines`). Every error motion is a
 series of Legendre polynomials over the measured part of its axis, from the first term that is not another's:
 
-* six motions of the whole are the datum's and belong to no axis: they are estimated beside, and given back;
+* six motions of the whole are the datum's and belong to no axis: they are estimated as well, and returned;
 * constants of error motions and slopes of straightness are motions of the whole or squareness, so error motions have a
   mean of zero, straightness no slope, and squareness is that of the axes' mean lines;
 * what an error does to no reflector, or nothing but what others do, is not seen. With one reflector these are the
@@ -11,7 +11,7 @@ series of Legendre polynomials over the measured part of its axis, from the firs
 
 How many terms an error motion has is decided by the evidence: the coefficient of order k has the prior standard
 deviation tau / k^p, with tau of each error motion and one p for all of largest marginal likelihood (MacKay, Bayesian
-interpolation, Neural Computation 4, 1992). Terms that the targets say nothing about keep their prior, so that what may
+interpolation, Neural Computation 4, 1992). Terms that the targets do not determine keep their prior, so that what may
 be between the targets is in the uncertainty. Squareness and the slope of positioning have no prior.
 """
 
@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
+from scipy.special import chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -245,7 +246,7 @@ def fit_machine(
     freedom = 3 * len(position) - 6 - float(found.determined.sum())
     ratio = found.left / max(freedom, 1.0)
     scale, notes = 1.0, []
-    if freedom > 0 and found.left > stats.chi2.ppf(1 - FALSE_ALARM, freedom):
+    if freedom > 0 and found.left > chdtri(freedom, FALSE_ALARM):
         scale = ratio
         notes.append(
             f"Errors of the axes leave {np.sqrt(ratio):.3g} times as much of the targets' errors as their uncertainty "
@@ -292,8 +293,8 @@ def _normal_equations(
     size = len(terms) + 6 + len(influence)
     N, b, square = np.zeros((size, size)), np.zeros(size), 0.0
     GG, GA = np.zeros((6, 6)), np.zeros((6, len(terms)))
-    for begin in range(0, len(position), _BLOCK):
-        part = slice(begin, begin + _BLOCK)
+    for first in range(0, len(position), _BLOCK):
+        part = slice(first, first + _BLOCK)
         q, at = position[part], reflector[part]
         G, shared = model.motions(q + at, centre), influence[:, which[part]].transpose(1, 2, 0)
         A = np.concatenate([model.columns(terms, q, at), G, shared], axis=2)
@@ -312,7 +313,7 @@ def _normal_equations(
 
 
 def _unseen(terms: list[Term], levels: list[int], N: Array, nuisance: int) -> dict[str, Unseen]:
-    """Return the errors whose first term moves no reflector, or is not told from those before it, with the reason."""
+    """Return errors whose first term moves no reflector, or is not distinguishable from earlier ones."""
     size = np.sqrt(np.diag(N))
     reference = size[: len(terms)].max()
     unit = np.where(size > 0, size, 1.0)

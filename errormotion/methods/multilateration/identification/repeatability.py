@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, fdtri, ndtri
 
 from errormotion.methods.multilateration.identification.uncertainty import Scatter
 
@@ -153,8 +153,8 @@ def exceeds(network: Network, relative: float) -> bool:
     freedom = network.freedom
     # The variance has f' = 2 / relative^2 degrees of freedom itself.
     if relative > 0:
-        return bool(network.sigma0**2 > stats.f.ppf(1 - FALSE_ALARM, freedom, max(2 / relative**2, 1.0)))
-    return bool(network.sigma0**2 * freedom > stats.chi2.ppf(1 - FALSE_ALARM, freedom))
+        return bool(network.sigma0**2 > fdtri(freedom, max(2 / relative**2, 1.0), 1 - FALSE_ALARM))
+    return bool(network.sigma0**2 * freedom > chdtri(freedom, FALSE_ALARM))
 
 
 def _joined(
@@ -166,7 +166,7 @@ def _joined(
     variance_of_reading = before.variance + tracker**2
     apart = abs(found.variance - before.variance)
     chance = 2 * variance_of_reading**2 / freedom + before.spread**2
-    if apart > float(stats.norm.isf(FALSE_ALARM / 2)) * np.sqrt(chance):
+    if apart > -float(ndtri(FALSE_ALARM / 2)) * np.sqrt(chance):
         cause = " Possible cause: a drift that is not linear." if found.variance > before.variance else ""
         notes.append(
             f"Returns show a repeatability of {found.value * 1e6:.2g} um, the settings state "

@@ -35,11 +35,11 @@ class Readings:
     nominal : ndarray (m, 3)
         Commanded places of the reflector, m.
     reflector : ndarray (m, 3)
-        Where it is with all axes at zero, m; 0 where the data do not say.
+        Where it is with all axes at zero, m; 0 where the data do not state it.
     station : ndarray (n, 3) or None
         Rough places, m.
     time : ndarray (n, m)
-        Of each reading, s; its number where the data do not say.
+        Of each reading, s; its number where the data do not state it.
     timed : bool
         Whether they do.
     stations, targets : list of str
@@ -152,7 +152,9 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
         station = _array(raw, "station_nominal", "station", "direction")
         if np.isnan(station).any():
             station = None
-            notes.append("Not every station has a rough place (station_nominal): all are looked for anywhere.")
+            notes.append(
+                "Not every station has an approximate position (station_nominal): the distances determine all of them."
+            )
     if "reflector" in raw:
         reflector = _array(raw, "reflector", "target", "direction")
         if np.isnan(reflector).any():

@@ -1,4 +1,4 @@
-"""What the targets' uncertainty is made of: their own readings, and what all share.
+"""Parts of the targets' uncertainty: their own readings, and sources that all share.
 
 Sources are kept as one array over source, target and freedom, which is what an error dataset holds. It is filled block
 by block: nothing else is as large.
@@ -86,8 +86,8 @@ class Parts:
 
 def blocks(count: int) -> Iterator[slice]:
     """Yield slices of so many targets."""
-    for begin in range(0, count, BLOCK):
-        yield slice(begin, min(begin + BLOCK, count))
+    for first in range(0, count, BLOCK):
+        yield slice(first, min(first + BLOCK, count))
 
 
 def parts(
@@ -98,13 +98,13 @@ def parts(
     stretched: Array,
     shared: Sequence[Shared],
 ) -> Parts:
-    """Return what the targets' uncertainty is made of.
+    """Return the parts of the targets' uncertainty.
 
     Parameters
     ----------
     network : Network
     factor : float
-        By which the standard deviation of its readings is larger than it was told.
+        Standard deviation of a reading over that of the network's weights.
     scatter : Scatter
         What that is made of.
     scales : sequence of (name, group, relative standard uncertainty)

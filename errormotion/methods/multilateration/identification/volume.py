@@ -184,7 +184,7 @@ def grid(low: Sequence[float], high: Sequence[float], count: Sequence[int]) -> A
 
 
 def diagonals(low: Sequence[float], high: Sequence[float], count: int = 11) -> Array:
-    """Return positions along the four body diagonals, (4, count, 3), m; each begins at low Z (ISO 230-6)."""
+    """Return positions along the four body diagonals, (4, count, 3), m; each starts at low Z (ISO 230-6)."""
     a, b = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     starts = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], dtype=float)
     way = np.linspace(0.0, 1.0, count)[None, :, None]
@@ -212,8 +212,8 @@ def _field(axes: Parametric, q: Array, tool: Array) -> Array:
 def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
     """Return whether each freedom is known, (k, 6).
 
-    Displacements where the reflector was are: what is not told apart does the same there. Elsewhere, and for rotations,
-    every error that matters must have been seen.
+    Displacements at the position of the reflector are known: errors that are not distinguishable have the same effect
+    there. Elsewhere, and for rotations, every error with an effect must be determined.
     """
     J = axes.chain.machine.jacobian(q, tool)
     unseen = [axes.chain.machine.error_names.index(name) for name in axes.unseen]

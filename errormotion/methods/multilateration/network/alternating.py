@@ -1,7 +1,7 @@
 """The scheme of the paper: stations from targets, targets from stations, and again, relative to the first target.
 
-Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The first target's readings then say
-nothing about the first target, which stays where it is; everything else is counted from it. Each half is a
+Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The first target's readings then do
+not determine it: it stays in its position, and everything else is relative to it. Each half is a
 least-squares problem of three unknowns at a time. Together they creep: a station moves only by what the targets have
 not taken.
 """
@@ -67,7 +67,7 @@ def alternate(
     tolerance: float = TOLERANCE,
     iterations: int = 1000,
 ) -> Alternated:
-    """Estimate targets and stations by turns.
+    """Estimate targets and stations alternately.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ _NEAR = 1e-6
 
 @dataclass(frozen=True)
 class State:
-    """Stations and targets (3, m), what they say, passes taken, and whether the last step was small enough."""
+    """Stations and targets (3, m), their sums, passes, and whether the last step was small enough."""
 
     stations: Stations
     place: Array

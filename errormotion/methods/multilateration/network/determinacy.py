@@ -1,6 +1,6 @@
 """What distances determine, and which freedom is loose where they do not.
 
-A target with k readings says k - 3 things about the stations, which have 4 n - 6 unknowns together: places and dead
+A target with k readings gives k - 3 equations for the stations, which have 4 n - 6 unknowns: positions and dead
 paths without the six motions of the whole. Four stations need ten targets. Where stations or targets stand badly, these
 equations depend on one another: with stations in one plane two freedoms are loose whatever the targets, and a target in
 one line with two stations, or in one plane with all, has a direction in which no distance changes.
@@ -22,11 +22,11 @@ DIGITS = 1e-13
 FLAT = 0.03
 """Stations thinner than this share of their extent count as standing in a plane, or on a line."""
 WEAK = 20.0
-"""Noise multiplied by more than this in a target is worth a note."""
+"""Noise multiplied by more than this in a target is noted."""
 _NOTHING = 1e-30
 NEAR = 0.05
 """Stations seen from the targets within this angle, rad, are in one line with them."""
-_TOLD = 3
+_NAMED = 3
 _LISTED = 12
 _SHARE = 0.1
 
@@ -45,7 +45,7 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
     if n < 4:
         raise MethodError(
             f"expected at least four stations, found {n}: with three every target has as many unknowns as distances, "
-            "and nothing tells where the stations are; measure the targets from a further place"
+            "and the stations are not determined; measure the targets from a further station"
         )
     blind = np.flatnonzero(by_station < 4)
     if len(blind):
@@ -92,21 +92,21 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
         Rough places of the stations, m: where they were found is no guide when a freedom is loose.
     """
     refuse_nowhere(information)
-    values, motions, sigma, loose = _freedoms(information, basis, stations.place, target)
+    values, motions, sigma, loose = freedoms(information, basis, stations.place, target)
     if not loose.any():
         return values
     centre = target.mean(axis=0)
     k = int(np.count_nonzero(loose))
-    freedoms = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_TOLD])
+    named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_NAMED])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
     raise MethodError(
         f"expected places of stations and targets whose distances fix them all, found {k} "
-        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {freedoms}. "
-        f"What is special: {_reason(rough, target)}"
+        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {named}. "
+        f"Cause: {_reason(rough, target)}"
     )
 
 
-def _freedoms(
+def freedoms(
     information: Array, basis: Array, place: Array, target: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Return eigenvalues of the information with its diagonal made 1, and for each the motion by one deviation.
@@ -170,7 +170,7 @@ def _reason(place: Array, target: Array) -> str:
         )
     flat = np.linalg.svd(target - target.mean(axis=0), full_matrices=False, compute_uv=False)
     if flat[1] < FLAT * flat[0]:
-        found.append("the targets lie on one line: add targets beside it")
+        found.append("the targets lie on one line: add targets off it")
     elif flat[2] < FLAT * flat[0]:
         found.append("the targets lie in one plane: add targets off it")
     sight = target.mean(axis=0) - place
@@ -214,14 +214,14 @@ def without_say(carries: NDArray[np.bool_], target: Array) -> list[str]:
         return []
     more = f" and {len(weak) - _LISTED} more" if len(weak) > _LISTED else ""
     return [
-        f"targets that their readings hardly fix have no say in where the whole lies ({len(weak)} of them): "
+        f"targets that are hardly determined by their readings do not carry the datum ({len(weak)} of them): "
         f"{', '.join(str(i + 1) for i in weak[:_LISTED])}{more}"
     ]
 
 
-def without_place(weight: Array, told: tuple[int, ...]) -> list[str]:
-    """Return a note on the targets that have too few readings, by weight (n, m), but for those ``told`` already."""
-    few = np.setdiff1d(np.flatnonzero(np.count_nonzero(weight, axis=0) < 3), told)
+def without_place(weight: Array, named: tuple[int, ...]) -> list[str]:
+    """Return a note on the targets that have too few readings, by weight (n, m), except those ``named`` already."""
+    few = np.setdiff1d(np.flatnonzero(np.count_nonzero(weight, axis=0) < 3), named)
     if not len(few):
         return []
     more = f" and {len(few) - _LISTED} more" if len(few) > _LISTED else ""
@@ -239,15 +239,15 @@ def weak_targets(target: Array, covariance: Array, place: Array) -> list[str]:
         return []
     weak = np.flatnonzero(known & (trace > WEAK**2 * np.median(trace[known])))
     notes = []
-    for i in weak[:_TOLD]:
+    for i in weak[:_NAMED]:
         values, vectors = np.linalg.eigh(covariance[i])
         direction = ", ".join(f"{c:+.2f}" for c in vectors[:, -1])
         notes.append(
             f"target {i + 1} is hardly determined along ({direction}), standard uncertainty "
             f"{np.sqrt(values[-1]) * 1e3:.3g} mm: {_of_target(target[i], place)}"
         )
-    if len(weak) > _TOLD:
-        notes.append(f"{len(weak) - _TOLD} further targets are hardly determined in a direction, for like reasons")
+    if len(weak) > _NAMED:
+        notes.append(f"{len(weak) - _NAMED} further targets are hardly determined in a direction, for like reasons")
     return notes
 
 

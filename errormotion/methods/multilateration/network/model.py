@@ -9,12 +9,15 @@ stations are counted (U_1, L_1, U_2, L_2, ..., p).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,14 @@ class Stations:
         T = np.zeros((4 * n + len(self.value), 6))
         T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.place, centre)
         return T
+
+    def complement(self, centre: Array, free: NDArray[np.bool_]) -> Array:
+        """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
+        T = self.motions(centre)[free]
+        size = np.linalg.norm(T, axis=0)
+        Z = np.zeros((len(free), len(T) - 6))
+        Z[free] = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
+        return Z
 
 
 def motions(places: Array, centre: Array) -> Array:
@@ -79,6 +90,8 @@ def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.
     known : ndarray (n, m)
         Rows of the result: target after target, station after station.
     """
+    import scipy.sparse as sp
+
     n, m = known.shape
     e = directions(target, stations).transpose(1, 0, 2)
     values = np.concatenate([e, -e, np.full((m, n, 1), -1.0)], axis=-1)

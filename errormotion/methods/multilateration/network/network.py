@@ -1,4 +1,4 @@
-"""What a multilateration answers: places, dead paths, and what they are worth.
+"""Result of a multilateration: positions, dead paths, and their covariances.
 
 The datum is a free network: of all rigid motions of the whole, the one that fits the targets to their nominal places
 best. With a_i the part of target i that its own readings decide, covariance D_i, and ds that of the stations,
@@ -82,7 +82,7 @@ class Network:
     left_out : tuple of (int, int)
         Readings (station, target) found wrong, from 0.
     undecided : tuple of int
-        Targets with a wrong reading that cannot be told from the right ones; they are NaN.
+        Targets with a wrong reading that is not identified; they are NaN.
     sigma0 : float
         Root mean square of the residuals over their expected size: 1 where the noise is what was stated.
     freedom : int
@@ -154,7 +154,7 @@ class Network:
     def residual(self) -> Array:
         """Reading minus model (n, m), m: of every reading that exists and whose target has a place, left out or not.
 
-        NaN for all others. A reading that was left out has had no say in its target's place, so that its residual
+        NaN for all others. A reading that was left out did not determine its target's position, so that its residual
         shows its whole error.
         """
         s = self.stations
@@ -215,7 +215,7 @@ class Network:
         return own, factor, G
 
     def influence(self) -> Array:
-        """Return what the stations' uncertainty does to all targets at once, (p, m, 3), m.
+        """Return the effect of the stations' uncertainty on all targets, (p, m, 3), m.
 
         One row for each independent part of the stations' covariance: the sources of ``influence`` of an error
         dataset. What is left of ``target_covariance`` is independent from target to target but for the datum's

@@ -1,4 +1,4 @@
-"""Readings that do not fit: which they are, and which of them can be told.
+"""Readings that contradict the others: which they are, and which of them can be identified.
 
 A reading is judged by its residual over what it should be, sigma sqrt(redundancy). Where a target has two readings too
 many, the wrong one has the largest. With one too many, as with four stations, all of its residuals are equally
@@ -59,8 +59,8 @@ def notes(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> 
         shown = ", ".join(str(i + 1) for i in undecided[:_SHOWN])
         more = f" and {len(undecided) - _SHOWN} more" if len(undecided) > _SHOWN else ""
         found.append(
-            f"targets given up ({len(undecided)}), since a reading of theirs is wrong and nothing tells "
-            f"which: {shown}{more}; readings from a further station would tell"
+            f"targets given up ({len(undecided)}), since one of their readings is wrong and it is not determined "
+            f"which: {shown}{more}; readings from a further station would determine it"
         )
     return found
 
@@ -132,21 +132,21 @@ def search(network: Network, weight: Array, nominal: Array, before: Found) -> Fo
     targets = np.flatnonzero(worst > max(limit, 0.5 * worst.max()))
     if not len(targets):
         return before
-    which = _told_by_residuals(t[:, targets], network, targets)
+    which = _by_residuals(t[:, targets], network, targets)
     open_ = which < 0
     if open_.any():
-        which[open_] = _told_by_places(network, nominal, targets[open_])
+        which[open_] = _by_positions(network, nominal, targets[open_])
     out = before.out.copy()
-    told = which >= 0
-    out[which[told], targets[told]] = True
-    out[:, targets[~told]] = True
+    found = which >= 0
+    out[which[found], targets[found]] = True
+    out[:, targets[~found]] = True
     left_out = before.left_out + tuple(
-        (int(j), int(i)) for j, i in zip(which[told], targets[told], strict=True) if weight[j, i] > 0
+        (int(j), int(i)) for j, i in zip(which[found], targets[found], strict=True) if weight[j, i] > 0
     )
-    return Found(left_out, tuple(sorted({*before.undecided, *(int(i) for i in targets[~told])})), out)
+    return Found(left_out, tuple(sorted({*before.undecided, *(int(i) for i in targets[~found])})), out)
 
 
-def _told_by_residuals(t: Array, network: Network, targets: NDArray[np.intp]) -> NDArray[np.intp]:
+def _by_residuals(t: Array, network: Network, targets: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the station whose reading is clearly the worst of each target, -1 where there is none."""
     t = np.nan_to_num(t)
     order = np.sort(t, axis=0)
@@ -155,7 +155,7 @@ def _told_by_residuals(t: Array, network: Network, targets: NDArray[np.intp]) ->
     return np.where(clear & spare, t.argmax(axis=0), -1)
 
 
-def _told_by_places(network: Network, nominal: Array, targets: NDArray[np.intp]) -> NDArray[np.intp]:
+def _by_positions(network: Network, nominal: Array, targets: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the station without which each target lies where others do, -1 where none or several would do."""
     deviation = network.target - nominal
     usual = np.nanmedian(deviation, axis=0)

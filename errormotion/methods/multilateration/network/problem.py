@@ -81,14 +81,10 @@ class Problem:
 
     def basis(self, stations: Stations, centre: Array) -> Array:
         """Return orthonormal columns (4 n + k, p) that span the free parameters without the motions of the whole."""
-        T = stations.motions(centre)[self.free]
-        size = np.linalg.norm(T, axis=0)
-        Z = np.zeros((len(self.free), len(T) - 6))
-        Z[self.free] = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
-        return Z
+        return stations.complement(centre, self.free)
 
     def reduce(self, stations: Stations, place: Array) -> Sums:
-        """Move the targets (3, m) in place and return what they say about the stations."""
+        """Move the targets (3, m) in place and return their sums for the stations."""
         sums, moved = loops(place.shape[1]).reduce_targets(
             self.reading, self.weight, stations.place, stations.dead_path, self.extra, stations.value, place
         )
@@ -137,7 +133,10 @@ def state_problem(
     if sigma.ndim == 1 and len(sigma) == n:
         sigma = sigma[:, None]
     if sigma.shape not in ((), (n, 1), (n, m)):
-        raise MethodError(f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; say whose it is")
+        raise MethodError(
+            f"expected noise as one value, ({n},) or ({n}, {m}), found {sigma.shape}; state it for all readings, each "
+            "station, or each reading"
+        )
     sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
     reading, weight, positive = of.weigh(np.ascontiguousarray(d), sigma)
     by_target, by_station = of.count(weight)

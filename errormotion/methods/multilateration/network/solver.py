@@ -50,7 +50,7 @@ def solve(
     target : array_like (m, 3)
         Nominal targets, m: start and datum.
     station : array_like (n, 3), optional
-        Rough places of the stations, m; without them the distances tell.
+        Rough places of the stations, m; default: from the distances.
     noise : array_like (), (n,) or (n, m)
         Standard deviation of a reading, m: of all, of each station's, of each.
     dead_path : pair of array_like (n,), optional
@@ -105,8 +105,8 @@ def solve(
             break
         found = now
         problem = _without(problem, original, found)
-        begin = np.where(np.isfinite(network.target), network.target, problem.nominal)
-        state = descend(problem, network.stations, begin, tolerance)
+        target = np.where(np.isfinite(network.target), network.target, problem.nominal)
+        state = descend(problem, network.stations, target, tolerance)
         state = replace(state, passes=state.passes + network.iterations)
         network = conclude(problem, state, start.place, places, found)
     return network
@@ -129,9 +129,9 @@ def conclude(
     problem, state
         What was solved, and how.
     start : ndarray (n, 3)
-        Rough places of the stations, m, given or found: what to say of a loose freedom.
+        Approximate positions of the stations, m, stated or found, for the message on a loose freedom.
     rough : ndarray (n, 3), optional
-        Given ones, m: what to say of swapped stations.
+        Stated ones, m, for the note on swapped stations.
     found : Found, optional
         What was left out.
     """

@@ -1,4 +1,4 @@
-"""Where the stations are, roughly: from the nominal targets, station by station.
+"""Approximate positions of the stations, from the nominal targets, station by station.
 
 |u - U|^2 = (d + L)^2 is linear in U, L and K = L^2 - |U|^2:
 
@@ -6,7 +6,7 @@
 
 five unknowns for each station. Gauss-Newton on the distances themselves then sharpens U and L. Readings that are far
 off are given little weight, so a few of them do no harm. Targets in one plane leave the side open on which a station
-stands; then its rough place decides.
+is; then its approximate position decides.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 
 SOME = 150
-"""Readings of a station that are looked at: enough to tell where it is."""
+"""Readings of a station that are used: enough for a start value."""
 FLAT = 1e-3
 """Targets thinner than this share of their extent lie in a plane, or on a line."""
 FITS = 0.01
@@ -40,7 +40,7 @@ class Start:
 
 
 def initial_stations(reading: Array, weight: Array, target: Array, station: Array | None) -> Start:
-    """Return rough stations from readings (n, m) of nominal targets (m, 3).
+    """Return approximate stations from readings (n, m) of nominal targets (m, 3).
 
     Raises
     ------
@@ -50,18 +50,20 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     """
     n = len(reading)
     if station is not None and station.shape != (n, 3):
-        raise MethodError(f"expected rough places ({n}, 3) of the stations, found {station.shape}; give one per row")
+        raise MethodError(
+            f"expected approximate positions ({n}, 3) of the stations, found {station.shape}; give one per row"
+        )
     centre, extent, products = _shape(target, _some(len(target), 4 * SOME).step)
     values, axes = np.linalg.eigh(products)
     spread = np.sqrt(np.maximum(values[::-1], 0.0) / values[-1])
     if spread[1] < FLAT:
         raise MethodError(
             "expected targets spread in space, found them on one line; distances to these leave every station free "
-            "to turn about that line: add targets beside it"
+            "to turn about that line: add targets off it"
         )
     normal = axes[:, 0] if spread[2] < FLAT else None
     places, dead_paths = np.empty((n, 3)), np.empty(n)
-    if normal is None and _at_once(reading, weight, target, centre, _ENOUGH * extent, places, dead_paths):
+    if normal is None and _from_plain_readings(reading, weight, target, centre, _ENOUGH * extent, places, dead_paths):
         return Start(places, dead_paths)
     for j in range(n):
         d, u = _taken(reading[j], weight[j], target, centre, SOME)
@@ -70,7 +72,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
             if rough is None:
                 raise MethodError(
                     f"expected at least 5 readings of station {j + 1} to find it, found {len(d)}; measure more "
-                    "targets from it, or state roughly where it stands"
+                    "targets from it, or state its approximate position"
                 )
             places[j], dead_paths[j] = rough + centre, np.median(np.linalg.norm(u - rough, axis=1) - d)
             continue
@@ -128,12 +130,12 @@ def _linear(d: Array, u: Array) -> Array:
 
 def _guesses(d: Array, u: Array, rough: Array | None, normal: Array | None) -> Iterator[Array]:
     """Yield places and dead paths (U, L) to start from, the best first."""
-    yield _linear(d, u) if normal is None else _beside_plane(d, u, rough, normal)
+    yield _linear(d, u) if normal is None else _off_plane(d, u, rough, normal)
     if rough is not None:
         yield np.append(rough, np.median(np.linalg.norm(u - rough, axis=1) - d))
 
 
-def _beside_plane(d: Array, u: Array, rough: Array | None, normal: Array) -> Array:
+def _off_plane(d: Array, u: Array, rough: Array | None, normal: Array) -> Array:
     """Return (U, L) by the linear equations where targets lie in a plane through their mean."""
     middle = np.median(d)
     d = d - middle
@@ -144,8 +146,8 @@ def _beside_plane(d: Array, u: Array, rough: Array | None, normal: Array) -> Arr
     height = np.sqrt(max(L**2 - K - U @ U, 0.0))
     if rough is None and height > FLAT * np.linalg.norm(u, axis=1).max():
         raise MethodError(
-            "expected targets spread in space or the stations' rough places, found targets in one plane: distances "
-            "do not tell on which side of it a station stands; state roughly where the stations are, or measure "
+            "expected targets spread in space or the stations' approximate positions, found targets in one plane: "
+            "distances do not determine on which side of it a station is; state approximate positions, or measure "
             "targets off that plane"
         )
     side = -1.0 if rough is not None and normal @ rough < 0 else 1.0
@@ -213,7 +215,7 @@ def _sharpened(x: Array, d: Array, u: Array) -> tuple[Array, float]:
     return x, scale
 
 
-def _at_once(
+def _from_plain_readings(
     reading: Array, weight: Array, target: Array, centre: Array, enough: float, place: Array, dead_path: Array
 ) -> bool:
     """Fill positions (n, 3) and dead paths (n,) of stations from plain readings; return whether all were found."""

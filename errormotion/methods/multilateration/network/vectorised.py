@@ -95,14 +95,12 @@ def reduce_targets(
     moved : float
         Longest first step of a target, m.
     """
-    n, m = weight.shape
     reach = np.where(weight > 0, _reach(reading, dead_path, extra, value), 0.0)
     far, _ = _locate(reach, weight, station, place, _STEPS, _SHORT)
     e, distance = _sight(place, station)
-    N = _left_over(weight[:, None] * e)
+    N = left_over(weight[:, None] * e)
     c = N * weight
-    by_station = -c[:, :, None] * np.concatenate([e, np.ones((n, 1, m))], axis=1)
-    rows = [by_station.transpose(1, 2, 0, 3).reshape(4 * n, -1)]
+    rows = [equations(c, e)]
     if len(extra):
         rows.append(np.einsum("ajm,kjm->kam", c, extra).reshape(len(extra), -1))
     rows.append(np.einsum("ajm,jm->am", N, weight * (reach - distance)).reshape(1, -1))
@@ -139,15 +137,13 @@ def datum_sums(
     G are a target's motions with the whole about ``centre``, D its covariance with the stations known, F its motion by
     the stations' parameters.
     """
-    n, k = len(station), len(extra)
     weight, extra, target = weight[:, carries], extra[:, :, carries], target[carries]
-    e, D, whole = _seen(weight, station, target)
+    e, D, whole = seen(weight, station, target)
     weight, extra, target, e, D = weight[:, whole], extra[:, :, whole], target[whole], e[:, :, whole], D[:, :, whole]
     G = motions(target, centre)
     own = weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e)
-    by_station = np.einsum("jam,jbm->majb", own, np.concatenate([e, np.ones((n, 1, len(target)))], axis=1))
-    F = by_station.reshape(len(target), 3, 4 * n)
-    if k:
+    F = response(own, e)
+    if len(extra):
         F = np.concatenate([F, -np.einsum("jam,kjm->mak", own, extra)], axis=2)
     flat = G.reshape(-1, 6)
     return flat.T @ flat, flat.T @ (D.transpose(2, 0, 1) @ G).reshape(-1, 6), flat.T @ F.reshape(len(flat), -1)
@@ -170,7 +166,7 @@ def examine(
         Inverse of the sum of G^T G; and H (sum of G^T D G) H.
     """
     n = len(station)
-    e, D, whole = _seen(weight, station, target)
+    e, D, whole = seen(weight, station, target)
     # Readings by the stations' factor, then targets: both sum over the stations.
     by_station = W[: 4 * n].reshape(n, 4, -1)
     q = -np.einsum("jam,jap->mjp", e, by_station[:, :3]) - by_station[:, 3]
@@ -193,6 +189,18 @@ def examine(
     return covariance, redundancy
 
 
+def equations(c: Array, e: Array) -> Array:
+    """Return the equations (4 n, (n - 3) m) of targets for (U, L) of every station, from rows c (n - 3, n, m)."""
+    by_station = -c[:, :, None] * np.concatenate([e, np.ones_like(e[:, :1])], axis=1)
+    return np.asarray(by_station.transpose(1, 2, 0, 3).reshape(4 * len(e), -1))
+
+
+def response(own: Array, e: Array) -> Array:
+    """Return the motion (m, 3, 4 n) of targets by (U, L) of every station, from w^2 D e (n, 3, m)."""
+    by_station = np.einsum("jam,jbm->majb", own, np.concatenate([e, np.ones_like(e[:, :1])], axis=1))
+    return np.asarray(by_station.reshape(e.shape[2], 3, -1))
+
+
 def _reach(reading: Array, dead_path: Array, extra: Array, value: Array) -> Array:
     """Return the distances (n, m) that readings stand for, m."""
     found = reading + dead_path[:, None]
@@ -206,7 +214,7 @@ def _sight(place: Array, station: Array) -> tuple[Array, Array]:
     return v / distance[:, None], distance
 
 
-def _seen(weight: Array, station: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+def seen(weight: Array, station: Array, target: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return directions (n, 3, m), D (3, 3, m) of targets (m, 3), and which have one; 0 and the unit matrix else."""
     e, _ = _sight(target.T, station)
     D, _, whole = _inverse(weight[:, None] * e)
@@ -264,7 +272,7 @@ def _locate(reach: Array, weight: Array, station: Array, place: Array, steps: in
     return first, np.where(whole, np.einsum("aam->m", D), np.inf)
 
 
-def _left_over(E: Array) -> Array:
+def left_over(E: Array) -> Array:
     """Return orthonormal rows (n - 3, n, m) that are orthogonal to the columns of E (n, 3, m)."""
     n, _, m = E.shape
     R = np.concatenate([E, np.broadcast_to(np.eye(n)[:, :, None], (n, n, m))], axis=1)

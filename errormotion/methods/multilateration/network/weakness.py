@@ -1,7 +1,7 @@
-"""Targets whose readings hardly fix them: left out, since each would spoil the datum that all of them share.
+"""Targets that their readings hardly determine: excluded, since each would affect the datum of all.
 
 A target with three readings and its three stations nearly in one plane can move out of that plane by a millimetre
-before its distances change by a micrometre. Such a target says nothing about the stations.
+before its distances change by a micrometre. Such a target does not determine the stations.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from errormotion.arrays import Array
 from errormotion.methods.multilateration.network.model import Stations, directions
 from errormotion.methods.multilateration.network.start import initial_stations
 
-_SOME = 1000
+_SAMPLE = 1000
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def carriers(openness: Array) -> NDArray[np.bool_]:
 
     Infinite where a target has no place. The middle one is that of an even choice where there are many.
     """
-    return np.asarray(openness <= _limit(len(openness)) ** 2 * _middle(openness, max(1, len(openness) // _SOME)))
+    return np.asarray(openness <= _limit(len(openness)) ** 2 * _middle(openness, max(1, len(openness) // _SAMPLE)))
 
 
 def _middle(openness: Array, every: int) -> float:

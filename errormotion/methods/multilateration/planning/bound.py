@@ -1,4 +1,4 @@
-"""What a layout will be worth, before anything is measured: the Cramer-Rao bound of targets and stations.
+"""Predicted uncertainty of a layout: the Cramer-Rao bound of targets and stations.
 
 The covariance of a network depends on places and noise alone. Estimates of `solver` reach it as long as the stations'
 uncertainty is small against their distances. The formulation of the paper, L_j = |u_1 - U_j|, takes the first target's
@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network import determinacy
+from errormotion.methods.multilateration.network import determinacy, vectorised
 from errormotion.methods.multilateration.network.descent import State
-from errormotion.methods.multilateration.network.model import Stations, readings
+from errormotion.methods.multilateration.network.model import Stations, motions, readings
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import state_problem
 from errormotion.methods.multilateration.network.solver import conclude
+from errormotion.methods.multilateration.network.weakness import carriers
 
 _EXACT = 1e-3
 """Noise of the first target's readings, in units of their own, that counts as none."""
@@ -69,17 +70,49 @@ def bound(
     return conclude(problem, State(stations, place, problem.reduce(stations, place), 0, True), U)
 
 
+@np.errstate(all="ignore")
+def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array | None:
+    """Return the standard uncertainties (m,) of targets (m, 3), three coordinates together, m; NaN without a position.
+
+    None where a freedom is loose. Stations and dead paths are unknown; the covariances are those of `examine`.
+    """
+    weight = np.where(np.count_nonzero(weight, axis=0) >= 3, weight, 0.0)
+    e, D, whole = vectorised.seen(weight, station, target)
+    own = np.einsum("aam->m", D)
+    used = whole & carriers(np.where(whole, own, np.inf))
+    if np.count_nonzero(used) < 3:
+        return None
+    N = vectorised.left_over(weight[:, None] * e)
+    V = vectorised.equations(N * weight, e)
+    n, centre = len(station), target[used].mean(axis=0)
+    stations = Stations(station, np.zeros(n), np.zeros(0))
+    Z = stations.complement(centre, np.ones(4 * n, dtype=bool))
+    G, F = motions(target, centre), vectorised.response(weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e), e)
+    flat = G[used].reshape(-1, 6)
+    H = np.linalg.inv(flat.T @ flat)
+    shift = H @ (flat.T @ F[used].reshape(len(flat), -1))
+    information = Z.T @ (V @ V.T) @ Z
+    if determinacy.freedoms(information, Z - stations.motions(centre) @ (shift @ Z), station, target[used])[3].any():
+        return None
+    W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
+    F = (F - G @ shift) @ W
+    DG = D.transpose(2, 0, 1) @ G * used[:, None, None]
+    K = H @ (flat.T @ DG[used].reshape(-1, 6)) @ H
+    variance = own + np.einsum("map,map->m", F, F) + np.einsum("map,map->m", G @ K - 2 * DG @ H, G)
+    return np.where(whole, np.sqrt(variance), np.nan)
+
+
 def relative_bound(
     target: ArrayLike, station: ArrayLike, *, noise: float = 1e-6, first: int = 0
 ) -> tuple[Array, Array, Network]:
-    """Return what the formulation relative to one target is worth.
+    """Return the covariances of the formulation relative to one target.
 
     Returns
     -------
     target_covariance, joint_covariance : ndarray (m, 3, 3), (4 n, 4 n)
-        True covariances of its estimates, in the datum of the free network.
+        Of its estimates, in the datum of the free network.
     stated : Network
-        What it would state itself, the readings of that target taken for exact.
+        As the formulation states it, with the readings of that target taken as exact.
     """
     n, m = len(np.asarray(station)), len(np.asarray(target))
     sigma = np.full((n, m), float(noise))

@@ -1,4 +1,4 @@
-"""Which targets to measure: what a choice is to make small, as settings say it."""
+"""Candidates for targets, and limits of their number."""
 
 from __future__ import annotations
 

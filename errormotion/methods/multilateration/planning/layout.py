@@ -1,6 +1,6 @@
-"""Where to place the tracker: the layout from which the targets become least uncertain.
+"""Optimal positions of the tracker: the layout with the least uncertain targets.
 
-What a layout is worth follows from places alone (see `bound`). Places are searched for within boxes, from many starts,
+The uncertainty follows from positions alone (see `bound`). Positions are searched within boxes, from many starts,
 first with a smooth stand-in for the largest uncertainty of all targets, then with that itself.
 """
 
@@ -67,7 +67,7 @@ def route(layout: Layout) -> list[int]:
     left = list(range(len(position)))
     order = [left.pop(int(np.argmin(position.sum(axis=1))))]
     while left:
-        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at once
+        away = np.abs(position[left] - position[order[-1]]).max(axis=1)  # axes move at the same time
         order.append(left.pop(int(np.argmin(away))))
     return order
 
@@ -102,7 +102,7 @@ def optimise(
     noise : float
         Standard deviation of a reading, m.
     start : array_like (n, 3), optional
-        Places to begin with, m. The answer is never worse than they are, moved into their boxes.
+        Start positions, m. The result is never worse than these, moved into their boxes.
     minimise : {"largest", "mean"}
         Which uncertainty.
     seed : int
@@ -124,7 +124,7 @@ def optimise(
     """
     import nlopt
 
-    from errormotion.methods.multilateration.planning.bound import bound
+    from errormotion.methods.multilateration.planning.bound import predicted_uncertainty
 
     u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
     if len(corners) < LEAST:
@@ -144,14 +144,12 @@ def optimise(
         if lacking := _lacking(seen):
             return _PENALTY * (1.0 + lacking)
         try:
-            if worth is not None:
-                return weighed(worth(U), power)
-            with np.errstate(all="ignore"):  # in what is said about a loose freedom, which nobody reads here
-                network = bound(u, U, noise=noise, seen=seen)
-        except (MethodError, np.linalg.LinAlgError):  # a freedom is loose there
+            sigma = predicted_uncertainty(seen / noise, U, u) if worth is None else worth(U)
+        except np.linalg.LinAlgError:
             return _PENALTY
-        sigma = uncertainty(network.target_covariance)
-        return weighed(sigma, power) if np.isfinite(sigma).all() else _PENALTY
+        if sigma is None or (worth is None and not np.isfinite(sigma).all()):  # a freedom is loose there
+            return _PENALTY
+        return weighed(sigma, power)
 
     def weighed(sigma: Array, power: float | None) -> float:
         known = np.isfinite(sigma)
@@ -198,7 +196,7 @@ def optimise(
         starts = [best, *everywhere, *(np.array(x) for x in tried[:_STARTS])]
         starts = [search(nlopt.LN_SBPLX, x, _LOCAL, _POWER) for x in starts]
         best = min([best, *starts], key=cost)
-        # The largest of many uncertainties has edges along which a search creeps: begun anew it goes on.
+        # The largest of many uncertainties has edges along which a search is slow: a new search continues.
         for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX, nlopt.LN_COBYLA) * (_ROUNDS if thorough else 1):
             best = search(algorithm, best, _LOCAL)
     if cost(best) >= _PENALTY:

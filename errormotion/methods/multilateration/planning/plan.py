@@ -1,4 +1,4 @@
-"""What to expect of the set-up in the settings before anybody carries a tracker, and of the best one."""
+"""Predicted uncertainty of the layout in the settings, and of the best one."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ _AIR = (20.0, 101325.0, 0.5)
 def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None) -> xr.Dataset:
     """Return an error dataset of zeros with the covariance to expect of the layout that the settings name.
 
-    What it holds beside, all standard uncertainties of three coordinates together by the readings alone, m:
+    Further variables; all standard uncertainties are of three coordinates together, by the readings alone, m:
     ``target_uncertainty`` (target) of the layout as set; ``map_uncertainty`` (setup, place) at ``map_position``
     (place, direction), as set and with the best layout; ``largest_uncertainty`` and ``mean_uncertainty`` (setup) of
     that map; ``gain``, the factor by which the best layout is better in what was minimised; ``station_place`` and
     ``best_place`` (station, direction), m; ``sees`` (station, target) and ``best_sees`` (station, place). Where targets
     are chosen, the map is over the candidates, and ``chosen`` (place) is 1 for those to measure. The attribute
-    ``best_layout`` has the best layout as settings of a campaign; ``notes`` say it in words.
+    ``best_layout`` has the best layout as settings of a campaign; ``notes`` describe the plan.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _measure(planning: Planning, sigma: Array) -> float:
 
 
 def _best(settings: Settings, planning: Planning, sight: Sight, own: Array, expected: Network) -> Choice:
-    """Return the best places and what they are worth at the targets; the own ones where no others are better."""
+    """Return the best positions and the uncertainty at the targets; those of the layout where no others are better."""
     p, noise = settings.layout, reading_noise(settings)
     position, target = layout.grid(p)
     coarse = p.model_copy(update={"count": tuple(min(k, _COARSE) for k in p.count)})
@@ -199,7 +199,7 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
     except OSError as error:
         raise MethodError(
-            f"planning.write: {path}: expected a file that can be made anew; {error.strerror or error}. Name another."
+            f"planning.write: {path}: the file cannot be created; {error.strerror or error}. Give another name."
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Targets and stations chosen by turns: the targets for the stations, the stations for the targets."""
+"""Targets and stations chosen alternately: the targets for the stations, the stations for the targets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COARSE = 4
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen, and what it is worth all over the volume.
+    """The choice, and its uncertainty over the volume.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ def choose(
 
 
 def power_mean(sigma: Array, planning: Planning) -> float:
-    """Return what is minimised, m; places that nobody sees make it larger."""
+    """Return what is minimised, m; positions that no station sees increase it."""
     known = sigma[np.isfinite(sigma)]
     top, power = float(known.max()), POWERS[planning.minimise]
     unseen = 1 - len(known) / len(sigma)

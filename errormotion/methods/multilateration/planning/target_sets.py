@@ -224,7 +224,7 @@ class Volume:
         return np.asarray(np.einsum("k,kap,kaq->pq", weight, self.wanted, self.wanted, optimize=True))
 
     def _gains(self, C: Array, V: Array) -> Array:
-        """Return by how much the trace of V C falls with each candidate, (k,); those nobody sees have -inf."""
+        """Return the decrease of the trace of V C by each candidate, (k,); -inf for candidates that are not seen."""
         BC = self.told @ C
         inner = np.eye(self.told.shape[1]) + BC @ self.told.transpose(0, 2, 1)
         gain = np.trace(np.linalg.solve(inner, BC @ V @ BC.transpose(0, 2, 1)), axis1=1, axis2=2)

@@ -40,7 +40,7 @@ def blocks(errors: xr.Dataset, key: str) -> list[Block]:
     held = {name: found for name, found in curves.items() if found is not None}
     square = _squareness(errors)
     if not held and square is None:
-        return [Text("The errors of the axes were not estimated; the remarks say why if the method knows.", "note")]
+        return [Text("The errors of the axes were not estimated; the remarks state a known reason.", "note")]
     found: list[Block] = []
     if held:
         found.append(_figure(curves, key))
@@ -54,7 +54,7 @@ def blocks(errors: xr.Dataset, key: str) -> list[Block]:
         found.append(
             Text(
                 f"What the errors of the axes leave of the errors of the targets is {fixed(sigma0, 2)} times what "
-                "their uncertainty lets expect; 1 says that the axes explain them.",
+                "expected from their uncertainty; 1 means that the axes explain them.",
                 "plain" if sigma0 < 1.5 else "warning",
             )
         )

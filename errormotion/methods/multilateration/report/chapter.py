@@ -25,14 +25,14 @@ _TRACKER = "stations"
 _WORDS = {_TRACKER: "stations, by the tracker's noise", "repeatability": "repeatability of the machine"}
 _UNKNOWN = "not determined at any target"
 _NOT_SEEN = (
-    "Distances say how targets lie to one another and not where the whole of them is. Six rigid freedoms are therefore "
-    "not seen: three shifts and three rotations of all targets together. They are set so that the targets fit their "
-    "commanded places best; an error that moves or turns the whole volume does not appear here, and is not in the "
-    "uncertainty."
+    "Distances determine the positions of the targets relative to each other, not that of the whole. Six motions are "
+    "therefore not determined: three shifts and three rotations of all targets together. They are set for the best fit "
+    "of the targets to their commanded positions. An error that moves or turns the whole volume does not appear here, "
+    "and is not in the uncertainty."
 )
 _ROTATIONS = (
-    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown and not zero. What rotations of "
-    "the axes do shows only as displacements of the reflector."
+    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown and not zero. Rotations of the "
+    "axes show only as displacements of the reflector."
 )
 
 
@@ -152,7 +152,7 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     found: list[Block] = [multilateration_figures.ellipsoids(net, f"{key}-ellipsoids")]
     sigma = net.worst_direction
     if "influence" not in errors or not np.isfinite(sigma).any():
-        return [*found, Text("The result does not say where its uncertainty comes from.", "note")]
+        return [*found, Text("The result does not state the sources of its uncertainty.", "note")]
     worst = int(np.nanargmax(sigma))
     table = budget.table(_parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the least certain target")
     own = budget.readable("independent")
@@ -165,7 +165,7 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
 
 
 def _parted(place: xr.Dataset) -> xr.Dataset:
-    """Return a result at one target with its own readings' covariance divided by cause, as ``scatter_share`` says.
+    """Return a result at one target with its own readings' covariance divided by cause, after ``scatter_share``.
 
     What is independent from target to target is the tracker's noise and the machine's repeatability in one; at one
     target the second is a group like others.
@@ -184,9 +184,9 @@ def _parted(place: xr.Dataset) -> xr.Dataset:
             rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
             groups.append(str(cause))
     names = [*place["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
-    told = [*place["source_group"].values.tolist(), *groups]
+    all_groups = [*place["source_group"].values.tolist(), *groups]
     without = place.drop_dims("source")
-    parted = without.assign_coords(source=names, source_group=("source", told))
+    parted = without.assign_coords(source=names, source_group=("source", all_groups))
     return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
 
 
@@ -208,12 +208,12 @@ def _remarks(errors: xr.Dataset) -> list[Block]:
 def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     facts = [
         ("noise of a reading, as used / µm", fixed(1e6 * net.noise, 2)),
-        ("scatter over what was stated", fixed(scalar(errors, "sigma0"), 3)),
+        ("scatter over the stated one", fixed(scalar(errors, "sigma0"), 3)),
         ("readings less unknowns", integer(scalar(errors, "freedom"))),
         ("iterations", integer(scalar(errors, "iterations"))),
         ("condition of what can be determined", significant(scalar(errors, "condition"), 3)),
-        ("turns of the alternating scheme, beside ours", integer(scalar(errors, "alternating_iterations"))),
-        ("what it had left to go / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
+        ("iterations of the alternating scheme", integer(scalar(errors, "alternating_iterations"))),
+        ("its estimated remaining distance / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
         ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
         ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
     ]

@@ -43,7 +43,7 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
     um = 1e6 * sigma
     top, low = finite(np.max, um), finite(np.min, um)
     if not np.isfinite(top):
-        return Text("The uncertainty is not known anywhere, and no map is drawn.", "note")
+        return Text("The uncertainty is unknown everywhere, and no map is drawn.", "note")
 
     def paint(figure: Canvas) -> None:
         panels = figure.subplots(2, len(levels), sharex=True, sharey=True, squeeze=False)

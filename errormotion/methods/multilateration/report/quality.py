@@ -33,25 +33,25 @@ def stations(net: Network) -> Block:
         count = integer(int(used.sum())) if read else Cell("—", reason=unknown)
         rows.append([name, *place, path, off, count, or_dash(fixed(1e6 * rms, 2), unknown)])
     return Table(
-        "Places of the tracker and dead paths (what its counter did not know of the way), with expanded uncertainty, "
-        "k = 2. Off: distance from the rough place. Residual: root mean square.",
+        "Positions of the tracker and dead paths (offsets of its counter), with expanded uncertainty, "
+        "k = 2. Off: distance from the approximate position. Residual: root mean square.",
         ["station", "x / mm", "y / mm", "z / mm", "dead path / mm", "off / mm", "used", "residual / µm"],
         rows,
-        [("", 1), ("place", 3), ("", 1), ("", 1), ("readings", 2)],
+        [("", 1), ("position", 3), ("", 1), ("", 1), ("readings", 2)],
     )
 
 
 def planned(errors: xr.Dataset, net: Network) -> Block:
     """Return the table of a plan's stations: where they are set, and where they would be best."""
     if "best_place" not in errors or errors["best_place"].dims != ("station", "direction"):
-        return Text("The plan names no better places.", "note")
+        return Text("The plan contains no better positions.", "note")
     best = np.asarray(errors["best_place"].values, float)
     rows: list[list[Cell | str]] = [
         [name, *(or_dash(fixed(1e3 * v, 0), "not known") for v in (*own, *better))]
         for name, own, better in zip(net.stations, net.station, best, strict=True)
     ]
     return Table(
-        "Places of the tracker as set, as drawn above, and the best within the boxes.",
+        "Positions of the tracker as set, as drawn above, and the best within the boxes.",
         ["station", *2 * ("x / mm", "y / mm", "z / mm")],
         rows,
         [("", 1), ("as set", 3), ("best", 3)],
@@ -117,7 +117,7 @@ def left_out(net: Network) -> list[Block]:
     if given_up.size:
         names = [net.targets[i] for i in given_up[:_NAMED]]
         more = f", and {integer(given_up.size - _NAMED)} more" if given_up.size > _NAMED else ""
-        words = "Given up, because their readings contradict one another and nothing tells which is wrong"
+        words = "Given up, because their readings contradict each other and the wrong one is not determined"
         found.append(Text(f"{words}: {listed(names)}{more}.", "warning"))
     lost = int((~np.isfinite(net.residual) & (net.left_out == 0)).sum())
     if np.isfinite(net.residual).any() and lost:

@@ -93,7 +93,7 @@ def is_multilateration(errors: xr.Dataset) -> bool:
 
 
 def network(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Network:
-    """Return the view of a dataset over targets; ``raw`` tells by how much readings that were left out are wrong."""
+    """Return the view of a dataset over targets; ``raw`` gives the residuals of excluded readings."""
     m, n = errors.sizes["target"], errors.sizes.get("station", 0)
     sizes = {"target": m, "station": n, "direction": 3, "direction_": 3}
 

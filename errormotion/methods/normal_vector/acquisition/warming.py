@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.normal_vector.acquisition import cycle
 
@@ -218,7 +219,7 @@ def age(done: xr.Dataset) -> float:
     return (datetime.now(UTC) - start).total_seconds()
 
 
-def _ends(done: xr.Dataset) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _ends(done: xr.Dataset) -> Array:
     """Return the time of the last touch of each cycle, s; its start if unknown."""
     starts = done["time"].values.astype(float)
     if "touch_time" not in done:

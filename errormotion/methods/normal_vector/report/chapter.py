@@ -19,7 +19,7 @@ from errormotion.methods.normal_vector.report.view import (
     is_normal_vector,
     probing,
 )
-from errormotion.report import budget, provenance, quality, sensors, timeline
+from errormotion.report import budget, provenance, quality, timeline
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import (
     Block,
@@ -34,8 +34,8 @@ from errormotion.report.document import (
     estimate,
     or_dash,
 )
-from errormotion.report.fields import remarks
 from errormotion.report.generic import unit_at
+from errormotion.report.parts import sensors
 from errormotion.report.series import events
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
@@ -318,5 +318,5 @@ def _uncertainty(errors: xr.Dataset, seen: Probing) -> list[Block]:
 
 
 def _quality(source: Source) -> list[Block]:
-    found: list[Block] = [Text(note, "warning") for note in remarks(source.errors)]
-    return [*found, *quality.sentences(source.errors, source.raw)] or [Text("The method reported no remarks.")]
+    found = [*quality.notes(source.errors), *quality.sentences(source.errors, source.raw)]
+    return found or [Text("The method reported no remarks.")]

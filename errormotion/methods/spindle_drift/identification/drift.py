@@ -11,7 +11,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.hashing import DatasetHasher
+from errormotion.datasets.files.hashing import DatasetHasher
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis

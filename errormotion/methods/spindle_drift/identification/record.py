@@ -21,7 +21,7 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.datasets.hashing import DatasetHasher
+    from errormotion.datasets.files.hashing import DatasetHasher
     from errormotion.methods.spindle_drift.settings import Settings
 
 

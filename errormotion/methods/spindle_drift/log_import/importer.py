@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.text.log_format import TIMESTAMP
 from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
-from errormotion.datasets.tomlfile import load_model
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.log_import.import_map import (

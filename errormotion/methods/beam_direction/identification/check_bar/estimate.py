@@ -1,4 +1,4 @@
-"""The bar with the least sum of squared distances from points, how well it is held, and what noise would leave."""
+"""Fit of a bar to points by least squares, its covariance, and the residuals expected from noise."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["FALSE_ALARMS", "Bar", "Judged", "judged", "settled", "start"]
 
 
 FALSE_ALARMS = 0.01
-"""Chance at which a bar without fault is called systematic, or noisier than stated."""
+"""Probability that a correct bar is reported as systematic, or noisier than stated."""
 _STEPS = 50
 _AT_REST = 1e-12  # m
 
 
 @dataclass(frozen=True)
 class Bar:
-    """Where a bar is, and which of its parameters are free."""
+    """Position of a bar, and its free parameters."""
 
     centre: Array
     axis: Array
@@ -82,7 +82,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a fit leaves, and how well it is known."""
+    """Residuals and uncertainty of a fit."""
 
     covariance: Array
     common: Array
@@ -93,9 +93,9 @@ class Judged:
 
 
 def start(p: Array, own: Array, axis: Array, shape: str, robust: bool) -> tuple[Bar, tuple[int, ...]]:
-    """Return a bar near the best one, and the indices of the points that do not belong to it.
+    """Return a bar near the best one, and the indices of the outliers.
 
-    The radius is free here: a wrong one must not make good points look wrong.
+    The radius is free here, so that a wrong radius does not cause outliers.
     """
     sigma = float(np.sqrt(np.median(np.trace(own, axis1=1, axis2=2)))) if len(p) else 0.0
     floor = {"sigma": sigma} if sigma > 0 else {}
@@ -118,7 +118,7 @@ def settled(p: Array, start: Bar, shape: str, held: float | None) -> Bar:
         if np.abs(step[:2]).max() < _AT_REST:
             break
     else:
-        raise FitError("the fit of the bar did not settle: is the radius right, and the axis?")
+        raise FitError("the fit of the bar does not converge. Check the radius and the axis")
     middle = float(((p - bar.centre) @ bar.axis).mean())
     return Bar(bar.centre + middle * bar.axis, bar.axis, bar.radius, bar.tilts, bar.held)
 

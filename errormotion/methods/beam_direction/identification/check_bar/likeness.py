@@ -1,4 +1,4 @@
-"""Whether the residuals of a fit are noise, or resemble those of their neighbours."""
+"""Correlation of neighbouring residuals of a fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["likeness"]
 
 
 def likeness(f: Array, M: Array) -> tuple[float, float]:
-    """Return how alike neighbouring residuals are, and the chance that noise makes them as much alike or more.
+    """Return the correlation of neighbouring residuals, and the probability of it or a larger one by noise.
 
     Parameters
     ----------

@@ -1,10 +1,9 @@
-"""A check bar as the proof of a calibrated beam: the circle or cylinder through its points, and what they leave over.
+"""A check bar as the verification of a calibrated beam: circle or cylinder through its points, and the residuals.
 
-All points count alike, as in the tables that such measurements are published in; the covariance is that of this very
-estimate, from each point's own noise and from what all points share (`Points.influence`). Points that do not belong are
-left out and named. What the noise does not explain is said: that the residuals are larger than the noise, and that they
-are systematic, that is, resemble those of their neighbours along the bar. A radius that comes out well is no proof
-then, since a systematic error goes into centre and radius without being seen in their uncertainty.
+All points have the same weight, as in published tables of such measurements; the covariance is that of this estimate,
+from the noise of each point and from shared sources (`Points.influence`). Outliers are ignored and reported. Residuals
+larger than the noise, and systematic residuals (correlated along the bar), are reported. In this case a correct radius
+is no verification, because a systematic error affects centre and radius without affecting their uncertainty.
 """
 
 from __future__ import annotations
@@ -128,16 +127,16 @@ def fit_bar(
     hold_radius : bool
         Fit with ``radius`` as it is given.
     robust : bool
-        Leave out and name the points that do not belong.
+        Ignore and report outliers.
     noise : float, optional
         Standard deviation of each coordinate, m; for bare points, since `Points` have their own.
 
     Raises
     ------
     MethodError
-        Input that is not as said above.
+        Invalid input.
     FitError
-        Points that do not hold the shape, or no shape that half of them agree on.
+        Points that do not determine the shape, or do not agree on one.
     """
     p, own, influence, reading = _given(scanned, noise)
     u = np.asarray(axis, float)
@@ -232,9 +231,9 @@ def measure_bar(
     FitError
         See `fit_bar`.
     """
-    lacking = [name for name in ("bar_distance", "bar_stage", "bar_axis") if name not in raw]
-    if lacking:
-        raise MethodError(f"Expected readings of a check bar in the raw dataset; missing {', '.join(lacking)}.")
+    missing = [name for name in ("bar_distance", "bar_stage", "bar_axis") if name not in raw]
+    if missing:
+        raise MethodError(f"Expected readings of a check bar in the raw dataset; missing {', '.join(missing)}.")
     axis = raw["bar_axis"].values
     speckle = float(raw["speckle"]) if "speckle" in raw else 0.0
     scanned = points(
@@ -267,7 +266,7 @@ def measure_bar(
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Whether residuals are noise, in words."""
+    """Whether the residuals are noise, as text."""
 
     judged: Judged
     likeness: float
@@ -283,14 +282,14 @@ class _Verdict:
         noise = explained if self.judged.exceeds else ""
         if self.systematic:
             return [
-                f"The residuals are systematic: {size}{noise}, and neighbours along the bar resemble each other "
-                f"(correlation {self.likeness:.2f}, by chance once in {_rarely(self.chance)}). Centre and radius carry "
-                "an error that their uncertainty does not contain."
+                f"The residuals are systematic: {size}{noise}, and neighbours along the bar are correlated "
+                f"(correlation {self.likeness:.2f}, by chance once in {_rarely(self.chance)}). Centre and radius have "
+                "an error that is not part of their uncertainty."
             ]
         if self.judged.exceeds:
             return [
-                f"The residuals exceed the noise: {size}{noise}. They look random along the bar; uncertainties were "
-                "enlarged to match. Is the noise as stated, the bar clean, the stage quiet?"
+                f"The residuals exceed the noise: {size}{noise}. They are random along the bar; the uncertainties were "
+                "raised accordingly. Check the stated noise, the surface of the bar, and vibrations of the stage."
             ]
         return []
 
@@ -313,17 +312,18 @@ def _given(scanned: Points | ArrayLike, noise: float | None) -> tuple[Array, Arr
 def _left_out(k: int, residual: float, reading: Array | None, n: int) -> str:
     what = "" if reading is None else f", reading {1e3 * reading[k]:.3f} mm"
     side = "outside" if residual > 0 else "inside"
-    return f"Point {k + 1} of {n} (index {k}{what}) was left out: it lies {_um(abs(residual))} {side} the bar."
+    where = f"{_um(abs(residual))} {side} the bar"
+    return f"Point {k + 1} of {n} (index {k}{what}) is an outlier and was ignored: it is {where}."
 
 
 def _compared(free: float, free_u: float, known: float, known_u: float) -> Sequence[str]:
-    """Return what there is to say of a radius that is not the bar's."""
+    """Return a note on a radius that differs from the calibrated one."""
     u = float(np.hypot(free_u, known_u))
     if not abs(free - known) > 2 * u:
         return ()
     return [
-        f"The points have a radius of {1e3 * free:.4f} mm by themselves, which is {1e6 * (free - known):+.1f} um off "
-        f"the bar's {1e3 * known:.4f} mm; the expanded uncertainty (k = 2) of the difference is {_um(2 * u)}."
+        f"The points have a radius of {1e3 * free:.4f} mm, which is {1e6 * (free - known):+.1f} um off "
+        f"the calibrated {1e3 * known:.4f} mm; the expanded uncertainty (k = 2) of the difference is {_um(2 * u)}."
     ]
 
 

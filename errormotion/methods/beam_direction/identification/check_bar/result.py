@@ -1,4 +1,4 @@
-"""A check bar in a result: beside the planes that a beam was found with, or alone, seen by a beam that is known."""
+"""A check bar in a result: with the planes of the beam, or alone with a known beam."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return a result that holds a check bar and no errors of the beam: they are NaN, since nothing tells them.
+    """Return a result that holds a check bar and no errors of the beam: they are NaN.
 
     The beam is taken as the data state it, ``nominal_direction`` and ``nominal_origin`` (the stage's zero without).
 

@@ -1,6 +1,6 @@
 """Surface points from the readings of a calibrated beam, with what is known of each and of all together.
 
-A reading d at the place s of the stage puts a point at p = p0 + s + d u, p0 the zero point, u the unit vector of the
+A reading d at the position s of the stage puts a point at p = p0 + s + d u, p0 the zero point, u the unit vector of the
 beam; readings grow away from the sensor. The noise is each point's own. What is not known of the beam, or of the
 calibration of its inclination error, is one draw for the whole scan: it is kept as influences, never as scatter.
 
@@ -55,7 +55,7 @@ class Points:
     reading : ndarray (n,)
         As read, m.
     distance : ndarray (n,)
-        With the inclination error taken off, m; the same as `reading` where there is no calibration.
+        With the inclination error corrected, m; the same as `reading` where there is no calibration.
     direction : ndarray (3,)
         Of the beam.
     normals : ndarray (n, 3) or None
@@ -63,7 +63,7 @@ class Points:
     tilt : ndarray (n, 2) or None
         Tilt vectors of the surface to the beam, where a calibration was used.
     turns : int
-        How often the normals were found anew.
+        How often the normals were found again.
     notes : tuple of str
         What a user should know.
     """
@@ -109,7 +109,7 @@ def points(
     reading : array_like (n,)
         m, growing away from the sensor; NaN where there was none.
     stage : array_like (n, 3)
-        Place of the stage at each reading, m.
+        Position of the stage at each reading, m.
     origin, direction : array_like (3,)
         Zero point of the beam while the stage is at 0, m, and the unit vector along which readings grow.
     covariance : array_like (6, 6), optional
@@ -128,7 +128,7 @@ def points(
     moves : {"sensor", "target"}
         What the stage carries; if it is the target, the points are in the target's own frame.
     extrapolate : bool
-        Compensate also where the calibration does not speak for the tilt or the depth.
+        Compensate also where the calibration does not cover the tilt or the depth.
 
     Raises
     ------
@@ -138,15 +138,15 @@ def points(
     """
     r, s = np.asarray(reading, float), np.asarray(stage, float)
     if r.ndim != 1 or s.shape != (len(r), 3):
-        raise MethodError(f"Expected readings (n,) and stage places (n, 3); found {r.shape} and {s.shape}.")
+        raise MethodError(f"Expected readings (n,) and stage positions (n, 3); found {r.shape} and {s.shape}.")
     beam = _beam(origin, direction, covariance)
     measured = np.isfinite(r) & np.isfinite(s).all(axis=1)
     if not measured.any():
         raise MethodError("Expected readings; found none that is a number.")
     if moves not in ("sensor", "target"):
         raise MethodError(f"moves: expected 'sensor' or 'target'; found '{moves}'.")
-    places = s[measured] if moves == "sensor" else -s[measured]
-    scan = _Scan(r[measured], places, beam, calibration, triangulation_normal, mid_range, extrapolate)
+    positions = s[measured] if moves == "sensor" else -s[measured]
+    scan = _Scan(r[measured], positions, beam, calibration, triangulation_normal, mid_range, extrapolate)
     surface, notes = _surface(normals, measured, scan)
     distance, N, turns = _at_rest(scan, surface)
     notes += _extrapolated(scan, N)
@@ -165,7 +165,7 @@ def points(
         full[(slice(None),) * axis + (measured,)] = values
         return full
 
-    filled = [spread(values) for values in (scan.place(distance), own, distance)]
+    filled = [spread(values) for values in (scan.position(distance), own, distance)]
     p, C, d = (np.asarray(values) for values in filled)
     return Points(
         points=p,
@@ -198,7 +198,7 @@ class _Scan:
     def direction(self) -> Array:
         return self.beam[1]
 
-    def place(self, distance: Array, origin: Array | None = None, direction: Array | None = None) -> Array:
+    def position(self, distance: Array, origin: Array | None = None, direction: Array | None = None) -> Array:
         """Return the points (n, 3) at these distances, of this beam or of another one."""
         p0, u, _ = self.beam
         p0, u = p0 if origin is None else origin, u if direction is None else direction
@@ -272,7 +272,7 @@ def _at_rest(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Array
         return _compensated(scan, surface), surface, 0
     distance = scan.reading
     for turn in range(1, TURNS + 1):
-        N = scan.facing(surface(scan.place(distance)))
+        N = scan.facing(surface(scan.position(distance)))
         before, distance = distance, _compensated(scan, N)
         if np.abs(distance - before).max() < AT_REST:
             return distance, N, turn
@@ -291,7 +291,7 @@ def _compensated(scan: _Scan, normals: Array) -> Array:
 
 
 def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
-    """Say how many points (normals (n, 3)) were compensated at tilts that the calibration does not speak for."""
+    """Say how many points (normals (n, 3)) were compensated at tilts that the calibration does not cover."""
     if scan.calibration is None or normals is None:
         return ()
     beyond = int((~scan.calibration.supported(scan.tilt(normals))).sum())
@@ -299,7 +299,7 @@ def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
         return ()
     return (
         f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not speak "
-        "for: what was taken off there is extrapolated.",
+        "for: what was corrected there is extrapolated.",
     )
 
 
@@ -316,7 +316,7 @@ def _influences(scan: _Scan, normals: Array | None, distance: Array) -> tuple[Ar
         if calibration is not None and normals is not None:
             q = scan.tilt(normals, tipped)
             d = calibration.compensate(scan.reading, q, scan.mid_range, extrapolate=True).value
-        return scan.place(d, p0 + step[:3], tipped)
+        return scan.position(d, p0 + step[:3], tipped)
 
     for k, step in enumerate(factors(C) if C is not None else ()):
         found.append((moved(step) - moved(-step)) / 2)

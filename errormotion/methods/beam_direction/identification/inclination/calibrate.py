@@ -1,7 +1,7 @@
-"""Calibration of a point sensor's inclination error from readings against an interferometer.
+"""Calibration of the inclination error of a point sensor from readings against an interferometer.
 
-``inclination_lines`` finds the slope of every setting, ``inclination_surface`` the smooth surface through them; here
-both become a calibration dataset, with how well it predicts settings that it has not seen.
+``lines`` fits the slope of every setting, ``surface`` a smooth surface to the slopes; this module combines them to a
+calibration dataset, with the prediction error at settings that were left out.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from errormotion.methods.beam_direction.identification.inclination.surface impor
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA
 
 GAP = 0.6
-"""Widest empty circle between calibrated tilts that counts as surrounded, in tilts of the steepest: half a wave of a k
-that changes its sign five times in half a turn about the beam."""
+"""Diameter of the largest empty circle between calibrated tilts that is covered, relative to the steepest tilt: half a
+wave of a k that changes its sign five times in half a turn about the beam."""
 MARGIN = 0.05
-"""How far from calibrated tilts a tilt may lie, in tilts of the steepest."""
+"""Largest distance of a covered tilt from the calibrated tilts, relative to the steepest tilt."""
 
 _CONTRADICTS = 6.0
-"""Standard deviations from which on a setting contradicts all the others."""
+"""Standard deviations from which on a setting contradicts all others."""
 _MOST_CONTRADICTING = 0.1
-"""Share of the settings that may do so."""
+"""Largest share of such settings."""
 _FEWEST = 4
 """Fewest different tilts: one more than a plane has coefficients."""
 _FEW = 50
 """Different tilts below which the intervals are rough."""
 _NAMED = 6
 _SPOILS = 3.5
-"""Steps of inclination that a hole may have before the intervals beside it suffer: they hold in 70 to 90 % of cases."""
+"""Size of a hole, in steps of inclination, from which on the intervals next to it hold in only 70 to 90 % of cases."""
 _ALL_AROUND = np.radians(359.0)
 _DRAWS = 1000
 _SEVERAL = 3.0
-"""Standard uncertainties that a mid range may be off the stated one without a word."""
+"""Standard uncertainties from which on a deviation of the mid-range from the stated one is reported."""
 
 
 class Settings(BaseModel):
@@ -56,20 +56,24 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     order: int | None = Field(
-        default=None, ge=0, le=inclination_surface.HIGHEST, description="order of the polynomial; default: chosen"
+        default=None,
+        ge=0,
+        le=inclination_surface.HIGHEST,
+        description="order of the polynomial; default: chosen from the data",
     )
     mirror: bool | None = Field(
-        default=None, description="whether the plane of triangulation is one of symmetry; default: chosen"
+        default=None,
+        description="whether the error is symmetric about the triangulation plane; default: chosen from the data",
     )
     offsets: Literal["auto", "each", "none"] = Field(
-        default="auto", description="whether each setting has a zero of its own, as an interferometer leaves it"
+        default="auto", description="whether each setting has its own zero of the interferometer"
     )
 
     serial_number: str = Field(default="", description="serial number of the sensor; default: as the readings state it")
 
 
 def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationCalibration:
-    """Make a calibration of readings.
+    """Return the calibration from readings.
 
     Parameters
     ----------
@@ -80,14 +84,14 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     Returns
     -------
     InclinationCalibration
-        Its attribute ``notes`` (text, one note a line) says what should be known when it is used.
+        Its attribute ``notes`` (text, one note per line) states restrictions of its use.
 
     Raises
     ------
     DatasetError
-        The raw dataset breaks its schema.
+        The raw dataset violates its schema.
     MethodError
-        Readings that cannot be meant, or too few settings.
+        Implausible readings, or too few settings.
     """
     settings = settings or Settings()
     if raw.attrs.get("schema") != INCLINATION_SCHEMA:
@@ -122,7 +126,7 @@ def _serial_number(raw: xr.Dataset, settings: Settings) -> dict[str, str]:
 
 
 def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.bool_], Surface]:
-    """Return which settings were used and the surface through them; those that contradict all the others are not."""
+    """Return which settings were used and the surface through them; those that contradict all others are not."""
     different = len(np.unique(np.round(q, 6), axis=0))
     fits = [
         order
@@ -131,14 +135,14 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
     ]
     if different < _FEWEST:
         raise MethodError(
-            f"{different} different tilts of the surface; expected at least {_FEWEST}, so that each can be left out "
-            "and predicted by the others. Measure more inclinations and rotations."
+            f"{different} different tilts of the surface; expected at least {_FEWEST}, for the cross-"
+            "validation. Measure more inclinations and rotations."
         )
     if settings.order is not None and settings.order not in fits:
         count = len(inclination_surface.degrees_to(settings.order, bool(settings.mirror)))
         raise MethodError(
             f"Order {settings.order} has {count} coefficients; expected more different tilts than that, found "
-            f"{different}. Take order {fits[-1]} or less, or measure more settings."
+            f"{different}. Use order {fits[-1]} or less, or measure more settings."
         )
     x = half_tilt(q)
     kept = np.ones(len(q), dtype=bool)
@@ -153,7 +157,7 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
         )
         z = np.abs(surface.prediction.z)
         z = z / max(1.4826 * float(np.median(z)), 1e-3)
-        # The worst first: it pulls its neighbours with it.
+        # The worst one first, because it also affects its neighbours.
         wrong = z > max(_CONTRADICTS, 0.5 * z.max())
         if not wrong.any() or (~kept).sum() + wrong.sum() > _MOST_CONTRADICTING * len(q):
             return kept, surface
@@ -208,7 +212,7 @@ def _variables(
 
 
 def _interval(missed: Array) -> Array:
-    """Return the 95 % interval (2,) of a root mean square, from settings drawn again and again with replacement."""
+    """Return the 95 % interval (2,) of a root mean square, by bootstrap over the settings."""
     rng = np.random.default_rng(0)
     draws = rng.integers(0, len(missed), size=(_DRAWS, len(missed)), dtype=np.int32)
     return np.asarray(np.quantile(np.sqrt((missed**2)[draws].mean(axis=1)), [0.025, 0.975]))
@@ -221,13 +225,13 @@ def _notes(
     kept: NDArray[np.bool_],
     pivot: MidRange,
 ) -> Iterator[str]:
-    """Yield what should be known when the calibration is used."""
+    """Yield the notes of the calibration."""
     settings = [
         f"inclination {a:g} deg at rotation {b:g} deg"
         for a, b in zip(np.degrees(readings.inclination), np.degrees(readings.rotation), strict=True)
     ]
     if readings.missing:
-        yield f"{_of(readings.missing, 'group')} without a reading {_were(readings.missing)} not used."
+        yield f"{_of(readings.missing, 'group')} without a reading {_were(readings.missing)} ignored."
     wild = np.flatnonzero(lines.left_out)
     if wild.size:
         named = [
@@ -241,23 +245,23 @@ def _notes(
         named = [settings[k] for k in wrong[:_NAMED]]
         contradict = "contradicts" if wrong.size == 1 else "contradict"
         yield (
-            f"{_of(wrong.size, 'setting')} {contradict} all the others and {_were(wrong.size)} left out: "
+            f"{_of(wrong.size, 'setting')} {contradict} all others and {_were(wrong.size)} left out: "
             f"{_list(named, wrong.size)}."
         )
     if np.isfinite(readings.noise) and not 0.5 <= lines.noise / max(readings.noise, 1e-12) <= 2.0:
         yield (
-            f"The readings scatter by {1e6 * lines.noise:.3g} um about their lines; stated were "
-            f"{1e6 * readings.noise:.3g} um. The scatter counts."
+            f"The scatter of the readings about their lines is {1e6 * lines.noise:.3g} um; the stated noise is "
+            f"{1e6 * readings.noise:.3g} um. The scatter is used."
         )
     shift = pivot.reading - readings.mid_range
     if abs(shift) > _SEVERAL * pivot.uncertainty and abs(shift) * np.ptp(lines.slope) > lines.noise:
         yield (
             f"The lines of the settings meet at a reading of {1e3 * pivot.reading:.4f} mm "
-            f"(u = {1e3 * pivot.uncertainty:.4f} mm), not at the stated mid range, {1e3 * readings.mid_range:.4f} mm."
+            f"(u = {1e3 * pivot.uncertainty:.4f} mm), not at the stated mid-range, {1e3 * readings.mid_range:.4f} mm."
         )
     different = len(np.unique(np.round(calibration.settings, 6), axis=0))
     if different < _FEW:
-        yield f"{different} different tilts: fewer than {_FEW} tell only roughly what lies between them."
+        yield f"{different} different tilts: with fewer than {_FEW} the calibration between them is uncertain."
     if not calibration.serial_number:
         yield "The serial number of the sensor is unknown: the calibration cannot be refused for another sensor."
     yield from _holes(calibration)
@@ -267,16 +271,16 @@ def _holes(calibration: InclinationCalibration) -> Iterator[str]:
     holes, step = calibration.support.holes(), calibration.support.step
     if not holes:
         return
-    told = hole_texts(holes)
+    texts = hole_texts(holes)
     yield (
         f"Holes between the settings, whose usual step is {np.degrees(step):.3g} deg of inclination; tilts in them are "
-        f"refused: {_list(told[:_NAMED], len(told))}."
+        f"refused: {_list(texts[:_NAMED], len(texts))}."
     )
     widest = max((np.ptp(hole.inclination) for hole in holes if np.ptp(hole.rotation) > _ALL_AROUND), default=0.0)
     if widest > _SPOILS * step:
         yield (
-            f"A hole of {np.degrees(widest):.0f} deg at every rotation spoils what is told beside it too: the "
-            "intervals hold less often than they say. Measure settings in it."
+            f"A hole of {np.degrees(widest):.0f} deg at every rotation also affects its surroundings: intervals there "
+            "hold less often than stated. Measure settings in it."
         )
 
 

@@ -1,7 +1,7 @@
 """Readings against an interferometer, setting by setting: each setting of the surface has a line of errors over depth.
 
 The error of a reading is e = r - d = (d - m) k + b: k the slope of the setting, b the zero of its series, because an
-interferometer tells displacements only. Readings that do not belong to the line of their setting are left out.
+interferometer measures displacements only. Readings that do not fit the line of their setting are left out.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Indices = NDArray[np.int64]
 SAME = 1e-5
 """Angle within which groups belong to one setting, rad."""
 FEWEST_FREE = 30
-"""Degrees of freedom from which on the scatter about the lines tells the noise."""
+"""Degrees of freedom from which on the noise follows from the scatter about the lines."""
 _ENOUGH = 4
-"""Readings that a setting needs, on average, for a zero of its own."""
+"""Mean number of readings per setting from which on each setting has its own zero."""
 _OUTLIER = 5.0
-"""Standard deviations from which on a reading does not belong to its line."""
+"""Standard deviations from which on a reading does not fit its line."""
 _LEAST_NOISE = 1e-10
 """m; rounding of readings without noise."""
 _ROUNDS = 20
@@ -33,7 +33,7 @@ _GAUSS = 1.4826  # standard deviation of normal numbers over their median absolu
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings that can be used, group by group.
+    """Valid readings by group.
 
     Attributes
     ----------
@@ -96,13 +96,13 @@ class Lines:
 
 
 def read(raw: xr.Dataset) -> Readings:
-    """Take the readings out of a raw dataset and refuse those that cannot be meant.
+    """Return the readings of a raw dataset; implausible readings are refused.
 
     Raises
     ------
     MethodError
-        Readings or references that do not move, that count against one another or in another unit, depths on one side
-        of mid range only, no inclination at all.
+        Readings or references that do not change, have opposite signs or different units, depths on one side of
+        mid-range only, or no inclination.
     """
     r, d, alpha, beta = (
         np.asarray(raw[name].values, dtype=float) for name in ("reading", "reference", "inclination", "rotation")
@@ -114,7 +114,7 @@ def read(raw: xr.Dataset) -> Readings:
     m = float(raw["mid_range"]) if "mid_range" in raw.variables else 0.0
     _check(r, d, m)
     if np.abs(alpha).max() < SAME:
-        raise MethodError("Every inclination is 0; expected a surface that is set to several inclinations.")
+        raise MethodError("Every inclination is 0; expected several inclinations.")
     written = np.round(np.stack([alpha, beta]) / SAME)
     _, first, setting = np.unique(written, axis=1, return_index=True, return_inverse=True)
     return Readings(
@@ -131,30 +131,32 @@ def read(raw: xr.Dataset) -> Readings:
 
 
 def _check(r: Array, d: Array, m: float) -> None:
-    """Refuse readings and references that cannot be meant."""
+    """Refuse implausible readings and references."""
     if np.ptp(d) < 1e-6:
         raise MethodError(f"The reference stays at {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor.")
     way = float(np.cov(r, d)[0, 1] / d.var(ddof=1)) if len(d) > 1 else 1.0
     if abs(way) < 1e-4:
         raise MethodError(
             f"The readings stay near {1e3 * np.median(r):.4f} mm while the reference moves by {1e3 * np.ptp(d):.3f} "
-            "mm; expected both to move together. Is it the right column?"
+            "mm; expected the same displacement. Check the column."
         )
     if way < 0:
         raise MethodError(
-            "The readings fall where the reference rises: one of them counts the other way. Change the sign of the "
-            "reference, so that both grow with the depth."
+            "The readings decrease where the reference increases. Change the sign of the reference, so that both "
+            "increase with the depth."
         )
     if not 0.8 < way < 1.25:
         units = {1e3: " Is the reference in mm, written as m?", 1e-3: " Are the readings in mm, written as m?"}
         hint = next((text for factor, text in units.items() if 0.8 < way * factor < 1.25), " Are the units right?")
-        raise MethodError(f"The readings move {way:.4g} times as far as the reference; expected about once.{hint}")
+        raise MethodError(
+            f"The readings change {way:.4g} times as much as the reference; expected a ratio of about 1.{hint}"
+        )
     low, high = float(d.min() - m), float(d.max() - m)
     if min(-low, high) < 0.05 * (high - low):
         raise MethodError(
-            f"The depths go from {1e3 * low:.3f} to {1e3 * high:.3f} mm about mid range ({1e3 * m:.3f} mm), all on one "
-            "side; expected both sides, because the error changes its sign there. Is `mid_range` right, and does the "
-            "reference count as the readings do?"
+            f"The depths go from {1e3 * low:.3f} to {1e3 * high:.3f} mm about mid-range ({1e3 * m:.3f} mm), all on one "
+            "side; expected both sides, because the error changes its sign there. Check `mid_range` and the sign of "
+            "the reference."
         )
 
 
@@ -165,21 +167,21 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
     ----------
     readings : Readings
     offsets : str
-        ``"each"``: every setting has its own zero of the interferometer; ``"none"``: the interferometer counts from the
-        zero of the sensor throughout; ``"auto"``: the first where the settings have enough readings for it.
+        ``"each"``: every setting has its own zero of the interferometer; ``"none"``: the interferometer has the zero of
+        the sensor; ``"auto"``: the first where the settings have enough readings.
 
     Raises
     ------
     MethodError
-        A setting has too few readings for a zero of its own, or nothing tells the noise.
+        A setting has too few readings for its own zero, or the noise is unknown.
     """
     count = np.bincount(readings.setting)
     free = offsets == "each" or (offsets == "auto" and float(np.median(count)) >= _ENOUGH and count.min() > 1)
     if offsets == "each" and count.min() < 2:
         k = int(np.argmin(count))
         raise MethodError(
-            f"{_name(readings, k)} has one reading only, which cannot tell a zero of its own; expected at least two, "
-            "or offsets 'none'."
+            f"{_name(readings, k)} has one reading only, which does not determine its own zero; expected at least "
+            "two, or offsets 'none'."
         )
     slope, offset = _start(readings, free)
     kept = np.ones(len(readings.error), dtype=bool)
@@ -196,14 +198,14 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
 
 
 def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
-    """Return slopes and offsets that a few wild readings do not move: medians over pairs of readings."""
+    """Return robust slopes and offsets: medians over pairs of readings."""
     n = int(readings.setting.max()) + 1
     slope, offset = np.zeros(n), np.zeros(n)
     order = np.argsort(readings.setting, kind="stable")
-    for k, places in enumerate(np.split(order, np.cumsum(np.bincount(readings.setting))[:-1])):
-        depth, error = readings.depth[places], readings.error[places]
+    for k, positions in enumerate(np.split(order, np.cumsum(np.bincount(readings.setting))[:-1])):
+        depth, error = readings.depth[positions], readings.error[positions]
         if free:
-            i, j = np.triu_indices(len(places), 1)
+            i, j = np.triu_indices(len(positions), 1)
             step = depth[j] - depth[i]
             far = np.abs(step) > 0.2 * np.ptp(depth)
             slope[k] = np.median((error[j] - error[i])[far] / step[far]) if far.any() else 0.0
@@ -216,9 +218,9 @@ def _start(readings: Readings, free: bool) -> tuple[Array, Array]:
 
 
 def _belonging(residual: Array, kept: NDArray[np.bool_], readings: Readings, free: bool) -> NDArray[np.bool_]:
-    """Return which readings lie on the line of their setting; a setting keeps at least what its line needs."""
+    """Return which readings fit the line of their setting; a setting keeps at least those that its line needs."""
     count = np.bincount(readings.setting)
-    # Lines come closer to their readings than the truth does, by the share of the readings that they take up.
+    # The residuals of a fitted line are smaller than the errors, by the degrees of freedom of the line.
     share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
     scale = max(_GAUSS * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _LEAST_NOISE)
     few = count[readings.setting] < (_ENOUGH if free else 2)
@@ -247,17 +249,17 @@ def _require_depth(readings: Readings, enough: NDArray[np.bool_]) -> None:
     if not enough.all():
         raise MethodError(
             f"{_name(readings, int(np.argmin(enough)))} has readings at one depth only; expected several depths, which "
-            "tell the slope of the error. Leave the setting out or measure it again."
+            "determine the slope of the error. Remove the setting or repeat its measurement."
         )
 
 
 def _noise(residual: Array, freedom: int, stated: float) -> float:
-    """Return the standard deviation of one reading: what the lines show, or what was stated if they show too little."""
+    """Return the standard deviation of one reading: from the lines, or as stated where these are too few."""
     if freedom >= FEWEST_FREE:
         return max(float(np.sqrt((residual**2).sum() / freedom)), _LEAST_NOISE)
     if not np.isfinite(stated):
         raise MethodError(
-            f"{freedom} readings more than unknowns do not tell the noise of the readings; expected at least "
+            f"{freedom} readings more than unknowns do not determine the noise of the readings; expected at least "
             f"{FEWEST_FREE}, or `reading_noise` in the data."
         )
     return max(stated, _LEAST_NOISE)
@@ -270,12 +272,12 @@ def _name(readings: Readings, setting: int) -> str:
 
 @dataclass(frozen=True)
 class MidRange:
-    """Where the lines of all settings meet: the reading at which the error does not depend on the inclination.
+    """Common point of the lines of all settings: the reading at which the error does not depend on the inclination.
 
     Attributes
     ----------
     reading, uncertainty : float
-        m; NaN where the lines do not tell.
+        m; NaN where the lines do not determine it.
     scatter : float
         Standard deviation of the zeros of the settings, m.
     """
@@ -286,7 +288,7 @@ class MidRange:
 
 
 def mid_range(readings: Readings, lines: Lines) -> MidRange:
-    """Return where the lines meet.
+    """Return the common point of the lines.
 
     The error at the stated mid range is b = b0 - k (m_found - m): a line over k.
     """

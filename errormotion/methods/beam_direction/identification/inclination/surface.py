@@ -36,7 +36,7 @@ _DECAYS = 1.4 ** np.arange(-7.0, 1.0)
 _SCATTERS = np.array([1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0])
 """f."""
 _LEAST_WEIGHT = 1e-3
-"""Weight, over the largest, below which a place of the grid does not count."""
+"""Weight, over the largest, below which a position of the grid does not count."""
 _ROUNDING = 1e-9
 """Least share of a slope that its own reading does not determine."""
 _ON_LINE = 1e-6
@@ -106,7 +106,7 @@ def fit_surface(
     Parameters
     ----------
     x : ndarray (setting, 2)
-        Places, scaled so that the farthest is at 1.
+        Positions, scaled so that the farthest is at 1.
     slope, variance : ndarray (setting,)
         k of each setting and its variance from noise.
     highest : int
@@ -119,24 +119,24 @@ def fit_surface(
     both_sides = bool((x[:, 1] > _ON_LINE).any() and (x[:, 1] < -_ON_LINE).any())
     last = HIGHEST + BEYOND if order is None else order
     problem = _Problem.of(x, slope, variance, degrees_to(last, both_sides if mirror is None else mirror))
-    places, weights = problem.thinned().grid()
-    prediction = problem.predict(places[0])
+    positions, weights = problem.thinned().grid()
+    prediction = problem.predict(positions[0])
     if mirror is None and both_sides:
         free = _Problem.of(x, slope, variance, degrees_to(last, mirror=False))
-        if _worse(prediction.density, free.predict(places[0]).density):
+        if _worse(prediction.density, free.predict(positions[0]).density):
             problem = free
-            places, weights = problem.thinned().grid()
-            prediction = problem.predict(places[0])
-    coefficients, covariance = problem.average(places, weights)
+            positions, weights = problem.thinned().grid()
+            prediction = problem.predict(positions[0])
+    coefficients, covariance = problem.average(positions, weights)
     # Nothing says that the prior fits: the covariance is no smaller than the settings that were left out show.
     widening = max(1.0, float(np.mean(prediction.z**2)))
     return Surface(
         problem.degrees,
         coefficients,
         covariance * widening,
-        problem.choose_order(places[0], prediction, highest) if order is None else order,
+        problem.choose_order(positions[0], prediction, highest) if order is None else order,
         not (problem.degrees[:, 1] % 2).any(),
-        places[0].scatter,
+        positions[0].scatter,
         Prediction(prediction.density, prediction.slope, prediction.variance * widening, prediction.z),
     )
 
@@ -149,7 +149,7 @@ def _worse(density: Array, best: Array) -> bool:
 
 @dataclass(frozen=True)
 class _Place:
-    """One place of the grid: s rho^4 over the largest slope, rho, f."""
+    """One position of the grid: s rho^4 over the largest slope, rho, f."""
 
     size: float
     decay: float
@@ -197,7 +197,7 @@ class _Problem:
         return float(np.max(np.abs(self.y * self.deviation)))
 
     def grid(self) -> tuple[list[_Place], Array]:
-        """Return the places that suit, the best first, and their weights, sum 1."""
+        """Return the positions that suit, the best first, and their weights, sum 1."""
         sizes, scatters = (part.ravel() for part in np.meshgrid(_SIZES, _SCATTERS))
         square, noise = (sizes * self.unit()) ** 2, scatters**2
         suits = np.empty((len(_DECAYS), len(sizes)))
@@ -209,23 +209,23 @@ class _Problem:
         weights = np.exp(suits - suits.max()).ravel()
         order = np.argsort(-weights, kind="stable")
         order = order[weights[order] >= _LEAST_WEIGHT]
-        places = [
+        positions = [
             _Place(float(sizes[k % len(sizes)]), float(_DECAYS[k // len(sizes)]), float(scatters[k % len(sizes)]))
             for k in order
         ]
-        return places, weights[order] / weights[order].sum()
+        return positions, weights[order] / weights[order].sum()
 
-    def average(self, places: list[_Place], weights: Array) -> tuple[Array, Array]:
-        """Return the mean of the coefficients over places of the grid, and their covariance."""
-        means = np.empty((len(places), len(self.degrees)))
+    def average(self, positions: list[_Place], weights: Array) -> tuple[Array, Array]:
+        """Return the mean of the coefficients over positions of the grid, and their covariance."""
+        means = np.empty((len(positions), len(self.degrees)))
         C = np.zeros((len(self.degrees), len(self.degrees)))
-        for decay in {place.decay for place in places}:
+        for decay in {position.decay for position in positions}:
             values, vectors = self.spectrum(decay)
             D = self.prior(decay)
             along = vectors.T @ (D * (self.Phi.T @ self.y))
-            rows = [k for k, place in enumerate(places) if place.decay == decay]
-            square = np.array([(places[k].size * self.unit()) ** 2 for k in rows])[:, None]
-            noise = np.array([places[k].scatter ** 2 for k in rows])[:, None]
+            rows = [k for k, position in enumerate(positions) if position.decay == decay]
+            square = np.array([(positions[k].size * self.unit()) ** 2 for k in rows])[:, None]
+            noise = np.array([positions[k].scatter ** 2 for k in rows])[:, None]
             shrink = square / (square * values + noise)
             means[rows] = D * ((shrink * along) @ vectors.T)
             basis = D[:, None] * vectors
@@ -235,12 +235,12 @@ class _Problem:
         C += off.T @ off
         return mean, (C + C.T) / 2
 
-    def predict(self, place: _Place) -> Prediction:
+    def predict(self, position: _Place) -> Prediction:
         """Return the prediction of each setting by all the others, in closed form."""
         from scipy.linalg import solve_triangular
 
-        square, noise = (place.size * self.unit()) ** 2, place.scatter**2
-        X = self.Phi * (self.prior(place.decay) * np.sqrt(square / noise))
+        square, noise = (position.size * self.unit()) ** 2, position.scatter**2
+        X = self.Phi * (self.prior(position.decay) * np.sqrt(square / noise))
         L = np.linalg.cholesky(X.T @ X + np.eye(X.shape[1]))
         B = solve_triangular(L, X.T, lower=True, check_finite=False)
         rest, leverage = self.y - B.T @ (B @ self.y), (B**2).sum(axis=0)
@@ -253,15 +253,15 @@ class _Problem:
             z,
         )
 
-    def choose_order(self, place: _Place, best: Prediction, highest: int) -> int:
+    def choose_order(self, position: _Place, best: Prediction, highest: int) -> int:
         """Return the smallest order that predicts no worse than all degrees."""
         for order in range(highest):
-            if not _worse(self.up_to(order).predict(place).density, best.density):
+            if not _worse(self.up_to(order).predict(position).density, best.density):
                 return order
         return highest
 
 
 def _density(rest: Array, leverage: Array, noise: Array) -> Array:
-    """Return the sums of the log densities of left-out slopes, up to a constant, for residuals (setting, place)."""
+    """Return the sums of the log densities of left-out slopes, up to a constant, for residuals (setting, position)."""
     free = np.maximum(1.0 - leverage, _ROUNDING)
     return np.asarray(-0.5 * (rest**2 / (noise * free) + np.log(noise / free)).sum(axis=0))

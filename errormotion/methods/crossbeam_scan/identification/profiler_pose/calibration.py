@@ -1,14 +1,14 @@
-"""Pose of the profiler in the tool frame, from scans of a level plate with a circular pocket of known place.
+"""Pose of the profiler in the tool frame, from scans of a level plate with a circular pocket of known position.
 
-A point (x, 0, z) of a line is, in the tool frame at its place over the pocket, H (x, 0, z) + s, with s how far the
+A point (x, 0, z) of a line is, in the tool frame at its position over the pocket, H (x, 0, z) + s, with s how far the
 carriage is from there and H = T(dx, dy, dz) R_X(a) R_Y(b) R_Z(g). The rim obeys
 
     (X - X0)^2 + (Y - Y0)^2 = r^2,   Z = Z0,
 
-and the plate gives the tilt dz/dx. The feed s is along Y of the machine, not of the profiler: that is what g shows by,
+and the plate gives the tilt dz/dx. The feed s is along Y of the machine, not of the profiler: this determines g,
 since the circle is sheared in (x, s) and not turned. A turned circle (s put in the profiler's frame, as eq. (7) of Zhao
-et al. has it) would be a circle still and would not tell g from the place of its centre. For the same reason a shows
-only when the plate is seen at two heights.
+et al. has it) would still be a circle and would not separate g from the position of its centre. For the same reason
+a is determined only when the plate is seen at two heights.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def parameters(H: RigidTransform) -> Array:
 
 @dataclass(frozen=True)
 class Pocket:
-    """A circular pocket whose place in the tool frame is known, because the machine has cut it.
+    """A circular pocket whose position in the tool frame is known, because the machine has cut it.
 
     Attributes
     ----------
     radius, radius_uncertainty : float
         m; the radius is a parameter of the fit with this prior.
     centre : ndarray, (3,)
-        (X0, Y0, Z0) of the rim, in the tool frame at its place over the pocket, m.
+        (X0, Y0, Z0) of the rim, in the tool frame at its position over the pocket, m.
     centre_uncertainty : ndarray, (3,)
         Standard uncertainty, m.
     """
@@ -122,11 +122,11 @@ def calibrate(
     Parameters
     ----------
     x : (point,)
-        Places along the profile, m.
+        Positions along the profile, m.
     height : (scan, line, point)
         m; NaN = no reading. One scan leaves ``a`` open unless there is a prior; two at heights apart determine it.
     stage : (scan, line, 3)
-        Where the tool frame is at each line, off its place over the pocket, m, in machine directions; one height per
+        Where the tool frame is at each line, off its position over the pocket, m, in machine directions; one height per
         scan.
     pocket : Pocket
         What is scanned.
@@ -198,8 +198,8 @@ def _scan(x: Array, height: Array, stage: Array) -> _Scan:
     heights = plate.height[np.isfinite(plate.height)]
     # the carriage goes straight and the plate is level: all lines see the rim at one height, best known by their mean
     z = heights.mean() + plate.slope * rim.x
-    places = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
-    return _Scan(places, stage[rim.line], heights, float(stage[0, 2]), plate)
+    positions = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
+    return _Scan(positions, stage[rim.line], heights, float(stage[0, 2]), plate)
 
 
 class _Fit:
@@ -238,7 +238,7 @@ class _Fit:
         return np.array([0.0, b, 0.0, *-middle, self.pocket.radius])
 
     def _rim(self, p: Array) -> tuple[Array, Array, Array, Array]:
-        """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of their places, (n,) each."""
+        """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of the edges, (n,) each."""
         P = pose(*p[:6]).apply(self.edges.reshape(-1, 3)).reshape(self.edges.shape) + self.shift
         R = np.hypot(P[..., 0], P[..., 1])
         cos, sin = np.abs(P[..., 0] / R).min(axis=1), np.abs((P[..., 1] / R).mean(axis=1))

@@ -129,22 +129,22 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     index = np.arange(x.size)
     beside = ~np.any(deep, axis=1, keepdims=True) | (index < first[:, None] - trim) | (index > last[:, None] + trim)
     seen = np.isfinite(height)
-    begin, end = np.argmax(seen, axis=1), x.size - 1 - np.argmax(seen[:, ::-1], axis=1)
-    within = (index >= begin[:, None] + trim) & (index <= end[:, None] - trim)
+    start, end = np.argmax(seen, axis=1), x.size - 1 - np.argmax(seen[:, ::-1], axis=1)
+    within = (index >= start[:, None] + trim) & (index <= end[:, None] - trim)
     plate = tilt(x, np.where(beside & within, height, np.nan))
-    lines, places = [], []
+    lines, positions = [], []
     for k in np.flatnonzero(inside & np.isfinite(plate.height)):
         top = plate.height[k] + plate.slope * x
         ends = [_edge(x, height[k], top, i, side * trim) for i, side in ((first[k], 1), (last[k], -1))]
         if np.isfinite(ends).all():
             lines.append(k)
-            places.append(ends)
+            positions.append(ends)
     if len(lines) < 10:
         raise MethodError(
             f"Ten lines with both edges of the pocket are needed; found {len(lines)}. Too many readings are missing at "
             "the edges, or the pocket is not wholly in the scan."
         )
-    line, at = np.array(lines, dtype=np.int64), np.array(places)
+    line, at = np.array(lines, dtype=np.int64), np.array(positions)
     return plate, Edges(line, at, plate.height[line, None] + plate.slope * at)
 
 
@@ -155,18 +155,18 @@ def _spans(deep: Mask) -> Mask:
 
 
 def _edge(x: Array, z: Array, top: Array, index: int, trim: int) -> float:
-    """Return the place of an edge near a point, m; ``trim`` is positive where the floor is at the right."""
+    """Return the position of an edge near a point, m; ``trim`` is positive where the floor is at the right."""
     pitch, reach, side = float(x[1] - x[0]), abs(trim), int(np.sign(trim))
-    begin, end = index - reach, index + reach
+    start, end = index - reach, index + reach
     far = sorted((index + trim, index + side * (reach + round(FLOOR / pitch))))
-    if begin < 0 or end >= x.size or far[0] < 0 or far[1] >= x.size:
+    if start < 0 or end >= x.size or far[0] < 0 or far[1] >= x.size:
         return np.nan
     floor = z[far[0] : far[1]] - top[far[0] : far[1]]
     if np.isfinite(floor).sum() < reach:
         return np.nan
-    g = 1 - (z - top)[begin : end + 1] / np.nanmedian(floor)
+    g = 1 - (z - top)[start : end + 1] / np.nanmedian(floor)
     known = np.isfinite(g)
     if np.mean(~known) > GAPS or not (known[0] and known[-1]):
         return np.nan
     share = np.interp(np.arange(g.size), np.flatnonzero(known), np.clip(g[known], 0.0, 1.0)).sum() * pitch
-    return float(x[begin] - pitch / 2 + share if side > 0 else x[end] + pitch / 2 - share)
+    return float(x[start] - pitch / 2 + share if side > 0 else x[end] + pitch / 2 - share)

@@ -1,4 +1,4 @@
-"""The pose of the profiler as an error dataset: how it hangs off its nominal pose, and the pose itself."""
+"""The pose of the profiler as an error dataset: the errors against the nominal pose, and the pose itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 
 ROUND = 0.01
-"""Where no nominal pose is given: square to the machine, at a place in whole centimetres."""
+"""Where no nominal pose is given: square to the machine, at a position in whole centimetres."""
 
 
 def given(pose: PoseSettings) -> RigidTransform:
@@ -32,7 +32,7 @@ def given_covariance(pose: PoseSettings) -> np.ndarray:
 def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
     """Return the pose of the profiler from scans of a pocket: variant "profiler pose" of the raw dataset.
 
-    The errors are those of one beam, ``profiler``: actual minus nominal pose in the tool frame, at the nominal place.
+    The errors are those of one beam, ``profiler``: actual minus nominal pose in the tool frame, at the nominal origin.
     Extras: ``profiler_pose`` (row, column), ``pose_covariance`` (p, p_) over (a, b, g, dx, dy, dz), ``nominal_pose``.
 
     Raises
@@ -79,7 +79,7 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
 
 
 def _off(pose: RigidTransform, nominal: RigidTransform) -> np.ndarray:
-    """Return the twist (6,) from the nominal pose to another, at the nominal place."""
+    """Return the twist (6,) from the nominal pose to another, at the nominal position."""
     return displacement(pose * nominal.inv(), nominal.translation)
 
 

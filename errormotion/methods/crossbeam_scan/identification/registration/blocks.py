@@ -22,10 +22,10 @@ from errormotion.methods.crossbeam_scan.identification.registration.kernels impo
 from errormotion.methods.crossbeam_scan.identification.registration.surface import Surface, repaired
 
 LARGEST = 1.0
-"""No artefact is larger than this, m: larger numbers are millimetres."""
+"""Largest size of an artefact, m; larger numbers are taken for millimetres."""
 FEWEST_BLOCKS = 8
 BESIDE_HOLE = 3.0
-"""A block beside a hole counts with its variance times this: what fills the hole is no measurement."""
+"""Factor on the variance of blocks next to a hole, because the filled heights are not measured."""
 THIN = 4
 _SAMPLED = 64
 _FEW = 2500
@@ -44,7 +44,7 @@ class BlockMap:
     slope_x, slope_y : ndarray (block row, block column)
         Slopes of the blocks.
     variance : ndarray (block row, block column)
-        Variance of the height as the scatter of the points says, m^2; infinite where the block was dropped.
+        Variance of the height from the scatter of the points, m^2; infinite where the block was dropped.
     points : ndarray (block row, block column)
         Points used.
     noise : float
@@ -73,7 +73,7 @@ class BlockMap:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Which blocks say something, (block row, block column)."""
+        """Which blocks are known, (block row, block column)."""
         return np.isfinite(self.variance)
 
     @cached_property
@@ -107,7 +107,7 @@ class BlockMap:
 
     @cached_property
     def moments(self) -> Moments:
-        """What the slopes of every fourth block along both directions tell about motions."""
+        """Information of the slopes of every fourth block along both directions about motions."""
         some = slice(THIN // 2, None, THIN)
         known = self.known[some, some]
         x, y = np.meshgrid(self.x[some] - self.centre[0], self.y[some] - self.centre[1])
@@ -124,9 +124,9 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
     height : array_like (row, column)
         Heights z in the profiler's frame, m; NaN where the sensor gave no value. float32 is read as it is.
     x : array_like (column,)
-        Places of the points along the profile, m, evenly spaced and rising.
+        Positions of the points along the profile, m, evenly spaced and rising.
     y : array_like (row,)
-        Places of the profiles along the feed, m, rising; uneven by less than their pitch.
+        Positions of the profiles along the feed, m, rising; uneven by less than their pitch.
 
     Returns
     -------
@@ -135,13 +135,13 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
     Raises
     ------
     MethodError
-        Shapes do not fit, places do not rise or are not even, numbers that are no metres, or hardly any points.
+        Shapes do not fit, positions do not rise or are not even, numbers that are not in metres, or too few points.
     """
     z = np.ascontiguousarray(height, dtype=np.float32)
     x, y = np.ascontiguousarray(x, dtype=float), np.ascontiguousarray(y, dtype=float)
     if z.ndim != 2 or z.shape != (y.size, x.size):
         raise MethodError(
-            f"expected heights of shape (rows, columns) = ({y.size}, {x.size}) as y and x say, found {z.shape}; "
+            f"expected heights of shape (rows, columns) = ({y.size}, {x.size}) by y and x, found {z.shape}; "
             "give z[row, column] with one y for every profile and one x for every point of a profile"
         )
     rows, columns = z.shape[0] // ROWS, z.shape[1] // COLUMNS
@@ -158,28 +158,28 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike) -> BlockMap:
             f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
             f"{kernels.FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
         )
-    # A scan without any noise still has the last bit of its numbers; a few of them tell how large they are.
+    # A scan without any noise still has the last bit of its numbers; some of them give its size.
     least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
     out = kernels.reduce_blocks(z, dx[0], dy, max(float(np.median(scales)), least))
     return _deblurred(out, xc, yc, dx[0], dy[0], least, (z, x, y))
 
 
-def _centres(name: str, places: Array, blocks: int, size: int, tolerance: float) -> tuple[Array, Array]:
-    """Return evenly spaced centres of the blocks and the places of the points about them, (block, point)."""
-    step = np.diff(places)
-    if not np.isfinite(places).all() or not (step > 0).all():
+def _centres(name: str, positions: Array, blocks: int, size: int, tolerance: float) -> tuple[Array, Array]:
+    """Return evenly spaced centres of the blocks and the positions of the points about them, (block, point)."""
+    step = np.diff(positions)
+    if not np.isfinite(positions).all() or not (step > 0).all():
         wrong = int(np.argmax(~(step > 0)))
         raise MethodError(
-            f"expected {name} to rise from point to point, found {places[wrong]:.9g} m followed by "
-            f"{places[wrong + 1]:.9g} m at index {wrong + 1}; check the encoder's count (overflow, reversal) and "
+            f"expected {name} to rise from point to point, found {positions[wrong]:.9g} m followed by "
+            f"{positions[wrong + 1]:.9g} m at index {wrong + 1}; check the encoder's count (overflow, reversal) and "
             "sort or cut the scan"
         )
-    if places[-1] - places[0] > LARGEST:
+    if positions[-1] - positions[0] > LARGEST:
         raise MethodError(
-            f"expected {name} in metres over less than {LARGEST:g} m, found {places[-1] - places[0]:.6g} m; "
+            f"expected {name} in metres over less than {LARGEST:g} m, found {positions[-1] - positions[0]:.6g} m; "
             "if these are millimetres, divide by 1000"
         )
-    used = places[: blocks * size]
+    used = positions[: blocks * size]
     pitch = (used[-1] - used[0]) / (used.size - 1)
     even = used[0] + pitch * np.arange(used.size)
     even += np.median(used - even)

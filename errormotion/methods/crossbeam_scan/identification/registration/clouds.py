@@ -33,7 +33,7 @@ _ICP_STEPS = 60
 
 
 def open3d() -> Any:
-    """Return the module, or say how to get it.
+    """Return the module; raise MethodError with the command that installs it.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def plane_icp(cold: ArrayLike, warm: ArrayLike) -> Found:
     rms : float
         Root mean square distance of the pairs, m.
     iterations : int
-        The most that it may have taken: Open3D does not tell.
+        The largest possible number: Open3D does not report it.
     """
     o3d = open3d()
     target, source = _cloud(o3d, cold), _cloud(o3d, warm)
@@ -98,10 +98,10 @@ def published_chain(cold: ArrayLike, warm: ArrayLike) -> Found:
     o3d = open3d()
     target, source = (_cloud(o3d, cloud).remove_statistical_outlier(20, 2.0)[0] for cloud in (cold, warm))
     fine = o3d.pipelines.registration
-    begin = np.eye(4)
+    start = np.eye(4)
     if hasattr(fine, "registration_ndt"):
-        begin = fine.registration_ndt(source, target, ndt_option(o3d), begin).transformation
-    return _icp(o3d, source, target, begin, fine.TransformationEstimationPointToPoint())
+        start = fine.registration_ndt(source, target, ndt_option(o3d), start).transformation
+    return _icp(o3d, source, target, start, fine.TransformationEstimationPointToPoint())
 
 
 def ndt_option(o3d: Any) -> Any:
@@ -118,11 +118,11 @@ def _cloud(o3d: Any, points: ArrayLike) -> Any:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(values[np.isfinite(values).all(axis=1)]))
 
 
-def _icp(o3d: Any, source: Any, target: Any, begin: Array, method: Any) -> Found:
+def _icp(o3d: Any, source: Any, target: Any, start: Array, method: Any) -> Found:
     """Run ICP with tolerances below the noise of the pose."""
     fine = o3d.pipelines.registration
     criteria = fine.ICPConvergenceCriteria(1e-10, 1e-12, _ICP_STEPS)
-    found = fine.registration_icp(source, target, NEAREST, begin, method, criteria)
+    found = fine.registration_icp(source, target, NEAREST, start, method, criteria)
     if found.fitness == 0:
         raise MethodError(
             f"expected clouds that lie within {NEAREST * 1e3:g} mm of one another, found none of the points to do so; "

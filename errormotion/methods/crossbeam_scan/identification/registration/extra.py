@@ -1,4 +1,4 @@
-"""Further parameters of a registration: linear displacements of the surface beside the rigid motion.
+"""Further parameters of a registration: linear displacements of the surface in addition to the rigid motion.
 
 A carriage that turns while it feeds carries a picture of the artefact that is sheared or stretched, and a warm artefact
 one that is larger. Every such parameter e displaces a point P of the cold frame by e G (P - c), with G a 3 x 3 matrix
@@ -41,13 +41,13 @@ BASES: dict[str, Array] = {
 """Drift along x, y, z per metre of feed (that along y: its scale), scales of the sensor, expansion of the artefact."""
 
 WIDE = 0.05
-"""A prior wider than this holds nothing: the parameter counts as free."""
+"""A parameter with a prior wider than this counts as free."""
 _SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Extra:
-    """The parameters that are asked for.
+    """The requested parameters.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Extra:
     prior: Array
 
     @classmethod
-    def of(cls, asked: Mapping[str, float] | None) -> Extra:
+    def of(cls, requested: Mapping[str, float] | None) -> Extra:
         """Return the parameters of a mapping from name to standard deviation.
 
         Raises
@@ -72,24 +72,24 @@ class Extra:
         MethodError
             A name is unknown, or a standard deviation is no positive number.
         """
-        asked = dict(asked or {})
-        if unknown := sorted(set(asked) - set(BASES)):
+        requested = dict(requested or {})
+        if unknown := sorted(set(requested) - set(BASES)):
             raise MethodError(
                 f"expected extra parameters out of {', '.join(BASES)}, found {', '.join(map(repr, unknown))}; "
                 "leave out or rename what is not in the list"
             )
-        if wrong := {name: sigma for name, sigma in asked.items() if not sigma > 0}:
+        if wrong := {name: sigma for name, sigma in requested.items() if not sigma > 0}:
             raise MethodError(
                 f"expected the standard deviation of the prior of every extra parameter as a positive number, found "
                 f"{', '.join(f'{name} = {sigma}' for name, sigma in wrong.items())}; "
-                "give inf for a free one, and leave out what shall stay 0"
+                "give inf for a free one, and leave out what is to be 0"
             )
-        bases = np.array([BASES[name] for name in asked]).reshape(-1, 3, 3)
-        return cls(tuple(asked), bases, np.array([float(sigma) for sigma in asked.values()]))
+        bases = np.array([BASES[name] for name in requested]).reshape(-1, 3, 3)
+        return cls(tuple(requested), bases, np.array([float(sigma) for sigma in requested.values()]))
 
     @property
     def motions(self) -> Array:
-        """Displacement of a point by a unit of twist or parameter, affine in its place: (6 + k, 3, 4)."""
+        """Displacement of a point by a unit of twist or parameter, affine in its position: (6 + k, 3, 4)."""
         own = np.zeros((len(self.names), 3, 4))
         own[:, :, 1:] = self.bases
         return np.concatenate([MOTIONS, own])
@@ -115,7 +115,7 @@ class Extra:
         return RigidTransform.from_translation(np.linalg.solve(stretch, (stretch - np.eye(3)) @ shift)) * pose
 
     def refuse_undetermined(self, information: Array, blocks: int, free: Freedoms) -> None:
-        """Raise where free parameters cannot be told from the motion, or from one another.
+        """Raise MethodError where free parameters are not separable from the motion or from one another.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class Extra:
         names = [self.names[loose[i]] for i in np.flatnonzero(share > _SHARE * share.max(initial=0.0))]
         if names:
             raise MethodError(
-                f"expected extra parameters that the artefact's surface tells from its motion and from one another, "
-                f"found undetermined: {', '.join(names)}; leave some of them out, or give the standard deviation of "
-                f"their prior, of at most {WIDE:g}"
+                f"expected extra parameters that the artefact's surface separates from its motion and from "
+                f"one another, found undetermined: {', '.join(names)}; omit some of them, or give the standard "
+                f"deviation of their prior, of at most {WIDE:g}"
             )

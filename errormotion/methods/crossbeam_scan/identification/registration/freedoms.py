@@ -17,13 +17,13 @@ from errormotion.datasets import DOF
 from errormotion.errors import MethodError
 
 MOTIONS = np.zeros((6, 3, 4))
-"""Displacement (3,) of a point by a unit of twist, affine in its place (1, X, Y, Z): (6, 3, 4)."""
+"""Displacement (3,) of a point by a unit of twist, affine in its position (1, X, Y, Z): (6, 3, 4)."""
 MOTIONS[[0, 1, 2], [0, 1, 2], 0] = 1.0
 MOTIONS[[3, 4, 5], [2, 0, 1], [2, 3, 1]] = 1.0
 MOTIONS[[3, 4, 5], [1, 2, 0], [3, 1, 2]] = -1.0
 
 LEAST_SLOPE = 2e-3
-"""A motion that changes the heights by less than this share of itself (root mean square) is not determined."""
+"""A motion that changes the heights by less than this share of its size (root mean square) is not determined."""
 _SHAPES = {1: "a surface of revolution or of straight rulings", 2: "a cylinder", 3: "a plane or a sphere"}
 
 
@@ -57,14 +57,14 @@ class Moments:
     ----------
     slopes : ndarray (12, 12)
         Sum of q q^T, q the products of the normal (-Sx, -Sy, 1) with (1, X, Y, Z) about the centre.
-    places : ndarray (4, 4)
+    positions : ndarray (4, 4)
         Sum of p p^T, p = (1, X, Y, Z).
     blocks : int
         Number of blocks.
     """
 
     slopes: Array
-    places: Array
+    positions: Array
     blocks: int
 
     def information(self, motions: Array) -> tuple[Array, Array]:
@@ -74,7 +74,7 @@ class Moments:
         determined where a plane is noisy.
         """
         flat, x, y = motions.reshape(-1, 12), motions[:, 0], motions[:, 1]
-        return flat @ self.slopes @ flat.T, x @ self.places @ x.T + y @ self.places @ y.T
+        return flat @ self.slopes @ flat.T, x @ self.positions @ x.T + y @ self.positions @ y.T
 
 
 def undetermined(information: Array, scale: Array, blocks: int) -> tuple[Array, Array]:
@@ -115,7 +115,7 @@ def scales(radius: float, extra: int) -> Array:
 
 
 def refuse(found: Freedoms, what: str) -> None:
-    """Raise MethodError where an artefact leaves freedoms undetermined; ``what`` says which scan."""
+    """Raise MethodError where an artefact leaves freedoms undetermined; ``what`` names the scan."""
     if found.loose:
         names = ", ".join(found.loose)
         k = len(found.loose)

@@ -1,4 +1,4 @@
-"""Two general point clouds, which are no height maps: point-to-plane ICP of Open3D, with what its pose is worth.
+"""Two general point clouds, which are no height maps: point-to-plane ICP of Open3D, with the covariance of its pose.
 
 A pair of a warm point p and its nearest cold point q with the normal n has the residual r = n . (M p - q), and for a
 small further twist at c the row J = (n, (M p - c) x n). The noise of a cold point is in all pairs that share it: with

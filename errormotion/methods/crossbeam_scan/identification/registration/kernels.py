@@ -23,7 +23,7 @@ ROWS = 4
 """Points of a block along y, the feed: profiles."""
 POINTS = ROWS * COLUMNS
 FEWEST = 20
-"""A block with fewer valid points says nothing."""
+"""A block with fewer valid points carries no information."""
 MANY = 10000
 """More blocks than these are shared by several threads."""
 
@@ -33,7 +33,7 @@ _GATE = 4.5
 # Scatter of a good block, in units of the usual: 61 degrees of freedom scatter by 0.18, curvature adds some 0.2.
 _LIMIT = 2.0
 _BAD_BLOCK = 4.0
-# Blocks of a row that tell its scale: a few at first, and more where these say that it is another one.
+# Blocks of a row that determine its scale: a few at first, more if these differ from the usual scale.
 _FEW_OF_ROW, _OF_ROW = 6, 16
 _OFF = 1.3
 
@@ -42,7 +42,7 @@ compiled = Compiler("the registration of scans", seconds=5, error_model="numpy")
 
 
 def in_threads(work: Callable[..., Any], rows: int, blocks: int, *given: Any) -> None:
-    """Call ``work(*given, first, last)`` for parts of so many rows of blocks, each in a thread of its own if worth it.
+    """Call ``work(*given, first, last)`` for parts of the rows of blocks, on several threads if there are many.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def _median(values: Array) -> float:  # pragma: no cover - compiled
 def _robust_plane(
     z: NDArray[np.float32], r0: int, c0: int, dx: Array, dy: Array, room: Array
 ) -> tuple[int, float, float, float, float]:  # pragma: no cover - compiled
-    """Return points, height, both slopes and scale of a block by medians, which a quarter of wrong points cannot bend.
+    """Return points, height, both slopes and scale of a block by medians, robust against a quarter of outliers.
 
     ``room`` (2, 64): scratch.
     """
@@ -153,7 +153,7 @@ def _trimmed_plane(
 ) -> bool:  # pragma: no cover - compiled
     """Fit a plane to the points of a block within ``gate`` of ``plane`` (height and slopes), which it replaces.
 
-    ``out`` (9,) receives a column of `reduce_blocks`. False where too few points are left to bear a plane.
+    ``out`` (9,) receives a column of `reduce_blocks`. False where too few points are left for a plane.
     """
     base, sx, sy, g = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2]), np.float32(gate)
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -225,7 +225,7 @@ def _refit(
     room: Array,
     out: Array,
 ) -> None:  # pragma: no cover - compiled
-    """Fit a plane to a block's points near it, from ``plane`` if that holds, else from medians.
+    """Fit a plane to a block's points near it, from ``plane`` if that fits, else from medians.
 
     ``out`` (9,) receives a column of `reduce_blocks`.
     """
@@ -284,7 +284,7 @@ def _row_scale(
     scale: float,
     room: Array,
 ) -> float:  # pragma: no cover - compiled
-    """Return the scale of a row of blocks: a line that is off as a whole is no outlier in some of its blocks.
+    """Return the scale of a row of blocks: a line with a common deviation is not an outlier of single blocks.
 
     Where a quarter of the blocks scatters too much, the median of what some of them scatter by robustly, if that is
     more than ``scale`` by what a few blocks leave open.
@@ -375,7 +375,7 @@ def _reduce_rows(
                 out[7, row, column] = qy
                 out[8, row, column] = 0.0
             else:
-                # Where the blocks on the left lead to: NaN leads nowhere, and medians start.
+                # Extrapolated from the blocks on the left; NaN starts from medians.
                 left, bend = max(column - 1, 0), 0.0
                 if column > 1:
                     bend = out[1, row, left] - out[1, row, left - 1]

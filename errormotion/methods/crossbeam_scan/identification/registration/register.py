@@ -1,4 +1,4 @@
-"""The registration of two block maps, and the choice of what does it."""
+"""The registration of two block maps, and the choice of its backend."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from errormotion.methods.crossbeam_scan.identification.registration.start import
 Backend = Literal["height_map", "open3d_plane", "paper"]
 
 GATE = 5.0
-"""Blocks further off than this many robust standard deviations are dirt, and left out."""
+"""Blocks with residuals beyond this many robust standard deviations are excluded as outliers."""
 LARGEST_SHIFT, LARGEST_TURN = 4e-3, 0.1
-"""Beyond these, m and rad, a scan is off its place: twice what the start is made for."""
+"""Largest motion, m and rad: twice the range of the start."""
 LEAST_OVERLAP = 0.5
-"""Share of the warm blocks that must have cold surface beneath them."""
+"""Share of the warm blocks that must overlap the cold surface."""
 LARGEST_MISFIT = 0.02
-"""Residuals may be this share of the surface's relief before the scans count as two artefacts."""
+"""Residuals beyond this share of the relief indicate two different artefacts."""
 NOISY = 10.0
-"""Information counts beyond this many times what the slopes' noise makes of nothing."""
+"""Information is used beyond this many times the expected contribution of noise of the slopes."""
 NEAR = 0.01
-"""The noise is estimated once a step would change its variance by no more than this share."""
+"""The noise is estimated when a step changes its variance by at most this share."""
 STRAIGHT = 400.0
-"""Over steps of this squared length, in standard deviations, residuals change in proportion: 0.01 of one is left."""
+"""Steps up to this squared length, in standard deviations, are linear: an error of 0.01 remains."""
 _STEPS = 12
 
 
@@ -66,16 +66,16 @@ def register(
         The scans, from `prepare`. The motion may be up to 2 mm and 0.05 rad.
     registration : {"height_map", "open3d_plane", "paper"}
         Gauss-Newton on the height map; point-to-plane ICP of Open3D; trimming, statistical outlier removal, NDT and
-        point-to-point ICP as published. The latter two need the extra ``open3d`` and are there for comparison.
+        point-to-point ICP as published. The latter two need the extra ``open3d`` and serve for comparison.
     point : array_like (3,), optional
         Functional point of the result in profiler coordinates, m; default: the middle of the cold surface.
     line_effects : bool
-        Whether jitter from profile to profile is looked for, and taken out where it shows.
+        Whether jitter from profile to profile is estimated and, where significant, eliminated.
     loose : {"refuse", "report"}
-        What to do with an artefact that leaves freedoms undetermined: raise, or find the others and name these.
+        For an artefact that leaves freedoms undetermined: raise, or determine the others and name these.
     extra : mapping of str to float, optional
-        Further parameters to be found with the motion, out of `extra.BASES`: name and standard deviation of the prior
-        about 0, in m per m; inf for a free one.
+        Further parameters to be estimated with the motion, out of `extra.BASES`: name and standard deviation of the
+        prior about 0, in m per m; inf for a free one.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def register(
     ------
     MethodError
         The artefact leaves freedoms or extra parameters undetermined (they are named), the scans do not overlap or show
-        two surfaces, an unknown backend or parameter is asked for, the backend is not installed, or the steps do not
+        two surfaces, an unknown backend or parameter is requested, the backend is not installed, or the steps do not
         settle.
     """
     if registration not in ("height_map", "open3d_plane", "paper"):
@@ -99,11 +99,11 @@ def register(
             f"{registration!r}, which knows the rigid motion only; choose one of both"
         )
     free = _determined(cold, warm, loose, terms)
-    begun = _begin(cold, warm, free)
+    started = _start(cold, warm, free)
     problem = Problem.of(cold, warm, extra=terms)
     at = problem.centre if point is None else np.asarray(point, dtype=float)
     if registration == "height_map":
-        found = _refined(problem, begun, free, line_effects)
+        found = _refined(problem, started, free, line_effects)
         rms, missed = None, np.zeros(6 + len(terms.names))
     else:
         from errormotion.methods.crossbeam_scan.identification.registration import clouds
@@ -113,7 +113,7 @@ def register(
         gate = GATE * problem.evaluate(state).scale()
         sums = problem.evaluate(state, gate)
         found = _Found(state, sums, Noise(), gate, steps)
-        # What the height map still sees of this pose's error is the honest part of its covariance.
+        # The remaining step of the height map is the error of this pose; it is added to its covariance.
         missed = solve(*normal_equations(sums, found.noise), free.motions, free.radius)
     sums, state = found.sums, found.state
     C = _covariance(problem, found, found.noise, free)
@@ -142,7 +142,7 @@ class _Found:
 
 
 def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Freedoms:
-    """Return what both scans determine, from the surfaces alone: each laid on itself."""
+    """Return what both scans determine, from the surfaces alone: each registered onto itself."""
     found = []
     for block_map, what in ((cold, "a cold scan"), (warm, "a warm scan")):
         of_slopes, of_noise = block_map.moments.information(extra.motions)
@@ -175,8 +175,8 @@ def _cold_share(problem: Problem, warm: BlockMap, found: _Found, free: Freedoms,
     return part * white + (1.0 - part) * 0.5
 
 
-def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
-    """Return where to start, or refuse scans that show no common surface."""
+def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
+    """Return the start; raise MethodError for scans without a common surface."""
     thin = Problem.of(cold, warm, THIN)
     noise = 30 * cold.usual_variance**0.5
     start = descend(thin, thin.rest, free.motions, free.radius)
@@ -185,21 +185,21 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
         start = found if found.scale < start.scale else start
     if np.isinf(start.scale):
         raise MethodError(
-            f"expected two scans of one place, found the cold one at {_extent(cold)} and the warm one at "
-            f"{_extent(warm)}; make both begin at the same place, and count their places from the same zero"
+            f"expected two scans of one position, found the cold one at {_extent(cold)} and the warm one at "
+            f"{_extent(warm)}; start both at the same position, and count positions from the same zero"
         )
     if not start.scale < noise and not start.scale < LARGEST_MISFIT * (relief := _relief(cold)):
         raise MethodError(
             f"expected two scans of one artefact moved by at most 2 mm and 0.05 rad, found surfaces that stay "
-            f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) wherever one is laid on the other; "
-            "check that both scans are of the same artefact, begin at the same place and have the same units"
+            f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) after registration; "
+            "check that both scans are of the same artefact, start at the same position and have the same units"
         )
     M = start.state.matrix
     shift, turn = M[:, :3] @ cold.centre + M[:, 3] - cold.centre, start.state.turn
     if np.hypot(*shift[:2]) > LARGEST_SHIFT or turn > LARGEST_TURN:
         raise MethodError(
             f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
-            f"{turn:.3f} rad; let both scans begin at the same place of the artefact"
+            f"{turn:.3f} rad; start both scans at the same position of the artefact"
         )
     if start.overlap < LEAST_OVERLAP:
         raise MethodError(
@@ -210,10 +210,10 @@ def _begin(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
 
 
 def _extent(block_map: BlockMap) -> str:
-    """Return where a scan lies, in words."""
+    """Return the extent of a scan as text."""
     return " and ".join(
-        f"{name} from {places[0] * 1e3:.1f} to {places[-1] * 1e3:.1f} mm"
-        for name, places in (("x", block_map.x), ("y", block_map.y))
+        f"{name} from {positions[0] * 1e3:.1f} to {positions[-1] * 1e3:.1f} mm"
+        for name, positions in (("x", block_map.x), ("y", block_map.y))
     )
 
 
@@ -227,7 +227,7 @@ def _relief(block_map: BlockMap) -> float:
 
 
 def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool) -> _Found:
-    """Take Gauss-Newton steps with all blocks; the noise is estimated once the pose is near."""
+    """Take Gauss-Newton steps with all blocks; the noise is estimated when the pose has nearly converged."""
     state, noise, gate = State(start.state.matrix, problem.rest.values), Noise(), GATE * start.scale
     near, steps = False, start.steps
     for _ in range(_STEPS):
@@ -251,7 +251,7 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
     else:
         raise MethodError(
             f"expected the registration to settle within {_STEPS} steps, found it still {length**0.5:.1f} standard "
-            "deviations from rest; look at both scans for a part that moved"
+            "deviations from convergence; check both scans for a part that moved"
         )
     return _Found(state, sums, noise, gate, steps)
 
@@ -261,5 +261,5 @@ def _unknown(covariance: Array, free: Freedoms) -> Array:
     if not free.loose:
         return covariance
     share = np.sum(free.motions**2, axis=1)
-    spoilt = (share > 0.01) | np.array([name in free.loose for name in DOF])
-    return np.where(spoilt[:, None] | spoilt[None, :], np.nan, covariance)
+    undetermined_here = (share > 0.01) | np.array([name in free.loose for name in DOF])
+    return np.where(undetermined_here[:, None] | undetermined_here[None, :], np.nan, covariance)

@@ -1,4 +1,4 @@
-"""What a registration answers."""
+"""Result of a registration."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from errormotion.methods.crossbeam_scan.identification.registration.extra import
 
 @dataclass(frozen=True)
 class Registration:
-    """Pose of the warm scan's frame in the cold scan's frame, and what it is worth.
+    """Pose of the warm scan's frame in the cold scan's frame, with its covariance.
 
     Attributes
     ----------
     backend : str
-        What found it.
+        The backend that was used.
     pose : RigidTransform
         M: takes a point from the warm frame to the cold one. Extra parameters come after it and leave ``point``
         where it is: p of the warm frame is at ``point`` + (1 + sum e G) (M p - ``point``) of the cold one.
@@ -27,13 +27,13 @@ class Registration:
         Functional point of twist and covariance, in profiler coordinates, m.
     covariance : ndarray (6, 6)
         Of the twist at ``point``, m^2, m rad, rad^2; NaN for freedoms that the artefact does not determine, and all
-        NaN where a backend cannot tell.
+        NaN where a backend gives none.
     residual : ndarray (block row, block column)
         Distance of the warm blocks from the cold surface along z, m; NaN where there is none. Empty for clouds.
     x, y : ndarray
         Centres of the blocks in the warm frame, m.
     rms : float
-        Root mean square of what the backend minimises, m. It says nothing about the pose.
+        Root mean square of the residuals of the backend, m. It gives no information about the accuracy of the pose.
     points : int
         Points used of the warm scan.
     noise : tuple of float

@@ -8,7 +8,7 @@ Sx and Sy are the slopes of the warm block itself, turned by M. Slopes and mean 
 the cold scan's noise is in neither: J^T r then has no bias, which it has when both come from one noisy map.
 
 A line sensor shakes from profile to profile: row i has r = J twist + a_i + b_i Sy + noise, a_i the jitter along z and
-b_i that along y. Both columns (1 and Sy) are in J already, so a row's sums say all: with C = U^T W U, u = U^T W r,
+b_i that along y. Both columns (1 and Sy) are in J already, so the sums of a row suffice: with C = U^T W U, u = U^T W r,
 T = diag(tau_a, tau_b) and k the variance of a residual in units of 1 / W,
 
     K = T (k 1 + T C T)^-1 T,   H = sum(A - B K B^T),   h = sum(g - B K u),   effects = K u,   their covariance k K .
@@ -126,7 +126,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class State:
-    """Where the warm scan is thought to be: a warm point p is at c + stretch (M p - c), c the problem's centre."""
+    """Estimated pose of the warm scan: a warm point p is at c + stretch (M p - c), c the problem's centre."""
 
     matrix: Array
     """M, (3, 4)."""

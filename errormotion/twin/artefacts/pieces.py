@@ -11,7 +11,7 @@ from scipy.ndimage import spline_filter
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
-from errormotion.twin import surfaces
+from errormotion.twin.artefacts import surfaces
 
 Surface = Callable[[Array, Array], ArrayLike]
 
@@ -31,7 +31,7 @@ class Artefact:
     name : str
         For reports.
     shape : int
-        Which of the shapes in `errormotion.twin.surfaces`.
+        Which of the shapes in `errormotion.twin.artefacts.surfaces`.
     parameters : ndarray, (5,)
         Of the shape; half the size in x and y first, m.
     table : ndarray

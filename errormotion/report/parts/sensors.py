@@ -1,4 +1,4 @@
-"""Temperature sensors: where they sit on the machine, what each of them saw, and where it saw nothing."""
+"""Temperature sensors: positions on the machine, temperatures, and missing readings."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from errormotion.report.turntable import Dots, Ellipsoids, Lines, Scene, draw
 _FAINT, _STILL, _COOLER = "#c3c8d0", "#6f7680", canvas.BLUE
 _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
 _WIDE, _HIGH = 110.0, 18.0
-_GAPS = 60
-_LEAST = 0.5  # K: changes below it are not coloured
+_MOST_GAPS = 60
+_SMALLEST_CHANGE = 0.5  # K; smaller changes are not coloured
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What one sensor saw.
+    """Temperatures of one sensor.
 
     Attributes
     ----------
     name : str
     place : (3,)
-        On the machine, m; NaN = unknown.
+        Position on the machine, m; NaN = unknown.
     first, low, high, last : float
-        degC, of what is known; NaN where nothing is.
+        degC, of the known values; NaN if there are none.
     known : float
-        Share of the instants with a value.
+        Fraction of the instants with a value.
     curve : (2, n)
-        Time and temperature, for a small drawing; NaN where a gap is.
+        Time and temperature, for a small drawing; NaN in gaps.
     why : str
-        Why values are missing, where it is known.
+        Reasons of missing values, if known.
     """
 
     name: str
@@ -57,18 +57,18 @@ class Sensor:
 
     @property
     def change(self) -> float:
-        """Largest departure from the first known temperature, K."""
+        """Largest deviation from the first known temperature, K."""
         up, down = self.high - self.first, self.low - self.first
         return up if up >= -down else down
 
     @property
     def placed(self) -> bool:
-        """Whether its place is known."""
+        """Whether its position is known."""
         return bool(np.isfinite(self.place).all())
 
 
 def of_dataset(errors: xr.Dataset, source: Source) -> list[Sensor]:
-    """Return the sensors of a dataset with temperatures over time, their places from the instruments' settings."""
+    """Return the sensors of a dataset with temperatures over time; positions are from the settings of instruments."""
     names = sensor_names(errors)
     if not names:
         return []
@@ -87,7 +87,7 @@ def of_dataset(errors: xr.Dataset, source: Source) -> list[Sensor]:
 
 
 def places(source: Source) -> dict[str, Array]:
-    """Return the place of each sensor that the instruments' settings hold, m, by the names that datasets use."""
+    """Return the positions of sensors in the settings of instruments, m, by their names in datasets."""
     found: dict[str, Array] = {}
     for holder in (source.provenance, source.run):
         entries = holder.get("instruments")
@@ -97,7 +97,7 @@ def places(source: Source) -> dict[str, Array]:
             for name, place in given.items() if isinstance(given, Mapping) else []:
                 point = _point(place)
                 if point is not None:
-                    # Where two instruments have a channel of one name, datasets put the instrument before it.
+                    # If two instruments have channels of the same name, datasets prefix the instrument.
                     found.setdefault(str(name), point)
                     found[f"{entry.get('name', '')}.{name}"] = point
     return found
@@ -111,65 +111,65 @@ def _point(place: Any) -> Array | None:
     return point if point.shape == (3,) and np.isfinite(point).all() else None
 
 
-def blocks(sensors: Sequence[Sensor], key: str, beside: tuple[Sequence[str], Array] | None = None) -> list[Block]:
-    """Return the map, where any place is known, and the table.
+def blocks(sensors: Sequence[Sensor], key: str, others: tuple[Sequence[str], Array] | None = None) -> list[Block]:
+    """Return the map, if any position is known, and the table.
 
     Parameters
     ----------
     sensors : sequence of Sensor
     key : str
-        Keeps identifiers apart.
-    beside : (names, (k, 3)), optional
-        What else is drawn to see where the sensors are, m.
+        Makes identifiers unique.
+    others : (names, (k, 3)), optional
+        Further points that are drawn for orientation, m.
     """
     if not sensors:
         return [Text("No temperatures were recorded.", "note")]
     placed = [sensor for sensor in sensors if sensor.placed]
     found: list[Block] = []
     if placed:
-        found.append(_map(placed, [sensor.name for sensor in sensors if not sensor.placed], key, beside))
+        found.append(_map(placed, [sensor.name for sensor in sensors if not sensor.placed], key, others))
     else:
         found.append(
             Text(
-                "The places of the sensors on the machine are not known, and no map is drawn. State them as "
-                "'places' of the thermometer in the bench.",
+                "The positions of the sensors on the machine are unknown; no map is drawn. State them as 'places' of "
+                "the thermometer in the bench file.",
                 "note",
             )
         )
     return [*found, table(sensors)]
 
 
-def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, beside: tuple[Sequence[str], Array] | None) -> Figure:
+def _map(placed: Sequence[Sensor], lost: Sequence[str], key: str, others: tuple[Sequence[str], Array] | None) -> Figure:
     where = np.array([sensor.place for sensor in placed])
-    names, others = beside if beside is not None else ([], np.empty((0, 3)))
-    others = np.asarray(others, float)
-    kept = [i for i in range(len(others)) if np.isfinite(others[i]).all()]
-    names, others = [names[i] for i in kept], others[kept]
-    every = np.concatenate([where, others])
+    names, points = others if others is not None else ([], np.empty((0, 3)))
+    points = np.asarray(points, float)
+    kept = [i for i in range(len(points)) if np.isfinite(points[i]).all()]
+    names, points = [names[i] for i in kept], points[kept]
+    every = np.concatenate([where, points])
     floor = float(every[:, 2].min()) - 0.05 * max(float(np.ptp(every, axis=0).max()), 0.1)
     largest = finite(np.max, np.abs([sensor.change for sensor in placed]))
     parts: list[Lines | Dots | Ellipsoids] = [Lines(_floor(every, floor), _FAINT, 0.6)]
     parts.append(Lines(np.stack([every, every * (1, 1, 0) + (0, 0, floor)], axis=1), _FAINT, 0.5, dash="2 2"))
-    if len(others):
-        parts.append(Dots(others, _STILL, 2.2, names))
-    shade = max(largest / len(_WARMER), _LEAST)
+    if len(points):
+        parts.append(Dots(points, _STILL, 2.2, names))
+    shade = max(largest / len(_WARMER), _SMALLEST_CHANGE)
     for sensor in placed:
         label = (
             f"{sensor.name} {fixed(sensor.change, 1, signed=True)} K" if _known(sensor) else f"{sensor.name} unknown"
         )
         parts.append(Dots(sensor.place[None], _colour(sensor, shade), 3.2, [label]))
     caption = (
-        "Sensors at their places on the machine, with the largest change from the first known temperature. "
+        "Positions of the sensors on the machine, with the largest change from the first known temperature. "
         + (
             f"Grey: within {fixed(shade, 1)} K; ochre, orange and dark red: warmer by more than {fixed(shade, 1)}, "
             f"{fixed(2 * shade, 1)} and {fixed(3 * shade, 1)} K; blue: cooler. "
-            if largest >= _LEAST
-            else f"No sensor changed by {fixed(_LEAST, 1)} K. "
+            if largest >= _SMALLEST_CHANGE
+            else f"All changes are smaller than {fixed(_SMALLEST_CHANGE, 1)} K. "
         )
-        + "Broken lines lead to the ground of the drawing."
+        + "Dashed lines lead to the base of the drawing."
         + (f" Grey points: {listed(list(names))}." if len(names) else "")
-        + (f" Without a known place: {listed(list(lost))}." if lost else "")
-        + " The buttons turn it, as do the arrow keys after a click on one."
+        + (f" Position unknown: {listed(list(lost))}." if lost else "")
+        + " The buttons rotate the drawing, as do the arrow keys after a click on one."
     )
     words = "; ".join(f"{s.name} {fixed(s.change, 1, signed=True)} K" for s in placed)
     return Figure(draw(Scene(parts), key), caption, f"Sensors in space, with their change: {words}.")
@@ -187,14 +187,14 @@ def _colour(sensor: Sensor, shade: float) -> str:
 
 
 def _floor(points: Array, height: float) -> Array:
-    """Return the edges of the rectangle under all points, (4, 2, 3)."""
+    """Return the edges of the rectangle below all points, (4, 2, 3)."""
     (x0, y0), (x1, y1) = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     corners = np.array([[x, y, height] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 
 def table(sensors: Sequence[Sensor]) -> Table:
-    """Return range, last value and small curve of each sensor."""
+    """Return the table of range, last value and small curve of each sensor."""
     rows: list[list[Cell | str]] = []
     never = "no valid reading"
     for sensor in sensors:
@@ -203,7 +203,7 @@ def table(sensors: Sequence[Sensor]) -> Table:
         rows.append(
             [
                 sensor.name,
-                or_dash(where, "place not stated"),
+                or_dash(where, "position not stated"),
                 *(or_dash(fixed(v, 1), never) for v in (sensor.first, sensor.low, sensor.high, sensor.last)),
                 or_dash(fixed(sensor.change, 1, signed=True), never),
                 missing if sensor.known < 1 else "never",
@@ -211,15 +211,15 @@ def table(sensors: Sequence[Sensor]) -> Table:
             ]
         )
     return Table(
-        "Temperatures in °C, and the largest change from the first that is known, in K. The small curves have "
-        "an ordinate of their own each, from its lowest to its highest value; red: no value.",
-        ["sensor", "place / mm", "first", "lowest", "highest", "last", "change", "unknown", "course"],
+        "Temperatures in °C, and the largest change from the first known temperature in K. Each small curve is scaled "
+        "from its lowest to its highest value; red: no value.",
+        ["sensor", "position / mm", "first", "lowest", "highest", "last", "change", "missing", "curve"],
         rows,
     )
 
 
 def sparkline(curve: Array) -> Markup:
-    """Return a curve (2, n) without axes; where it is NaN, a red bar stands at the foot."""
+    """Return a curve (2, n) without axes, with a red bar at the bottom where it is NaN."""
     time, values = curve
     time, values = canvas.decimate(np.asarray(time, float), np.asarray(values, float), 50)
     size = f"viewBox='0 0 {_WIDE:g} {_HIGH:g}' width='{_WIDE:g}' height='{_HIGH:g}' style='vertical-align:middle'"
@@ -235,14 +235,14 @@ def sparkline(curve: Array) -> Markup:
         drawn.append(f"<path d='{path}' fill='none' stroke='{canvas.BLUE}' stroke-width='1.2'/>")
     bars = _runs(x, ~known)
     if bars:
-        path = "".join(f"M{a:.1f} {_HIGH - 1.5:g}H{b:.1f}" for a, b in bars[:_GAPS])
+        path = "".join(f"M{a:.1f} {_HIGH - 1.5:g}H{b:.1f}" for a, b in bars[:_MOST_GAPS])
         drawn.append(f"<path d='{path}' fill='none' stroke='{UNKNOWN}' stroke-width='2.5'/>")
     last = "the last is unknown" if not known[-1] else f"the last is {fixed(float(values[-1]), 1)} °C"
-    return Markup(f"<svg {size} role='img' aria-label='course; {last}'>{''.join(drawn)}</svg>")
+    return Markup(f"<svg {size} role='img' aria-label='curve; {last}'>{''.join(drawn)}</svg>")
 
 
 def _runs(x: Array, where: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return begin and end of each run of places, from neighbour to neighbour."""
+    """Return start and end of each run, from neighbour to neighbour."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
     return [
         (float(x[max(start - 1, 0)]), float(x[min(stop, x.size - 1)]))
@@ -251,13 +251,12 @@ def _runs(x: Array, where: NDArray[np.bool_]) -> list[tuple[float, float]]:
 
 
 def warmest(sensors: Sequence[Sensor]) -> str:
-    """Say which sensor changed most, and which are unknown; empty without sensors."""
+    """Return a sentence on the sensor with the largest change, and on unknown ones; empty without sensors."""
     known = [sensor for sensor in sensors if _known(sensor)]
     if not known:
         return f"{integer(len(sensors))} sensors, none with a valid reading." if sensors else ""
     most = max(known, key=lambda sensor: abs(sensor.change))
-    words = (
-        f"{integer(len(sensors))} temperatures; {most.name} changed most, by {fixed(most.change, 1, signed=True)} K."
-    )
-    gone = [sensor.name for sensor in sensors if not math.isfinite(sensor.last)]
-    return words + (f" Never known: {listed(gone)}." if gone else "")
+    change = f"{most.name}, {fixed(most.change, 1, signed=True)} K"
+    words = f"{integer(len(sensors))} temperature sensors; largest change: {change}."
+    unknown = [sensor.name for sensor in sensors if not math.isfinite(sensor.last)]
+    return words + (f" Without a valid reading: {listed(unknown)}." if unknown else "")

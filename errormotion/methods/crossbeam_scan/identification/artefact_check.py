@@ -1,4 +1,4 @@
-"""Whether the artefacts stayed where they were: by cold scans made again, and by what their neighbours say."""
+"""Check of the artefacts for motion, by repeated cold scans and by comparison with their neighbours."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MOVED = "the artefact had moved"
 
 
 @dataclass(frozen=True)
-class Trust:
-    """Which errors are those of the axis, and which are the artefact's.
+class ArtefactCheck:
+    """Errors that are caused by the motion of an artefact.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Trust:
     since : ndarray, (artefact,)
         Time of the first scan after an artefact moved, s; NaN where it did not.
     notes : list of str
-        For people.
+        Messages for the user.
     """
 
     wrong: NDArray[np.bool_]
@@ -40,30 +40,30 @@ class Trust:
     notes: list[str]
 
     def extras(self) -> dict[str, Any]:
-        """Return these as extra results of the error dataset."""
+        """Return the extra variables of the error dataset."""
         return {
             "moved": ("position", np.isfinite(self.since)),
             "moved_since": ("position", self.since, {"units": "s"}),
         }
 
 
-def judge(
+def check_artefacts(
     axis: Carriage,
     found: Registrations,
     settings: Settings,
-    places: Array,
+    positions: Array,
     time: Array,
     cold: list[int],
     warm: list[int],
-) -> Trust:
-    """Return what the repeated cold scans and the neighbours say of every artefact.
+) -> ArtefactCheck:
+    """Return which artefacts moved, by the repeated cold scans and by their neighbours.
 
     Parameters
     ----------
     axis : Carriage
     found : Registrations
     settings : Settings
-    places : (artefact,)
+    positions : (artefact,)
         m.
     time : (warm cycle,)
         s, increasing.
@@ -71,26 +71,26 @@ def judge(
         Cycles; those of ``cold`` after the first repeat it.
     """
     repeatability = (settings.repeatability_shift, settings.repeatability_turn)
-    wrong, since = np.zeros(found.reason.shape, dtype=bool), np.full(places.size, np.nan)
-    notes = _cold_notes(axis, places, cold[1:], repeatability)
+    wrong, since = np.zeros(found.reason.shape, dtype=bool), np.full(positions.size, np.nan)
+    notes = _cold_notes(axis, positions, cold[1:], repeatability)
     consistency = moved_artefacts(
         time,
-        places,
+        positions,
         axis.profiler[warm],
         axis.profiler_covariance[warm],
         repeatability=repeatability,
         cold_share=found.cold_share[warm],
     )
     if not consistency.tested:
-        notes.append("Too few artefacts to tell by the others whether one has moved: four are needed.")
+        notes.append("Too few artefacts to detect one that moved: at least four are needed.")
     for one in consistency.moved:
         wrong[warm[one.since :], one.artefact] = True
         since[one.artefact] = time[one.since]
-    notes += _moved_notes(consistency, places, time, settings.moved == "exclude")
-    return Trust(wrong, since, notes)
+    notes += _moved_notes(consistency, positions, time, settings.moved == "exclude")
+    return ArtefactCheck(wrong, since, notes)
 
 
-def _cold_notes(axis: Carriage, places: Array, repeats: list[int], repeatability: tuple[float, float]) -> list[str]:
+def _cold_notes(axis: Carriage, positions: Array, repeats: list[int], repeatability: tuple[float, float]) -> list[str]:
     if not repeats:
         return []
     found = cold_repeats(axis.profiler[repeats], axis.profiler_covariance[repeats], repeatability=repeatability)
@@ -98,20 +98,20 @@ def _cold_notes(axis: Carriage, places: Array, repeats: list[int], repeatability
     for repeat, k in np.argwhere(found.suspicious):
         shift, turn = _size(axis.profiler[repeats[repeat], k])
         notes.append(
-            f"The artefact at {places[k]:g} m was not where it had been when its cold scan was repeated "
-            f"({shift:.1f} um, {turn:.1f} urad off): is it clamped, and was the machine in thermal rest?"
+            f"The artefact at {positions[k]:g} m has moved between the cold scan and its repetition "
+            f"({shift:.1f} um, {turn:.1f} urad). Check its clamping and the thermal equilibrium of the machine."
         )
     return notes
 
 
-def _moved_notes(found: Consistency, places: Array, time: Array, excluded: bool) -> list[str]:
+def _moved_notes(found: Consistency, positions: Array, time: Array, excluded: bool) -> list[str]:
     notes = []
     for one in found.moved:
         shift, turn = _size(one.step)
         notes.append(
-            f"The artefact at {places[one.artefact]:g} m moved before the scan at {time[one.since] / 60:.1f} min, by "
-            f"{shift:.1f} um and {turn:.1f} urad against the others; its errors from there on are "
-            + ("left out." if excluded else "kept, but not trusted.")
+            f"The artefact at {positions[one.artefact]:g} m moved before the scan at {time[one.since] / 60:.1f} min, "
+            f"by {shift:.1f} um and {turn:.1f} urad relative to the others; its later errors are "
+            + ("excluded." if excluded else "kept, but not reliable.")
         )
     return notes
 

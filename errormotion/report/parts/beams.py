@@ -1,4 +1,4 @@
-"""The chapter of a beam detection: where each beam starts and points, how well, and how far from nominal."""
+"""Chapter of a beam detection: origins and directions, their uncertainty, and deviation from nominal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _UNKNOWN = "the beam was not determined"
 
 
 def part(source: Source, key: str) -> Part:
-    """Return the chapter of one beam detection; ``key`` keeps its figures' identifiers apart."""
+    """Return the chapter of one beam detection; ``key`` makes the identifiers of its figures unique."""
     errors = source.errors
     return Part(
         "Detection of the laser beams",
@@ -38,7 +38,7 @@ def part(source: Source, key: str) -> Part:
         [
             Section("beams", "Origins and directions", _beams(errors)),
             Section("nominal", "Difference to nominal", _nominal(errors)),
-            Section("constructions", "Circles and line beside the likelihood fit", _constructions(errors)),
+            Section("constructions", "Circles and line compared with the likelihood fit", _constructions(errors)),
             Section("quality", "Residuals and data quality", [*quality.notes(errors), *_residuals(errors, key)]),
             Section("provenance", "Provenance", provenance.blocks(source)),
         ],
@@ -54,8 +54,8 @@ def angle_between(
     ----------
     direction, other : ndarray, (3,)
     covariance : ndarray, (3, 3), optional
-        Of ``direction``, in rad^2; without it the uncertainty is NaN. Where the two vectors coincide the angle has no
-        linear part, and the uncertainty is that of the worst direction across.
+        Of ``direction``, in rad^2; without it the uncertainty is NaN. If the two vectors coincide, the angle is not
+        linear, and the uncertainty is that of the worst perpendicular direction.
     """
     across = direction - (direction @ other) * other
     angle = math.atan2(float(np.linalg.norm(across)), float(direction @ other))
@@ -76,12 +76,12 @@ def _names(errors: xr.Dataset) -> list[str]:
 
 
 def _vectors(errors: xr.Dataset, name: str) -> np.ndarray | None:
-    """Return a variable (beam, direction); None where the dataset does not hold it."""
+    """Return a variable (beam, direction); None if the dataset does not contain it."""
     return errors[name].transpose("beam", "direction").values if name in errors else None
 
 
 def _covariance(errors: xr.Dataset) -> np.ndarray:
-    """Return the covariance (beam, 6, 6) over origin and direction; NaN where the dataset does not hold it."""
+    """Return the covariance (beam, 6, 6) over origin and direction; NaN if the dataset does not contain it."""
     if "beam_covariance" not in errors:
         return np.full((errors.sizes["beam"], 6, 6), np.nan)
     return errors["beam_covariance"].transpose("beam", "p", "p_").values
@@ -108,16 +108,20 @@ def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     far, off = max(known, key=lambda i: found[i][0]), max(known, key=lambda i: found[i][1])
     sigma = np.sqrt(np.einsum("bii->bi", _covariance(errors)))
     return [
-        KeyFigure("farthest origin", Cell(fixed(1e6 * found[far][0], 0)), "µm", f"{names[far]}, from nominal"),
+        KeyFigure(
+            "largest deviation of origin", Cell(fixed(1e6 * found[far][0], 0)), "µm", f"{names[far]}, from nominal"
+        ),
         KeyFigure(
             "largest angle",
             estimate(found[off][1] / ARCSEC, 2 * found[off][2] / ARCSEC, signed=False),
             "arcsec",
             f"{names[off]}, from nominal",
         ),
-        KeyFigure("origin known to", Cell(significant(2e6 * finite(np.max, sigma[:, :3]))), "µm", "largest U, k = 2"),
         KeyFigure(
-            "direction known to",
+            "uncertainty of origin", Cell(significant(2e6 * finite(np.max, sigma[:, :3]))), "µm", "largest U, k = 2"
+        ),
+        KeyFigure(
+            "uncertainty of direction",
             Cell(significant(2 * finite(np.max, sigma[:, 3:]) / ARCSEC)),
             "arcsec",
             "largest U, k = 2",
@@ -137,8 +141,8 @@ def _summary(errors: xr.Dataset) -> list[str]:
         far, off = max(known, key=lambda entry: entry[1][0]), max(known, key=lambda entry: entry[1][1])
         angle, expanded = rounded(off[1][1] / ARCSEC, 2 * off[1][2] / ARCSEC, signed=False)
         words.append(
-            f"Against nominal, origins differ by up to {fixed(1e6 * far[1][0], 0)} µm ({far[0]}) and directions by "
-            f"up to {angle} ± {expanded} arcsec ({off[0]}); an evaluation with nominal beams would carry "
+            f"Origins deviate from nominal by up to {fixed(1e6 * far[1][0], 0)} µm ({far[0]}) and directions by "
+            f"up to {angle} ± {expanded} arcsec ({off[0]}); an evaluation with nominal beams would have errors from "
             "these differences."
         )
     both = _construction_differences(errors)
@@ -155,14 +159,14 @@ def _summary(errors: xr.Dataset) -> list[str]:
 def _beams(errors: xr.Dataset) -> list[Block]:
     origin, direction = _vectors(errors, "beam_origin"), _vectors(errors, "beam_direction")
     if origin is None or direction is None:
-        return [Text("The result holds no origins and directions.", "warning")]
+        return [Text("The result contains no origins and directions.", "warning")]
     expanded = 2 * np.sqrt(np.einsum("bii->bi", _covariance(errors)))
     names = _names(errors)
-    places: list[list[Cell | str]] = []
-    senses: list[list[Cell | str]] = []
+    origins: list[list[Cell | str]] = []
+    directions: list[list[Cell | str]] = []
     noise = errors["noise"].values if "noise" in errors else np.full(len(names), np.nan)
     for i, name in enumerate(names):
-        places.append(
+        origins.append(
             [
                 name,
                 *(estimate(1e3 * v, 1e3 * u, reason=_UNKNOWN) for v, u in zip(origin[i], expanded[i, :3], strict=True)),
@@ -171,7 +175,7 @@ def _beams(errors: xr.Dataset) -> list[Block]:
         )
         across = np.nan_to_num(_covariance(errors)[i, 3:, 3:], nan=-1.0)
         largest = float(np.sqrt(np.linalg.eigvalsh(across)[-1])) if (np.diag(across) >= 0).all() else math.nan
-        senses.append(
+        directions.append(
             [
                 name,
                 *(or_dash(fixed(value, 6, signed=True), _UNKNOWN) for value in direction[i]),
@@ -180,16 +184,16 @@ def _beams(errors: xr.Dataset) -> list[Block]:
         )
     return [
         Table(
-            "Origins in machine coordinates: the place of reading zero, the start of the measuring range. Noise: one "
-            "standard deviation of an averaged reading about the fit. After ±: expanded uncertainty, k = 2.",
+            "Origins in machine coordinates: the position of reading zero, the start of the measuring range. Noise: "
+            "standard deviation of an averaged reading. After ±: expanded uncertainty, k = 2.",
             ["beam", "x / mm", "y / mm", "z / mm", "noise / µm"],
-            places,
+            origins,
         ),
         Table(
             "Directions as unit vectors, from the sensor to the object, and their expanded uncertainty as an angle in "
             "the worst direction, k = 2. A change of 0.000 01 across the beam is 2.1 arcsec.",
             ["beam", "u_x", "u_y", "u_z", "U / arcsec"],
-            senses,
+            directions,
         ),
     ]
 
@@ -198,7 +202,7 @@ def _nominal(errors: xr.Dataset) -> list[Block]:
     found = _differences(errors)
     origin, at = _vectors(errors, "beam_origin"), _vectors(errors, "nominal_origin")
     if not found or origin is None or at is None:
-        return [Text("No nominal origins and directions are known.", "note")]
+        return [Text("The nominal origins and directions are unknown.", "note")]
     expanded = 2 * np.sqrt(np.einsum("bii->bi", _covariance(errors)))
     rows: list[list[Cell | str]] = []
     for i, name in enumerate(_names(errors)):
@@ -253,7 +257,7 @@ def _constructions(errors: xr.Dataset) -> list[Block]:
     return [
         Table(
             "Construction from circles and a line, minus the maximum-likelihood fit of all readings to the "
-            "intersection of ray and sphere. The likelihood fit is the one that is used.",
+            "intersection of ray and sphere. The result is that of the likelihood fit.",
             ["beam", "Δx / µm", "Δy / µm", "Δz / µm", "distance / µm", "angle / arcsec"],
             rows,
             [("", 1), ("origin", 4), ("direction", 1)],
@@ -263,7 +267,7 @@ def _constructions(errors: xr.Dataset) -> list[Block]:
 
 def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
     if "residual" not in errors or not np.isfinite(errors["residual"].values).any():
-        return [Text("The result holds no residuals.", "note")]
+        return [Text("The result contains no residuals.", "note")]
     values = 1e6 * errors["residual"].transpose("beam", "profile", "step").values
     names = _names(errors)
     left = errors["left_out"].values if "left_out" in errors else None
@@ -280,8 +284,8 @@ def _residuals(errors: xr.Dataset, key: str) -> list[Block]:
             ]
         )
     table = Table(
-        "Residuals of the likelihood fit: reading minus predicted reading. Left out: readings not used in the fit.",
-        ["beam", "residuals", "without value", "left out", "rms / µm", "largest / µm"],
+        "Residuals of the likelihood fit: reading minus predicted reading. Excluded: readings not used in the fit.",
+        ["beam", "residuals", "without value", "excluded", "rms / µm", "largest / µm"],
         rows,
     )
 

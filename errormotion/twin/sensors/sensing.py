@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.twin import kernels
-from errormotion.twin.bar import Bar
-from errormotion.twin.frame import FrameGeometry
+from errormotion.twin.artefacts.bar import Bar
+from errormotion.twin.heat.state import ThermalState
 from errormotion.twin.schedule import StepProgram
-from errormotion.twin.state import ThermalState
+from errormotion.twin.sensors.frame import FrameGeometry
 
 Channels = NDArray[np.int64]
 

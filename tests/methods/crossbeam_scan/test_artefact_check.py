@@ -10,14 +10,14 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, check_artefacts
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
-from errormotion.methods.crossbeam_scan.identification.judgement import MOVED, judge
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
 from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
-from errormotion.twin.profiler import Profiler
+from errormotion.twin.sensors.profiler import Profiler
 
 PROFILER = Profiler(800, 25e-6)
 PLACES = np.linspace(-0.7, 0.7, 8)
@@ -87,7 +87,7 @@ def test_nobody_is_named_where_nothing_moved(strain, clean):
     assert not ds["moved"].any()
     assert np.isnan(ds["moved_since"].values).all()
     assert not named(ds)
-    assert not named(ds, "cold scan was repeated")
+    assert not named(ds, "cold scan and its repetition")
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_it_is_kept_where_that_is_asked_for(machine, raw, clean):
     assert np.isfinite(ds.em.twist().values).all()
     assert not (ds["reason"] != "").any()
     assert ds["moved"].values[3]
-    assert "kept, but not trusted" in named(ds)[0]
+    assert "kept, but not reliable" in named(ds)[0]
     # an artefact that rises looks like an axis that sinks; EZ is known to 0.5 um, twice
     rise = ds.em.twist().values[3:, 3, 2] - clean["free"].em.twist().values[3:, 3, 2]
     assert rise == pytest.approx(-5e-6, abs=2.5e-6)
@@ -139,14 +139,17 @@ def test_it_is_kept_where_that_is_asked_for(machine, raw, clean):
 def test_a_cold_scan_that_does_not_repeat_is_named(machine, raw):
     spoilt = replaced(raw, machine, slice(1, 2), 5, [0, 0, 5e-6, 0, 0, 0])
     ds = identify(spoilt)
-    assert len(named(ds, "cold scan was repeated")) == 1
-    assert f"The artefact at {PLACES[5]:g} m was not where it had been" in named(ds, "cold scan was repeated")[0]
+    assert len(named(ds, "cold scan and its repetition")) == 1
+    assert (
+        f"The artefact at {PLACES[5]:g} m has moved between the cold scan and its repetition"
+        in named(ds, "cold scan and its repetition")[0]
+    )
     assert ds["cold_repeat"].shape == (1, len(PLACES), 6)
 
 
 def test_three_artefacts_cannot_tell_and_say_so(raw):
     ds = identify(raw.isel(artefact=[0, 3, 6]))
-    assert named(ds, "Too few artefacts to tell by the others whether one has moved: four are needed.")
+    assert named(ds, "Too few artefacts to detect one that moved: at least four are needed.")
     assert not ds["moved"].any()
 
 
@@ -170,7 +173,7 @@ def judged(seed, step=None):
     axis = dataclasses.replace(axis, profiler=twist, profiler_covariance=known)
     found = Registrations(**dict.fromkeys((f.name for f in dataclasses.fields(Registrations)), None))
     found.reason, found.cold_share = np.full(shape, "", dtype=object), np.full(shape, 0.5)
-    return judge(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
+    return check_artefacts(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
 
 
 def test_clean_campaigns_name_nobody():

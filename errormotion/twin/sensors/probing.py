@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.twin import kernels, truth
-from errormotion.twin.balls import Balls, Probe, seeded_balls, seeded_probe
+from errormotion.twin.artefacts.balls import Balls, Probe, seeded_balls, seeded_probe
 from errormotion.twin.geometry import GeometricErrors
-from errormotion.twin.state import ThermalState
+from errormotion.twin.heat.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
 

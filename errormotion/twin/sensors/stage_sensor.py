@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.twin import kernels
-from errormotion.twin.planes import CheckBar, SineGauge, Target, seeded_check_bar
-from errormotion.twin.point_sensor import PointSensor, seeded_point_sensor
+from errormotion.twin.artefacts.planes import CheckBar, SineGauge, Target, seeded_check_bar
+from errormotion.twin.sensors.point_sensor import PointSensor, seeded_point_sensor
 
 PIVOT, BAR_POSITION = (0.10, 0.05, 0.12), (-0.10, 0.05, 0.10)
 """A point on every face of the sine gauge, and a point on the axis of the check bar, m."""
@@ -36,7 +36,7 @@ class StageSensor:
     check_bar: CheckBar
 
     def _set_up_point_sensor(self, rng: np.random.Generator) -> None:
-        """Mount the sensor, and place gauge and bar on the table."""
+        """Mount the sensor, and position gauge and bar on the table."""
         self.point_sensor = seeded_point_sensor(rng)
         self.sine_gauge = SineGauge(self.seed, np.array(PIVOT))
         self.check_bar = seeded_check_bar(rng, np.array(BAR_POSITION))
@@ -83,7 +83,7 @@ class StageSensor:
         """
         sensor = sensor or self.point_sensor
         times = np.atleast_1d(np.asarray(t, dtype=float))
-        places = np.atleast_2d(np.asarray(stage, dtype=float))
-        still = sensor.still(target, places, beyond=beyond) + sensor.speckles((self.seed, TEXTURE, *key), places)
+        positions = np.atleast_2d(np.asarray(stage, dtype=float))
+        still = sensor.still(target, positions, beyond=beyond) + sensor.speckles((self.seed, TEXTURE, *key), positions)
         noise = sensor.noise * kernels.normals(kernels.stream_key(self.seed, NOISE, *key), first, times.size)
         return np.asarray(still + sensor.warm_up_offset(self.sensors_on_for + times) + noise)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
+from errormotion.twin.heat.network import Ambient, ThermalNetwork, lag_response
 from errormotion.twin.kinds import MachineKind
 from errormotion.twin.schedule import Schedule
-from errormotion.twin.thermal import Ambient, ThermalNetwork, lag_response
 
 _DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
-from errormotion.twin import kernels, surfaces
-from errormotion.twin.artefacts import Artefact
+from errormotion.twin import kernels
+from errormotion.twin.artefacts import surfaces
+from errormotion.twin.artefacts.pieces import Artefact
 
 _JITTER_Y, _BLOBS, _STREAMS = 1, 2, 10
 

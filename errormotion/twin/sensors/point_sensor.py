@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.kinematics.beams import tilt, turned
-from errormotion.twin.planes import Target
-from errormotion.twin.triangulation import Optics, key_of, speckle
+from errormotion.twin.artefacts.planes import Target
+from errormotion.twin.sensors.triangulation import Optics, key_of, speckle
 
 #: nominal position of the zero point with the stage at 0, m
 NOMINAL_ORIGIN = (0.05, 0.0, -0.08)

@@ -1,0 +1,1 @@
+"""Files that people write and large variables: TOML, search folders, hashes, samples."""

@@ -1,0 +1,1 @@
+"""Parts that several chapters share: beams, budget, temperature sensors."""

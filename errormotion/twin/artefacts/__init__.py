@@ -1,0 +1,1 @@
+"""Pieces that the sensors of the virtual machine measure: artefacts, bar, balls, planes, and their surfaces."""
