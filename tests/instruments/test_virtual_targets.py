@@ -9,8 +9,8 @@ from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.methods.beam_direction import simulation
-from errormotion.twin.planes import Plane
-from errormotion.twin.point_sensor import PointSensor
+from errormotion.twin.artefacts.planes import Plane
+from errormotion.twin.sensors.point_sensor import PointSensor
 
 SLOW = OptoSettings(rate=1500.0, timeout=10.0)
 LONG = OptoSettings(rate=1500.0, timeout=10.0, range=20e-3)
@@ -77,7 +77,7 @@ def test_the_state_names_the_target_only_while_there_is_one() -> None:
         (("plane",), "inclination and rotation"),
         (("plane", 0.1), "inclination and rotation"),
         (("bar", 0.1, 0.2), "for a plane only"),
-        (("plane", 1.2, 0.0), "an inclination from 0 to 60 deg; found 68.7"),
+        (("plane", 1.2, 0.0), "inclination from 0 to 60 deg; found 68.7"),
     ],
 )
 def test_a_target_that_does_not_exist_is_refused(arguments: tuple[object, ...], message: str) -> None:
