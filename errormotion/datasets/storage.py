@@ -192,8 +192,8 @@ def _engine_of(path: Path) -> str:
     if _HDF5_SIGNATURE.startswith(head):
         raise DatasetError(f"{path}: is truncated; create it again or copy it again")
     raise DatasetError(
-        f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log use "
-        "'errormotion import'"
+        f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log "
+        "use 'errormotion import'"
     )
 
 
