@@ -61,8 +61,8 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
         raise MethodError(
             f"expected at least {full} targets seen by all {n} stations, or as many readings spread otherwise, for "
             f"{needed} unknowns of the stations (positions and dead paths); found {equations} equations in {m} "
-            f"targets, of which {int(np.count_nonzero(count == n))} are seen by all and {int(np.count_nonzero(count < 3))} by "
-            "fewer than three; measure more targets"
+            f"targets, of which {int(np.count_nonzero(count == n))} are seen by all and "
+            f"{int(np.count_nonzero(count < 3))} by fewer than three; measure more targets"
         )
 
 
