@@ -186,7 +186,7 @@ def test_mistakes_of_a_map_name_their_key(mistakes, old: str, new: str, expected
             "line 7: column 'X': expected 100 as in line 5, which has the same labels; found 101",
         ),
         ("1000,5", "one", "line 4: column 'Length': expected a number; found 'one'"),
-        ("S2;P2;", "S2;P1;", "comes again; line 6 has it already"),
+        ("S2;P2;", "S2;P1;", "duplicate; first given in line 6"),
         ("900,25", "900000,25", "line 6: column 'Length': makes displacement = 900 m"),
         ("S2;P2;100;0;50;880", "S2;P2;100;0", "line 7: expected 10 fields; found 8"),
     ],

@@ -1,4 +1,4 @@
-"""Readings that a person wrote: what is right is read in SI, what is wrong is told with its line and column."""
+"""Readings that a person wrote: correct files are read in SI, mistakes are reported with line and column."""
 
 import json
 from pathlib import Path
@@ -143,8 +143,8 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
         ("x [mm]", "x (mm)", "column 3 'x (mm)': expected a name and its unit in brackets"),
         ("x [mm]", "x [deg]", "column 'x [deg]': expected a unit of the kind of m; found 'deg'"),
         ("x [mm]", "x [parsnip]", "found 'parsnip'"),
-        ("x [mm]", "y [mm]", "column 4 'y [mm]': comes again; column 3 is 'y [mm]'"),
-        ("x [mm]", "stage_z [mm]", "column 5 'z [mm]': comes again; column 3 is 'stage_z [mm]'"),
+        ("x [mm]", "y [mm]", "column 4 'y [mm]': duplicate of column 3 'y [mm]'"),
+        ("x [mm]", "stage_z [mm]", "column 5 'z [mm]': duplicate of column 3 'stage_z [mm]'"),
         ("z [mm]", "bar_distance [mm]", "stage: expected all its components; missing stage_z"),
         ("plane,", "group,", "line 6: column 1 'group': unknown column"),
         (
@@ -175,11 +175,15 @@ def test_numbers_come_back_to_the_last_bit(tmp_path_factory: pytest.TempPathFact
         ("distance_noise", "distance_noize", "line 5: distance_noize: unknown key; did you mean 'distance_noise'?"),
         ("# distance_noise", "# stage = 1 mm\n# distance_noise", "line 5: stage: expected in a table"),
         ("# distance_noise = 0.1 um\n", "", "distance_noise(): missing; expected in m"),
-        ("# machine = C-frame 610", "# schema = errormotion.raw.inclination/1", "line 2: 'schema' comes again; line 1"),
+        (
+            "# machine = C-frame 610",
+            "# schema = errormotion.raw.inclination/1",
+            "line 2: duplicate key 'schema'; first given in line 1",
+        ),
         (
             "raw.beam_direction",
             "raw.beam_directoin",
-            "line 1: schema 'errormotion.raw.beam_directoin/1' is not known; did",
+            "line 1: schema 'errormotion.raw.beam_directoin/1' is unknown; did",
         ),
         ("# schema = errormotion.raw.beam_direction/1\n", "", "expected a line '# schema = ...'"),
     ],
@@ -197,15 +201,15 @@ def test_mistakes_are_told_with_their_place(complaints, old: str, new: str, told
         ),
         (
             "\nplane,nominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,1,0\n1,0,0,1\n",
-            "comes again; line 14",
+            "duplicate; first given in line 14",
         ),
         (
             "\nnominal_normal_x [1],nominal_normal_y [1],nominal_normal_z [1]\n1,0,0\n",
             "line 13: expected 2 along plane",
         ),
-        ("\nplane,reading [mm]\n1,0.1\n", "column 2 'reading [mm]': distance stands further up already"),
+        ("\nplane,reading [mm]\n1,0.1\n", "column 2 'reading [mm]': distance is already given above"),
         ("\ndistance_noise [um]\n0.1\n", "distance_noise: expected in the header, as '# distance_noise = ...'"),
-        ("\nplane,bar_distance [mm]\n1,0.1\n", "column 'plane': no variable of this table has it"),
+        ("\nplane,bar_distance [mm]\n1,0.1\n", "column 'plane': no variable of this table has this dimension"),
         ("\nbar_distance [mm]\n", "line 13: expected lines of numbers below the column names; found none"),
         ('\nbar_distance [mm]\n"0.1\n', "line 14: cannot be split into fields"),
     ],

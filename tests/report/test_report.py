@@ -230,8 +230,8 @@ def test_only_the_compulsory_part_of_a_spindle_dataset_is_enough(read, drift):
     bare = drift.drop_vars([name for name in drift.data_vars if name[0] != "E" and name != "covariance"])
     bare = bare.drop_dims(["channel", "sensor"], errors="ignore").drop_vars("spindle_speed")
     seen = read(bare)
-    assert "The result holds no ISO 230-3 values." in seen.text
-    assert "does not hold the geometry" in seen.text
+    assert "The result contains no ISO 230-3 values." in seen.text
+    assert "does not contain the geometry" in seen.text
     assert seen.unbalanced == []
 
 

@@ -1,4 +1,4 @@
-"""A text file with header lines and tables, split into lines and cells, without any interpretation."""
+"""A text file with header lines and tables, split into lines and cells, without interpretation of the cells."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Table:
 
 
 def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
-    """Take a text file apart.
+    """Return the header and the tables of a text file.
 
     Parameters
     ----------
@@ -38,18 +38,18 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
     Raises
     ------
     DatasetError
-        The file cannot be read or split, a key comes twice, or there is no table.
+        The file cannot be read or split, a key is duplicated, or there is no table.
     """
     header: dict[str, tuple[int, str]] = {}
     parts: list[list[tuple[int, str]]] = [[]]
     for number, line in enumerate(_lines(path), 1):
-        # A spreadsheet fills every line up with separators, and may put one with commas in quotes.
+        # Spreadsheets pad every line with separators, and may quote a line that contains commas.
         bare = line.strip().strip('",;\t ')
         if bare.startswith("#"):
             match = _KEY.fullmatch(bare)
             if match and match[1] in header:
                 before = header[match[1]][0]
-                raise DatasetError(f"{path}, line {number}: '{match[1]}' comes again; line {before} has it already")
+                raise DatasetError(f"{path}, line {number}: duplicate key '{match[1]}'; first given in line {before}")
             if match:
                 header[match[1]] = (number, match[2].strip())
         elif bare:

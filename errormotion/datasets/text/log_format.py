@@ -1,4 +1,4 @@
-"""How a text log is written: the tables of a map that every log has."""
+"""Format of a text log: the tables that every map has."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Column = Annotated[str | Annotated[int, Field(ge=1)], Field(description="name of
 
 
 class Format(LogTable):
-    """How the text is written."""
+    """Format of the text."""
 
     encoding: Annotated[str, AfterValidator(_known_encoding)] = "utf-8"
     delimiter: Literal[",", ";", "\t", " ", "auto"] = "auto"

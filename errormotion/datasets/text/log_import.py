@@ -17,7 +17,7 @@ from errormotion.datasets.schemas import RawSchema, Row, variants
 from errormotion.datasets.text.csv_text import Table
 from errormotion.datasets.text.log_format import TIMESTAMP
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
-from errormotion.datasets.text.log_reader import Complaints, columns_of, seconds, top_lines
+from errormotion.datasets.text.log_reader import Mistakes, columns_of, seconds, top_lines
 from errormotion.datasets.text.table_reader import (
     NUMBER,
     Column,
@@ -40,35 +40,35 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     Raises
     ------
     DatasetError
-        The map or the log is wrong; all mistakes at once.
+        The map or the log is wrong; all mistakes are reported together.
     """
     settings = load_model(map_file, LogMap)
-    mistakes = Complaints(map_file)
-    names = Names.of(_tables(settings, mistakes), _free_labels(settings))
-    columns = {key: _column(key, entry, names, mistakes) for key, entry in settings.columns.items()}
+    map_mistakes = Mistakes(map_file)
+    names = Names.of(_tables(settings, map_mistakes), _free_labels(settings))
+    columns = {key: _column(key, entry, names, map_mistakes) for key, entry in settings.columns.items()}
     dims = {dim for row in names.rows.values() for dim in names.record_dims(row)}
     for dim in settings.labels:
         if dim not in dims:
-            mistakes.add(0, f"labels.{dim}: unknown dimension; {nearest(dim, dims)}")
+            map_mistakes.add(0, f"labels.{dim}: unknown dimension; {nearest(dim, dims)}")
     found = Found()
     for name, value in settings.values.items():
-        _read_value(name, value, settings, log, names, found, mistakes)
-    mistakes.raise_any()
+        _read_value(name, value, settings, log, names, found, map_mistakes)
+    map_mistakes.raise_any()
     known = {key: column for key, column in columns.items() if column is not None}
-    complaints = Complaints(log)
-    table, start = _table(settings, complaints)
-    for part, columns_of_part, keys in _parts(table, known, settings, names, complaints):
+    mistakes = Mistakes(log)
+    table, start = _table(settings, mistakes)
+    for part, columns_of_part, keys in _parts(table, known, settings, names, mistakes):
         for text in incomplete(columns_of_part, keys, names):
-            complaints.add(0, text)
-        if not complaints.count:
-            read_table(part, columns_of_part, keys, names, found, complaints)
-    complaints.raise_any()
+            mistakes.add(0, text)
+        if not mistakes.count:
+            read_table(part, columns_of_part, keys, names, found, mistakes)
+    mistakes.raise_any()
     stated = {"machine": settings.machine, "start": start}
     attrs = {**settings.attributes, **{name: text for name, text in stated.items() if text}}
     return found.dataset({"schema": settings.schema_, **attrs}, names)
 
 
-def _tables(settings: LogMap, mistakes: Complaints) -> Sequence[RawSchema]:
+def _tables(settings: LogMap, mistakes: Mistakes) -> Sequence[RawSchema]:
     tables = variants(settings.schema_)
     if not settings.variant:
         return tables
@@ -90,7 +90,7 @@ def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _column(key: str, entry: MappedColumn, names: Names, mistakes: Complaints) -> Column | None:
+def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> Column | None:
     """Return a column of the map with its variable; None and a mistake where there is no such variable."""
     name, dot, label = key.partition(".")
     row = names.rows.get(name)
@@ -112,7 +112,7 @@ def _column(key: str, entry: MappedColumn, names: Names, mistakes: Complaints) -
     return Column(row, component, unit, entry.scale, offset, component is None or row.missing)
 
 
-def _quantity(text: str, row: Row, where: str, mistakes: Complaints) -> float:
+def _quantity(text: str, row: Row, where: str, mistakes: Mistakes) -> float:
     """Return a difference with its unit in the unit of a variable."""
     number, _, unit = text.strip().partition(" ")
     try:
@@ -124,9 +124,9 @@ def _quantity(text: str, row: Row, where: str, mistakes: Complaints) -> float:
 
 
 def _read_value(
-    name: str, entry: MappedValue, settings: LogMap, log: Path, names: Names, found: Found, mistakes: Complaints
+    name: str, entry: MappedValue, settings: LogMap, log: Path, names: Names, found: Found, mistakes: Mistakes
 ) -> None:
-    """Read a variable that the map states, or that it names in the first lines of the log."""
+    """Read a variable whose value is in the map, or in the first lines of the log under a key given in the map."""
     row, where = names.rows.get(name), f"values.{name}"
     if row is None:
         mistakes.add(0, f"{where}: unknown variable; {nearest(name, names.rows)}")
@@ -185,18 +185,18 @@ def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
     return None
 
 
-def _table(settings: LogMap, complaints: Complaints) -> tuple[Table, str]:
+def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str]:
     """Return the wanted columns of a log as a table with points as decimal signs, and its first date."""
     form = settings.format
     wanted = {f"labels.{dim}": column for dim, column in settings.labels.items()}
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
     dated = {f"columns.{key}" for key, entry in settings.columns.items() if entry.unit == TIMESTAMP}
-    (line, titles), lines, places = columns_of(wanted, form, complaints)
+    (line, titles), lines, places = columns_of(wanted, form, mistakes)
     start: datetime | None = None
     cells = []
     for number, row in lines:
         if len(row) != len(titles):
-            complaints.add(number, f"expected {len(titles)} fields; found {len(row)}")
+            mistakes.add(number, f"expected {len(titles)} fields; found {len(row)}")
             continue
         texts = []
         for key, place in places.items():
@@ -204,7 +204,7 @@ def _table(settings: LogMap, complaints: Complaints) -> tuple[Table, str]:
             if text in form.missing:
                 text = ""
             elif key in dated and text:
-                start, value = seconds(text, start, f"column '{titles[place]}'", number, complaints)
+                start, value = seconds(text, start, f"column '{titles[place]}'", number, mistakes)
                 text = repr(value)
             elif form.decimal == "," and key.startswith("columns") and "." not in text:
                 text = text.replace(",", ".")
@@ -215,7 +215,7 @@ def _table(settings: LogMap, complaints: Complaints) -> tuple[Table, str]:
 
 
 def _parts(
-    table: Table, columns: Mapping[str, Column], settings: LogMap, names: Names, complaints: Complaints
+    table: Table, columns: Mapping[str, Column], settings: LogMap, names: Names, mistakes: Mistakes
 ) -> Iterator[tuple[Table, dict[int, Column], dict[str, int]]]:
     """Yield the table once for each set of dimensions, with the columns of its variables and the label columns.
 
@@ -231,20 +231,20 @@ def _parts(
     for record, group in groups.items():
         own = {dim: number for dim, number in keys.items() if dim in record}
         repeats = record != widest and set(record) <= set(keys) and bool(record)
-        part = _without_repetition(table, list(own.values()), list(group), complaints) if repeats else table
+        part = _without_repetition(table, list(own.values()), list(group), mistakes) if repeats else table
         yield part, group, own
     for dim in set(keys) - {dim for record in groups for dim in record}:
-        complaints.add(0, f"labels.{dim}: no variable of the map has this dimension")
+        mistakes.add(0, f"labels.{dim}: no variable of the map has this dimension")
 
 
-def _without_repetition(table: Table, keys: Sequence[int], values: Sequence[int], complaints: Complaints) -> Table:
+def _without_repetition(table: Table, keys: Sequence[int], values: Sequence[int], mistakes: Mistakes) -> Table:
     """Return the first line for each combination of labels; other values in a later line are mistakes."""
     kept: dict[tuple[str, ...], tuple[int, list[str]]] = {}
     for line, texts in table.rows:
         before = kept.setdefault(tuple(texts[number] for number in keys), (line, texts))
         for number in values:
             if texts[number] != before[1][number]:
-                complaints.add(
+                mistakes.add(
                     line,
                     f"column '{table.head[1][number]}': expected {before[1][number] or 'nothing'} as in line "
                     f"{before[0]}, which has the same labels; found {texts[number] or 'nothing'}",

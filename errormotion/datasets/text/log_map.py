@@ -1,4 +1,4 @@
-"""The map of a log for any raw schema: which column and which value is which variable."""
+"""The map of a log for any raw schema: assignment of columns and values to variables."""
 
 from __future__ import annotations
 

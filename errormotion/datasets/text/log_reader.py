@@ -20,13 +20,13 @@ from errormotion.errors import DatasetError
 
 T = TypeVar("T")
 
-_MOST = 20
-"""Mistakes that are reported one by one."""
+_MAX_REPORTED = 20
+"""Largest number of mistakes that are reported with their text."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 @dataclass
-class Complaints:
+class Mistakes:
     """Mistakes in a file: the first ones with their text, the others counted."""
 
     path: Path
@@ -34,9 +34,9 @@ class Complaints:
     count: int = 0
 
     def add(self, line: int, text: str) -> None:
-        """Keep one mistake; ``line`` 0 is the file as a whole."""
+        """Add one mistake; ``line`` 0 is the file as a whole."""
         self.count += 1
-        if len(self.texts) < _MOST:
+        if len(self.texts) < _MAX_REPORTED:
             self.texts.append((line, text))
 
     def raise_any(self) -> None:
@@ -68,9 +68,9 @@ class Columns:
 
 
 def read_columns(
-    wanted: Mapping[str, str | int], time: str, form: Format, complaints: Complaints, *, dates: bool = False
+    wanted: Mapping[str, str | int], time: str, form: Format, mistakes: Mistakes, *, dates: bool = False
 ) -> Columns:
-    """Read columns of the log ``complaints.path``.
+    """Read columns of the log ``mistakes.path``.
 
     Parameters
     ----------
@@ -79,39 +79,39 @@ def read_columns(
     time : str
         Key of the time, where no cell may be empty.
     form : Format
-        How the text is written.
-    complaints : Complaints
-        Takes what is wrong with the cells.
+        Format of the text.
+    mistakes : Mistakes
+        Receives the mistakes in the cells.
     dates : bool
-        The time is given as dates.
+        Whether the time is given as dates.
 
     Raises
     ------
     DatasetError
         No file, wrong encoding, unbalanced quotes, missing columns, no lines.
     """
-    (_, titles), remaining, places = columns_of(wanted, form, complaints)
+    (_, titles), remaining, places = columns_of(wanted, form, mistakes)
     width = len(titles)
     cells = {key: array("d") for key in wanted}
     lines = array("q")
     start: datetime | None = None
     for line, row in remaining:
         if len(row) != width:
-            complaints.add(line, f"expected {width} fields; found {len(row)}")
+            mistakes.add(line, f"expected {width} fields; found {len(row)}")
             continue
         lines.append(line)
         for key, place in places.items():
             text = row[place].strip()
             if key == time and dates:
-                start, value = seconds(text, start, f"{key}, field {place + 1}", line, complaints)
+                start, value = seconds(text, start, f"{key}, field {place + 1}", line, mistakes)
             elif key == time and not text:
-                complaints.add(line, f"{key}, field {place + 1}: expected a number; found an empty cell")
+                mistakes.add(line, f"{key}, field {place + 1}: expected a number; found an empty cell")
                 value = np.nan
             else:
-                value = _number(text, f"{key}, field {place + 1}", form, line, complaints)
+                value = _number(text, f"{key}, field {place + 1}", form, line, mistakes)
             cells[key].append(value)
-    if not lines and not complaints.count:
-        raise DatasetError(f"{complaints.path}: expected lines of numbers below the header; found none")
+    if not lines and not mistakes.count:
+        raise DatasetError(f"{mistakes.path}: expected lines of numbers below the header; found none")
     return Columns(
         {key: np.array(values, dtype=float) for key, values in cells.items()},
         np.array(lines, dtype=np.int64),
@@ -120,9 +120,9 @@ def read_columns(
 
 
 def columns_of(
-    wanted: Mapping[str, str | int], form: Format, complaints: Complaints
+    wanted: Mapping[str, str | int], form: Format, mistakes: Mistakes
 ) -> tuple[tuple[int, list[str]], Iterator[tuple[int, list[str]]], dict[str, int]]:
-    """Find columns of the log ``complaints.path``.
+    """Find columns of the log ``mistakes.path``.
 
     Returns
     -------
@@ -138,12 +138,12 @@ def columns_of(
     DatasetError
         No file, wrong encoding, unbalanced quotes, missing columns, no lines.
     """
-    remaining = _rows(complaints.path, form)
+    remaining = _rows(mistakes.path, form)
     head = next(remaining, None)
     if head is None:
-        raise DatasetError(f"{complaints.path}: expected lines of numbers; found none")
-    places = _places(head[1], head[0], wanted, form, complaints)
-    complaints.raise_any()
+        raise DatasetError(f"{mistakes.path}: expected lines of numbers; found none")
+    places = _places(head[1], head[0], wanted, form, mistakes)
+    mistakes.raise_any()
     return head, remaining if form.header else _chain(head, remaining), places
 
 
@@ -164,7 +164,7 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
             marked = binary.read(2) in _UTF16_MARKS
             if marked and not encoding.startswith(("utf-16", "utf-32")):
                 raise DatasetError(
-                    f"{log}, line 1: begins with the byte order mark of UTF-16; set format.encoding = 'utf-16' "
+                    f"{log}, line 1: starts with the byte order mark of UTF-16; set format.encoding = 'utf-16' "
                     "in the map"
                 )
             binary.seek(0)
@@ -179,7 +179,7 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
         byte = error.object[error.start]
         raise DatasetError(
             f"{log}, line {max(number, 1)}: byte 0x{byte:02x} is not {encoding}; set format.encoding in the map to "
-            "what the log is written in, such as 'cp1252'"
+            "the encoding of the log, such as 'cp1252'"
         ) from error
     except UnicodeError as error:
         raise DatasetError(f"{log}, line {number + 1}: is not {encoding}: {error}") from error
@@ -219,28 +219,28 @@ def _chain(first: T, rest: Iterator[T]) -> Iterator[T]:
 
 
 def _places(
-    row: list[str], line: int, wanted: Mapping[str, str | int], form: Format, complaints: Complaints
+    row: list[str], line: int, wanted: Mapping[str, str | int], form: Format, mistakes: Mistakes
 ) -> dict[str, int]:
-    """Return where in a row each key stands, from the header or by number."""
+    """Return the index of each key's column in a row, from the header or by number."""
     names = [name.strip() for name in row] if form.header else []
     places = {}
     for key, column in wanted.items():
         if isinstance(column, int):
             if column > len(row):
-                complaints.add(line, f"{key}: expected a column {column}; found only {len(row)}")
+                mistakes.add(line, f"{key}: expected a column {column}; found only {len(row)}")
             places[key] = column - 1
         elif not form.header:
-            complaints.add(line, f"{key}: a log without header has no column '{column}'; give its number in the map")
+            mistakes.add(line, f"{key}: a log without header has no column '{column}'; give its number in the map")
         elif column not in names:
-            complaints.add(line, f"{key}: no column '{column}'; {nearest(column, names)}")
+            mistakes.add(line, f"{key}: no column '{column}'; {nearest(column, names)}")
         elif names.count(column) > 1:
-            complaints.add(line, f"{key}: column '{column}' comes {names.count(column)} times; give its number instead")
+            mistakes.add(line, f"{key}: column '{column}' occurs {names.count(column)} times; give its number instead")
         else:
             places[key] = names.index(column)
     return places
 
 
-def _number(text: str, place: str, form: Format, line: int, complaints: Complaints) -> float:
+def _number(text: str, place: str, form: Format, line: int, mistakes: Mistakes) -> float:
     """Return a cell as a number; NaN for an empty one."""
     if not text or text in form.missing:
         return np.nan
@@ -253,17 +253,17 @@ def _number(text: str, place: str, form: Format, line: int, complaints: Complain
         return value
     comma = form.decimal == "." and text.count(",") == 1 and "." not in text
     hint = "; for decimal commas set format.decimal = ',' in the map" if comma else ""
-    complaints.add(line, f"{place}: expected a number; found '{text}'{hint}")
+    mistakes.add(line, f"{place}: expected a number; found '{text}'{hint}")
     return np.nan
 
 
 def seconds(
-    text: str, start: datetime | None, place: str, line: int, complaints: Complaints
+    text: str, start: datetime | None, place: str, line: int, mistakes: Mistakes
 ) -> tuple[datetime | None, float]:
     """Return the first date of the log, and the seconds since then."""
     try:
         now = datetime.fromisoformat(text)
         return start or now, (now - (start or now)).total_seconds()
     except (ValueError, TypeError):  # TypeError: some dates with a time zone and some without
-        complaints.add(line, f"{place}: expected a date and time such as 2024-05-31T14:05:09.5; found '{text}'")
+        mistakes.add(line, f"{place}: expected a date and time such as 2024-05-31T14:05:09.5; found '{text}'")
         return start, np.nan

@@ -1,6 +1,6 @@
 """Readings in a text file: a short header and tables with units become a raw dataset.
 
-The names are those of the raw schema, so that every schema can be written like this::
+The names are those of the raw schema. Every schema can be written in this form::
 
     # schema = errormotion.raw.NAME/1
     # nominal_direction = 0.342 0 0.940
@@ -28,7 +28,7 @@ import xarray as xr
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.schemas import Row, raw_schemas, variants
 from errormotion.datasets.text.csv_text import Table, blocks
-from errormotion.datasets.text.log_reader import Complaints
+from errormotion.datasets.text.log_reader import Mistakes
 from errormotion.datasets.text.table_reader import (
     NUMBER,
     Column,
@@ -62,39 +62,39 @@ def read_csv(path: str | Path) -> xr.Dataset:
     -------
     Dataset
         Of the schema that the header names, in SI. Empty cells are NaN, and counted in the attribute
-        ``missing_values`` (JSON, variable to count); so are the places that fill short rows up, uncounted.
+        ``missing_values`` (JSON, variable to count); so are the cells that pad short rows, which are not counted.
 
     Raises
     ------
     DatasetError
-        The file cannot be read, or breaks its schema: every mistake with line, column, what was expected and what
-        came.
+        The file cannot be read, or breaks its schema; every mistake is reported with line, column, expected and
+        found value.
     """
     path = Path(path)
     header, tables = blocks(path)
-    complaints = Complaints(path)
+    mistakes = Mistakes(path)
     if "schema" not in header:
         known = ", ".join(sorted({raw.id for raw in raw_schemas()}))
         raise DatasetError(
             f"{path}: expected a line '# schema = ...' that names one of {known}; found none. "
-            "Logs of other software come in by 'errormotion import'."
+            "Import logs of other software with 'errormotion import'."
         )
     line, schema = header["schema"]
     known_variants = variants(schema)
     if not known_variants:
         raise DatasetError(
-            f"{path}, line {line}: schema '{schema}' is not known; {nearest(schema, {raw.id for raw in raw_schemas()})}"
+            f"{path}, line {line}: schema '{schema}' is unknown; {nearest(schema, {raw.id for raw in raw_schemas()})}"
         )
     names, found = Names.of(known_variants), Found()
     for key, (line, text) in header.items():
         if key not in TEXTS:
-            _value(key, line, text, names, found, complaints)
+            _value(key, line, text, names, found, mistakes)
     for table in tables:
-        before = complaints.count
-        columns, keys = _columns(table, names, found, complaints)
-        if complaints.count == before and columns:
-            read_table(table, columns, keys, names, found, complaints)
-    complaints.raise_any()
+        before = mistakes.count
+        columns, keys = _columns(table, names, found, mistakes)
+        if mistakes.count == before and columns:
+            read_table(table, columns, keys, names, found, mistakes)
+    mistakes.raise_any()
     attrs = {key: text for key, (_, text) in header.items() if key in TEXTS}
     raw = found.dataset(attrs, names)
     broken = violations(raw)
@@ -103,15 +103,17 @@ def read_csv(path: str | Path) -> xr.Dataset:
     return raw
 
 
-def _value(key: str, line: int, text: str, names: Names, found: Found, complaints: Complaints) -> None:
+def _value(key: str, line: int, text: str, names: Names, found: Found, mistakes: Mistakes) -> None:
     """Read one line of the header."""
     row = names.rows.get(key)
     if row is None:
         known = [*TEXTS, *(row.name for row in names.rows.values() if len(row.dims) < 2)]
-        complaints.add(line, f"{key}: unknown key; {nearest(key, known)}. (A remark has no '=' behind its first word)")
+        mistakes.add(
+            line, f"{key}: unknown key; {nearest(key, known)}. (A remark must have no '=' after its first word)"
+        )
         return
     if len(row.dims) > 1:
-        complaints.add(line, f"{key}: expected in a table, because it has dims ({', '.join(row.dims)}); found a value")
+        mistakes.add(line, f"{key}: expected in a table, because it has dims ({', '.join(row.dims)}); found a value")
         return
     words = text.split()
     count = next((k for k, word in enumerate(words) if not NUMBER.fullmatch(word)), len(words))
@@ -120,11 +122,11 @@ def _value(key: str, line: int, text: str, names: Names, found: Found, complaint
     if not numbers or (length and len(numbers) != length):
         many = "one number" if length == 1 else f"{length} numbers" if length else "numbers"
         comma = " (the decimal sign is a point; blanks separate numbers)" if "," in text else ""
-        complaints.add(line, f"{key}: expected {many}{_in(row)}; found '{text}'{comma}")
+        mistakes.add(line, f"{key}: expected {many}{_in(row)}; found '{text}'{comma}")
         return
-    inside = converted(np.array(numbers), unit, row, f"{key}", line, complaints)
-    if inside is not None and plausible(inside, np.full(len(inside), line), row, key, unit, complaints):
-        values = unit_vectors(inside, row, np.array([line]), complaints) if row.dims else inside[0]
+    inside = converted(np.array(numbers), unit, row, f"{key}", line, mistakes)
+    if inside is not None and plausible(inside, np.full(len(inside), line), row, key, unit, mistakes):
+        values = unit_vectors(inside, row, np.array([line]), mistakes) if row.dims else inside[0]
         found.variables[key] = xr.Variable(row.dims, values, units_of(row))
 
 
@@ -132,12 +134,10 @@ def _in(row: Row) -> str:
     return f" and a unit such as {row.unit}" if row.unit not in ("", "1") else ""
 
 
-def _columns(
-    table: Table, names: Names, found: Found, complaints: Complaints
-) -> tuple[dict[int, Column], dict[str, int]]:
-    """Return variable, component and unit of each column by its place, and the places of the key columns by dimension.
+def _columns(table: Table, names: Names, found: Found, mistakes: Mistakes) -> tuple[dict[int, Column], dict[str, int]]:
+    """Return variable, component and unit of each column by its index, and the indices of the key columns by dimension.
 
-    Complains of unknown and doubled names, missing units and components, and variables that do not go together.
+    Reports unknown and duplicate names, missing units and components, and variables that cannot be in one table.
     """
     line, titles = table.head
     known = names.columns()
@@ -149,25 +149,25 @@ def _columns(
         match = _COLUMN.fullmatch(title)
         shown = f"column {place + 1} '{title}'"
         if match is None:
-            complaints.add(line, f"{shown}: expected a name and its unit in brackets, such as 'distance [mm]'")
+            mistakes.add(line, f"{shown}: expected a name and its unit in brackets, such as 'distance [mm]'")
             continue
         name, unit = match[1], (match[2] or "").strip()
         variable = known.get(name)
         own = f"{variable[0].name} {variable[1]}" if variable else name
         if own in seen:
-            complaints.add(line, f"{shown}: comes again; column {seen[own] + 1} is '{titles[seen[own]]}'")
+            mistakes.add(line, f"{shown}: duplicate of column {seen[own] + 1} '{titles[seen[own]]}'")
         elif variable is not None and (match[2] is not None or name not in dims or name in names.aliases):
             if match[2] is None or (not unit and variable[0].unit):
                 example = f"{name} [{variable[0].unit or '1'}]"
-                complaints.add(line, f"{shown}: expected its unit in brackets, such as '{example}'; found none")
+                mistakes.add(line, f"{shown}: expected its unit in brackets, such as '{example}'; found none")
             elif variable[0].name in found.variables:
-                complaints.add(line, f"{shown}: {variable[0].name} stands further up already")
+                mistakes.add(line, f"{shown}: {variable[0].name} is already given above")
             columns[place] = Column(*variable, unit, may_be_empty=variable[1] is None)
         elif name in dims and match[2] is None:
             keys[name] = place
         else:
-            complaints.add(line, f"{shown}: unknown column; {nearest(name, [*known, *dims])}")
+            mistakes.add(line, f"{shown}: unknown column; {nearest(name, [*known, *dims])}")
         seen.setdefault(own, place)
     for text in incomplete(columns, keys, names):
-        complaints.add(line, text)
+        mistakes.add(line, text)
     return columns, keys

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
 from errormotion.datasets.text.csv_text import Table
-from errormotion.datasets.text.log_reader import Complaints
+from errormotion.datasets.text.log_reader import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -56,11 +56,11 @@ class Names:
         return short | found
 
     def component_dim(self, row: Row) -> str | None:
-        """Return the dimension of a variable whose values are in columns side by side."""
+        """Return the dimension of a variable whose values are in adjacent columns."""
         return next((dim for dim in reversed(row.dims) if dim in self.labels), None)
 
     def record_dims(self, row: Row) -> tuple[str, ...]:
-        """Return the dimensions of a variable whose values are in lines below one another."""
+        """Return the dimensions of a variable whose values are in successive lines."""
         return tuple(dim for dim in row.dims if dim != self.component_dim(row))
 
 
@@ -103,7 +103,7 @@ class Column:
     row : Row
         Its variable.
     component : int or None
-        Which component of a vector it is.
+        Index of the component of a vector.
     unit : str
         Unit of the cells.
     scale, offset : float
@@ -125,17 +125,17 @@ def units_of(row: Row) -> dict[str, str]:
     return {"units": row.unit} if row.unit else {}
 
 
-def converted(values: Array, unit: str, row: Row, place: str, line: int, complaints: Complaints) -> Array | None:
+def converted(values: Array, unit: str, row: Row, place: str, line: int, mistakes: Mistakes) -> Array | None:
     """Return values in the unit of the schema; None if that is not possible, which is a mistake."""
     if row.unit in ("", "1") and unit in ("", "1"):
         return values
     if not unit:
-        complaints.add(line, f"{place}: expected a unit, such as {row.unit}; found none")
+        mistakes.add(line, f"{place}: expected a unit, such as {row.unit}; found none")
         return None
     try:
         return np.asarray(convert(values, unit, row.unit or "1"), dtype=float)
     except DatasetError as error:
-        complaints.add(line, f"{place}: expected a unit of the kind of {row.unit or '1'}; found '{unit}': {error}")
+        mistakes.add(line, f"{place}: expected a unit of the kind of {row.unit or '1'}; found '{unit}': {error}")
         return None
 
 
@@ -145,13 +145,13 @@ def plausible(
     row: Row,
     place: str,
     unit: str,
-    complaints: Complaints,
+    mistakes: Mistakes,
 ) -> bool:
     """Return whether all values are within the plausible range; one mistake otherwise, at the first such line."""
     outside = np.flatnonzero((inside < row.low) | (inside > row.high))
     if outside.size:
         first = outside[0]
-        complaints.add(
+        mistakes.add(
             int(lines[first]),
             f"{place}: makes {row.name} = {inside[first]:.6g} {row.unit}; expected {row.low:g}..{row.high:g} "
             f"{row.unit}. Is the unit '{unit}' right? ({outside.size} such values)",
@@ -159,16 +159,14 @@ def plausible(
     return not outside.size
 
 
-def unit_vectors(values: Array, row: Row, lines: NDArray[np.int64], complaints: Complaints) -> Array:
-    """Return directions with length 1: written with four digits they are a little longer or shorter."""
+def unit_vectors(values: Array, row: Row, lines: NDArray[np.int64], mistakes: Mistakes) -> Array:
+    """Return directions normalised to length 1; rounding in the file changes their length slightly."""
     if row.unit != "1" or row.dims[-1] != "direction":
         return values
     norms = np.linalg.norm(values, axis=-1)
     wrong = np.flatnonzero(~(np.abs(norms - 1) <= 0.01) & ~np.isnan(norms))
     if wrong.size:
-        complaints.add(
-            int(lines.flat[0]), f"{row.name}: expected a vector of length 1; found {norms.flat[wrong[0]]:.4g}"
-        )
+        mistakes.add(int(lines.flat[0]), f"{row.name}: expected a vector of length 1; found {norms.flat[wrong[0]]:.4g}")
         return values
     directions: Array = values / norms[..., None]
     return directions
@@ -180,7 +178,7 @@ def read_table(
     keys: Mapping[str, int],
     names: Names,
     found: Found,
-    complaints: Complaints,
+    mistakes: Mistakes,
 ) -> None:
     """Read one table into ``found``.
 
@@ -195,27 +193,27 @@ def read_table(
     names : Names
         Of the schema.
     found : Found
-        Takes the variables.
-    complaints : Complaints
-        Takes every mistake, with its line.
+        Receives the variables.
+    mistakes : Mistakes
+        Receives every mistake, with its line.
     """
     line, titles = table.head
-    before = complaints.count
+    before = mistakes.count
     record = names.record_dims(next(iter(columns.values())).row)
-    cells = _cells(table, columns, titles, complaints)
-    places = _places(table, record, keys, names, found, complaints)
-    if complaints.count > before:
+    cells = _cells(table, columns, titles, mistakes)
+    places = _places(table, record, keys, names, found, mistakes)
+    if mistakes.count > before:
         return
     lines = np.array([number for number, _ in table.rows])
     shape = tuple(found.sizes[dim][0] for dim in record)
     arrays: dict[str, Array] = {}
     for number, column in columns.items():
         row, component, title = column.row, column.component, f"column '{titles[number]}'"
-        inside = converted(cells[number], column.unit, row, title, line, complaints)
+        inside = converted(cells[number], column.unit, row, title, line, mistakes)
         if inside is None:
             continue
         inside = inside * column.scale + column.offset
-        if not plausible(inside, lines, row, title, column.unit, complaints):
+        if not plausible(inside, lines, row, title, column.unit, mistakes):
             continue
         found.missing[row.name] = found.missing.get(row.name, 0) + int(np.isnan(inside).sum())
         if component is None:
@@ -228,7 +226,7 @@ def read_table(
         row = names.rows[name]
         side_by_side = names.component_dim(row)
         dims = (*record, side_by_side) if side_by_side else record
-        array = unit_vectors(array, row, lines, complaints)
+        array = unit_vectors(array, row, lines, mistakes)
         found.variables[name] = xr.Variable(dims, array, units_of(row)).transpose(*row.dims)
 
 
@@ -261,18 +259,18 @@ def incomplete(columns: Mapping[int, Column], keys: Mapping[str, int], names: Na
         yield f"{name}: expected in the header, as '# {name} = ...'; found a column"
         return
     yield from (f"expected a column '{dim}' (number or name, without unit)" for dim in record[:-1] if dim not in keys)
-    yield from (f"column '{dim}': no variable of this table has it" for dim in keys if dim not in record)
+    yield from (f"column '{dim}': no variable of this table has this dimension" for dim in keys if dim not in record)
 
 
-def _cells(table: Table, columns: Mapping[int, Column], titles: list[str], complaints: Complaints) -> dict[int, Array]:
+def _cells(table: Table, columns: Mapping[int, Column], titles: list[str], mistakes: Mistakes) -> dict[int, Array]:
     """Return the numbers of each column; every cell that is no number is a mistake."""
     if not table.rows:
-        complaints.add(table.head[0], "expected lines of numbers below the column names; found none")
+        mistakes.add(table.head[0], "expected lines of numbers below the column names; found none")
     found = {place: np.full(len(table.rows), np.nan) for place in columns}
     for k, (line, texts) in enumerate(table.rows):
         if len(texts) != len(titles):
             comma = " (the decimal sign is a point)" if len(texts) > len(titles) else ""
-            complaints.add(line, f"expected {len(titles)} fields; found {len(texts)}{comma}")
+            mistakes.add(line, f"expected {len(titles)} fields; found {len(texts)}{comma}")
             continue
         for place, column in columns.items():
             text, title = texts[place], f"column '{titles[place]}'"
@@ -280,8 +278,8 @@ def _cells(table: Table, columns: Mapping[int, Column], titles: list[str], compl
                 continue
             if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
                 comma = " (the decimal sign is a point)" if "," in text else ""
-                came = f"'{text}'" if text else "nothing"
-                complaints.add(line, f"{title}: expected a number; found {came}{comma}")
+                shown = f"'{text}'" if text else "nothing"
+                mistakes.add(line, f"{title}: expected a number; found {shown}{comma}")
                 continue
             found[place][k] = float(text)
     return found
@@ -293,7 +291,7 @@ def _places(
     keys: Mapping[str, int],
     names: Names,
     found: Found,
-    complaints: Complaints,
+    mistakes: Mistakes,
 ) -> tuple[NDArray[np.int64], ...]:
     """Return the index of each line along each dimension of the table."""
     places = np.zeros((len(record), len(table.rows)), dtype=int)
@@ -305,33 +303,31 @@ def _places(
             continue  # reported already
         for axis, dim in enumerate(record):
             if dim in keys:
-                places[axis, k] = _label(texts[keys[dim]], dim, dim in settled, line, names, found, complaints)
+                places[axis, k] = _label(texts[keys[dim]], dim, dim in settled, line, names, found, mistakes)
             else:
                 leading = tuple(places[:axis, k])
                 places[axis, k] = counts[leading] = counts.get(leading, -1) + 1
         place = tuple(places[:, k])
         if place in seen:
             label = ", ".join(f"{dim} '{texts[keys[dim]]}'" for dim in record)
-            complaints.add(line, f"{label}: comes again; line {seen[place]} has it already")
+            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}")
         seen.setdefault(place, line)
     for axis, dim in enumerate(record):
         size = len(found.labels[dim]) if dim in keys else int(places[axis].max(initial=-1)) + 1
         known, where = found.sizes.setdefault(dim, (size, table.head[0]))
         if size != known:
-            complaints.add(
-                table.head[0], f"expected {known} along {dim}, as in the table of line {where}; found {size}"
-            )
+            mistakes.add(table.head[0], f"expected {known} along {dim}, as in the table of line {where}; found {size}")
     return tuple(places)
 
 
-def _label(text: str, dim: str, settled: bool, line: int, names: Names, found: Found, complaints: Complaints) -> int:
+def _label(text: str, dim: str, settled: bool, line: int, names: Names, found: Found, mistakes: Mistakes) -> int:
     """Return the index of a label along its dimension; a new one is added unless another table has stated them all."""
     labels = found.labels.setdefault(dim, list(names.labels.get(dim, ())))
     if text in labels:
         return labels.index(text)
     if not text:
-        complaints.add(line, f"column '{dim}': expected a number or name; found nothing")
+        mistakes.add(line, f"column '{dim}': expected a number or name; found nothing")
     elif settled or dim in names.labels:
-        complaints.add(line, f"column '{dim}': expected one of {', '.join(labels)}; found '{text}'")
+        mistakes.add(line, f"column '{dim}': expected one of {', '.join(labels)}; found '{text}'")
     labels.append(text)
     return len(labels) - 1

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from errormotion.datasets.text.csv_text import Table, blocks
-from errormotion.datasets.text.log_reader import Complaints
+from errormotion.datasets.text.log_reader import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -110,23 +110,23 @@ def read_table(
             f"{path}, line {line}: expected one table without empty lines; found the start of a second one"
         )
     (table,) = tables
-    complaints = Complaints(path)
-    columns = _columns(table, complaints)
-    complaints.raise_any()
-    rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, complaints)]
-    if not rows and not complaints.count:
-        complaints.add(table.head[0], "expected lines of measurements below the column names; found none")
-    values = {name: _numbers(name, place, unit, rows, table, complaints) for name, (place, unit) in columns.items()}
+    mistakes = Mistakes(path)
+    columns = _columns(table, mistakes)
+    mistakes.raise_any()
+    rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, mistakes)]
+    if not rows and not mistakes.count:
+        mistakes.add(table.head[0], "expected lines of measurements below the column names; found none")
+    values = {name: _numbers(name, place, unit, rows, table, mistakes) for name, (place, unit) in columns.items()}
     keys = {name: [texts[place] for _, texts in rows] for name, (place, _) in columns.items() if name in KEYS}
-    names = _names(keys, rows, stations, complaints)
-    complaints.raise_any()
-    found = _placed(names, keys, values, rows, repeats, complaints)
-    complaints.raise_any()
+    names = _names(keys, rows, stations, mistakes)
+    mistakes.raise_any()
+    found = _placed(names, keys, values, rows, repeats, mistakes)
+    mistakes.raise_any()
     _check_length(path, found.length, table.head[1][columns["length"][0]], least_length)
     return found
 
 
-def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]:
+def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
     """Return index and unit of each known column."""
     line, titles = table.head
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
@@ -138,46 +138,46 @@ def _columns(table: Table, complaints: Complaints) -> dict[str, tuple[int, str]]
         name = others.get(name, name)
         unit = ((match[2] or match[3] or "") if match else "").strip()
         if name in found:
-            complaints.add(line, f"column '{title}': expected one column for the {name}; found a second one")
+            mistakes.add(line, f"column '{title}': expected one column for the {name}; found a second one")
         elif name in KEYS:
             found[name] = (place, "")
         elif name in QUANTITIES:
-            found[name] = (place, _unit(title, name, unit, line, complaints))
+            found[name] = (place, _unit(title, name, unit, line, mistakes))
         else:
             near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
-            complaints.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
+            mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):
-        if name not in found and not complaints.count:
-            complaints.add(line, f"expected a column '{name}'; found {', '.join(titles)}")
+        if name not in found and not mistakes.count:
+            mistakes.add(line, f"expected a column '{name}'; found {', '.join(titles)}")
     return found
 
 
-def _unit(title: str, name: str, unit: str, line: int, complaints: Complaints) -> str:
+def _unit(title: str, name: str, unit: str, line: int, mistakes: Mistakes) -> str:
     quantity = QUANTITIES[name]
     unit = _UNITS.get(unit, unit)
     if not unit:
-        complaints.add(line, f"column '{title}': expected its unit, such as '{name} [{quantity.example}]'")
+        mistakes.add(line, f"column '{title}': expected its unit, such as '{name} [{quantity.example}]'")
         return quantity.unit
     try:
         convert(1.0, unit, quantity.unit)
     except DatasetError as error:
-        complaints.add(line, f"column '{title}': expected a unit such as {quantity.example}; {error}")
+        mistakes.add(line, f"column '{title}': expected a unit such as {quantity.example}; {error}")
         return quantity.unit
     return unit
 
 
-def _whole(line: int, texts: list[str], table: Table, complaints: Complaints) -> bool:
+def _whole(line: int, texts: list[str], table: Table, mistakes: Mistakes) -> bool:
     wanted = len(table.head[1])
     if len(texts) == wanted:
         return True
     comma = " (the decimal sign is a point)" if len(texts) > wanted else ""
-    complaints.add(line, f"expected {wanted} fields; found {len(texts)}{comma}")
+    mistakes.add(line, f"expected {wanted} fields; found {len(texts)}{comma}")
     return False
 
 
 def _numbers(
-    name: str, place: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, complaints: Complaints
+    name: str, place: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, mistakes: Mistakes
 ) -> Array:
     """Return the numbers of a column in SI; NaN where missing. Empty for a column of names."""
     if name in KEYS:
@@ -190,13 +190,13 @@ def _numbers(
             continue
         if not _NUMBER.fullmatch(text) or not np.isfinite(float(text)):
             comma = " (the decimal sign is a point)" if "," in text else ""
-            complaints.add(line, f"column '{title}': expected a number; found '{text}'{comma}")
+            mistakes.add(line, f"column '{title}': expected a number; found '{text}'{comma}")
             continue
         values[k] = float(text)
     inside = np.asarray(convert(values, unit, quantity.unit), dtype=float)
     for k in map(int, np.flatnonzero((inside < quantity.low) | (inside > quantity.high))):
         low, high = (convert(limit, quantity.unit, unit) for limit in (quantity.low, quantity.high))
-        complaints.add(
+        mistakes.add(
             rows[k][0],
             f"column '{title}': expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Is its unit really {unit}?",
         )
@@ -207,18 +207,18 @@ def _names(
     keys: dict[str, list[str]],
     rows: list[tuple[int, list[str]]],
     stations: Sequence[str] | None,
-    complaints: Complaints,
+    mistakes: Mistakes,
 ) -> dict[str, tuple[str, ...]]:
     """Return the stations in their order, the targets by number or in the table's order."""
     for name, texts in keys.items():
         for (line, _), text in zip(rows, texts, strict=True):
             if not text:
-                complaints.add(line, f"column '{name}': expected a number or name; found nothing")
+                mistakes.add(line, f"column '{name}': expected a number or name; found nothing")
     found = {name: tuple(dict.fromkeys(texts)) for name, texts in keys.items()}
     if stations is not None:
         for (line, _), text in zip(rows, keys["station"], strict=True):
             if text and text not in stations:
-                complaints.add(line, f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
+                mistakes.add(line, f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
         found["station"] = tuple(stations)
     if all(re.fullmatch("[0-9]{1,9}", text) for text in found["target"]):
         found["target"] = tuple(sorted(found["target"], key=int))
@@ -231,7 +231,7 @@ def _placed(
     values: dict[str, Array],
     rows: list[tuple[int, list[str]]],
     repeats: Repeats,
-    complaints: Complaints,
+    mistakes: Mistakes,
 ) -> Readings:
     """Return the readings by station and target."""
     shape = len(names["station"]), len(names["target"])
@@ -240,7 +240,7 @@ def _placed(
     for k, (station, target) in enumerate(zip(keys["station"], keys["target"], strict=True)):
         group = groups.setdefault((places["station"][station], places["target"][target]), [])
         if group and repeats == "refuse":
-            complaints.add(
+            mistakes.add(
                 rows[k][0],
                 f"station '{station}', target '{target}': expected one line; line {rows[group[0]][0]} is another one. "
                 "Remove one, or choose one by 'repeats'",

@@ -131,7 +131,7 @@ def test_what_cannot_be_planned_is_refused():
         design.optimise(LIMITS, PAPER[:1])
     with pytest.raises(MethodError, match="need 18 readings or more; found 12"):
         design.optimise(replace(LIMITS, readings=12), PAPER)
-    with pytest.raises(MethodError, match="looks down on the gauge"):
+    with pytest.raises(MethodError, match="points down to the gauge"):
         design.optimise(replace(LIMITS, beam=-BEAM), PAPER)
 
 

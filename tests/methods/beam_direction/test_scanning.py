@@ -151,7 +151,7 @@ def test_normals_found_in_turn_with_the_points_are_those_of_the_bar(
     found = scan(surface(bar["bar_axis"].values))
     # The bar leans by some 0.1 mrad from its nominal axis; the ends of a scan are seen from one side.
     assert degrees_between(found.normals, true_normals(machine, found))[2:-2].max() < 0.1
-    assert found.turns < 10
+    assert found.iterations < 10
     assert fit_bar(found, bar["bar_axis"]).rms < 0.15e-6
 
 
@@ -164,8 +164,8 @@ def test_normals_that_are_given_are_turned_towards_the_sensor(
     assert (given.normals @ given.direction < 0).all()
 
 
-def test_scan_along_one_line_says_what_it_cannot_see(scan: Callable[..., Points], bar: xr.Dataset) -> None:
-    assert "only the tilt in the plane of the scan can be seen" in scan().notes[0]
+def test_scan_along_one_line_reports_the_undetermined_tilt(scan: Callable[..., Points], bar: xr.Dataset) -> None:
+    assert "determines only the tilt in the plane of the scan" in scan().notes[0]
     assert scan(round_bar(bar["bar_axis"].values)).notes == ()
 
 
@@ -206,7 +206,7 @@ def test_uncertainty_of_the_calibration_is_shared(scan: Callable[..., Points], b
         ({"covariance": -np.eye(6)}, "negative variance"),
         ({"moves": "table"}, "expected 'sensor' or 'target'; found 'table'"),
         ({"normals": np.ones((3, 3))}, "Expected unit normals"),
-        ({"normals": np.tile(ACROSS, (3, 1))}, "runs along the surface"),
+        ({"normals": np.tile(ACROSS, (3, 1))}, "parallel to the surface"),
     ],
 )
 def test_wrong_input_is_told(change: dict, message: str) -> None:
@@ -230,14 +230,14 @@ def test_tilt_beyond_the_calibration_is_refused(calibration: InclinationCalibrat
     assert "2 of 2 points lie at tilts" in " ".join(allowed.notes)  # the one without a reading is no point
 
 
-def test_normals_that_do_not_settle_are_told(calibration: InclinationCalibration) -> None:
+def test_normals_that_do_not_converge_are_reported(calibration: InclinationCalibration) -> None:
     turn = iter(range(1000))
 
     def restless(p: np.ndarray) -> np.ndarray:
         lean = 0.3 if next(turn) % 2 else -0.3
         return np.tile(np.array([lean, 0, 1]) / np.hypot(lean, 1), (len(p), 1))
 
-    with pytest.raises(MethodError, match="do not settle: after 50 turns"):
+    with pytest.raises(MethodError, match="do not converge: after 50 iterations"):
         points(
             READING, STAGE, ORIGIN, (0, 0, -1), calibration=calibration, triangulation_normal=ACROSS, normals=restless
         )

@@ -152,7 +152,7 @@ def test_every_mistake_is_told_with_its_line(complaints) -> None:
 def test_missing_and_doubled_columns_are_told_with_the_nearest(complaints) -> None:
     assert complaints("# c\nt,X1,X2,Y1,Y-2,Z,Z\n0,1,1,1,1,1,1\n") == [
         "line 2: channels.Y2: no column 'Y2'; did you mean 'Y-2'? Known here: X1, X2, Y-2, Y1, Z, t",
-        "line 2: channels.Z: column 'Z' comes 2 times; give its number instead",
+        "line 2: channels.Z: column 'Z' occurs 2 times; give its number instead",
         "line 2: temperatures.frame: no column 'T'; did you mean 't'? Known here: X1, X2, Y-2, Y1, Z, t",
     ]
 
@@ -169,7 +169,7 @@ def test_a_decimal_comma_is_recognised(complaints) -> None:
     ("log", "told"),
     [
         (b"t,X1,X2,Y1,Y2,Z,T\n0,1,1,1,1,1,20\n1,1,1,1,1,1,20 \xb0C\n", "log.csv, line 3: byte 0xb0 is not utf-8"),
-        (GOOD.encode("utf-16"), "log.csv, line 1: begins with the byte order mark of UTF-16"),
+        (GOOD.encode("utf-16"), "log.csv, line 1: starts with the byte order mark of UTF-16"),
         ('t,X1,X2,Y1,Y2,Z,T\n0,"1,1,1,1,1,20\n', "log.csv, line 2: cannot be split into fields"),
         ("", "log.csv: expected lines of numbers; found none"),
         ("# only a comment\n", "log.csv: expected lines of numbers; found none"),

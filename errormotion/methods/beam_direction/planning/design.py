@@ -1,16 +1,17 @@
 """Orientation of the planes and strokes for the smallest uncertainty of the direction of a beam.
 
-A plane of gradient g is one condition for the beam u: g.u = -1. The angles by which the beam may be off its nominal
-direction change this by t, the plane's tilt across the beam (|t| = tan of the inclination), and it is known as well as
-the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings in all, shared out
-as is best, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of the sensor limits
-a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is positive. With an
-inclination of alpha at most, no set-up with n readings in all can bring the worse of the two angles below
+A plane of gradient g is one condition for the beam u: g.u = -1. Small angles between the beam and its nominal direction
+change g.u in proportion to t, the plane's tilt across the beam (|t| = tan of the inclination). The uncertainty of the
+condition is that of the slope of the reading along the beam. From strokes of lengths L along X, Y and Z with n readings
+in all, optimally distributed, that slope has the variance 12 (sigma^2 / n) c^2 with c = sum |u_i| / L_i. The range R of
+the sensor limits a stroke to L_i = R / |g_i|; hence c >= sum |u_i g_i| / R >= 1 / R, equal where no u_i g_i is
+positive. With an inclination of alpha at most, no set-up with n readings in all can bring the worse of the two angles
+below
 
     sqrt(24 / n) sigma / (R tan alpha),
 
 and two planes tilted at right angles to one another reach it where gauge and travel allow. A longer stroke is never
-worse, so that only the orientations of the planes and their shares of the readings are left to search for.
+worse, so the search covers only the orientations of the planes and their shares of the readings.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ LEAST_READINGS = 3
 _LEAST_SHARE = 0.02
 _PENALTY = 1e3
 _EVALUATIONS = 1000
-"""Of each search, for each plane."""
+"""Largest number of evaluations of each search, for each plane."""
 _TOLERANCE = 1e-7
 _ROUNDING = 1e-9
 _ROUNDS = 2
@@ -61,7 +62,7 @@ class Limits:
     travel : ndarray (3,)
         Longest strokes along X, Y, Z, m.
     plate : float
-        Longest way of the light spot over the plane in one stroke, m.
+        Longest path of the light spot over the plane in one stroke, m.
     inclination, rotation : tuple of float
         Least and largest inclination and rotation of the gauge, rad.
     max_inclination : float
@@ -73,7 +74,8 @@ class Limits:
     scale_uncertainty : float
         Relative standard uncertainty of the sensor's scale, common to all planes.
     slope_uncertainty : callable, optional
-        Relative standard uncertainty of the slope that the inclination leaves, from the tilts (k, 2) -> (k,).
+        Relative standard uncertainty of the slope from the remaining inclination error, as a function of the tilts: (k,
+        2) -> (k,).
     """
 
     beam: Array
@@ -93,7 +95,7 @@ class Limits:
 def limits_of(
     settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
 ) -> Limits:
-    """Return the limits that settings state; ``sensor_range``, m, where the sensor states it."""
+    """Return the limits of the settings; ``sensor_range``, m, where the sensor reports it."""
     p = settings.layout
     if sensor_range is None:
         sensor_range = p.reading_range[1] - p.reading_range[0]
@@ -116,7 +118,7 @@ def limits_of(
 
 @dataclass(frozen=True)
 class Design:
-    """A set-up: planes, strokes, and how many readings each stroke has.
+    """A set-up: planes, strokes, and the number of readings of each stroke.
 
     Attributes
     ----------
@@ -154,7 +156,7 @@ def plane_normals(planes: Array) -> Array:
 
 
 def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
-    """Return positions (n, 3) on strokes along X, Y and Z whose middles meet in one position, m."""
+    """Return positions (n, 3) on strokes along X, Y and Z with a common midpoint, m."""
     parts = [
         np.linspace(-0.5, 0.5, count)[:, None] * length * axis
         for axis, length, count in zip(np.eye(3), lengths, counts, strict=True)
@@ -164,23 +166,23 @@ def stroke_points(lengths: Array, counts: NDArray[np.int64]) -> Array:
 
 
 def tilts(normals: Array, beam: Array) -> Array:
-    """Return the tilts (k, 2) of planes along ``across(beam)``: what g.u gains when the beam turns by an angle."""
+    """Return the tilts (k, 2) of planes along ``across(beam)``: the derivative of g.u with respect to its angles."""
     return np.asarray(normals @ _basis(tuple(beam)).T / -(normals @ beam)[:, None])
 
 
 @lru_cache(maxsize=4)
 def _basis(beam: tuple[float, ...]) -> Array:
-    """Return ``across(beam)``, which a search asks for ten thousands of times."""
+    """Return ``across(beam)``; cached, because a search calls it very often."""
     return across(np.array(beam))
 
 
 def inclinations(normals: Array, beam: Array) -> Array:
-    """Return the angles (k,) between the way back along the beam and the normals, rad; beyond pi/2: seen from below."""
+    """Return the angles (k,) between the reversed beam and the normals, rad; above pi/2: on the back of the plane."""
     return np.asarray(np.arccos(np.clip(-(normals @ beam), -1.0, 1.0)))
 
 
 def longest_strokes(normals: Array, limits: Limits) -> Array:
-    """Return the longest strokes (k, 3), m, that keep to the range, the travel and the plate."""
+    """Return the longest strokes (k, 3), m, within the range, the travel and the plate."""
     gradient = -normals / (normals @ limits.beam)[:, None]
     spot = np.linalg.norm(np.eye(3) + gradient[:, :, None] * limits.beam, axis=-1)
     with np.errstate(divide="ignore"):
@@ -190,7 +192,7 @@ def longest_strokes(normals: Array, limits: Limits) -> Array:
 
 def shares_of_strokes(strokes: Array, limits: Limits) -> tuple[Array, Array]:
     """Return the best shares (k, 3) of the strokes in a plane's readings, and c (k,), 1/m (see the module)."""
-    # A beam that is not quite where it is meant to be has a component along every axis.
+    # A beam that deviates from nominal has a component along every axis.
     per_stroke = np.hypot(limits.beam, limits.beam_uncertainty) / strokes
     c = per_stroke.sum(axis=1)
     return per_stroke / c[:, None], c
@@ -212,33 +214,33 @@ def spread(planes: Array, shares: Array, limits: Limits) -> Array:
 
 
 def common_scale(covariance: Array, weighted: Array, limits: Limits) -> Array:
-    """Return what a scale error common to all planes adds to the covariance (2, 2) of the angles."""
+    """Return the contribution of a scale error common to all planes to the covariance (2, 2) of the angles."""
     effect = covariance @ weighted.sum(axis=0) * limits.scale_uncertainty
     return np.outer(effect, effect)
 
 
 def worst_angle(covariance: Array) -> float:
-    """Return the standard uncertainty, rad, of the angle in the direction across the beam where it is largest."""
+    """Return the standard uncertainty, rad, of the angle in the direction across the beam in which it is largest."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def least_angle(limits: Limits) -> float:
-    """Return what the worse angle's uncertainty cannot fall below, rad, whatever the planes; see the module."""
+    """Return the lower bound of the worse angle's uncertainty over all planes, rad; see the module."""
     return float(
         np.sqrt(24.0 / limits.readings) * limits.noise / (limits.reach * np.tan(limits.max_inclination)),
     )
 
 
 def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
-    """Find the planes, strokes and readings that leave the worse of the beam's two angles least uncertain.
+    """Return the planes, strokes and readings that minimise the uncertainty of the worse of the beam's two angles.
 
     Parameters
     ----------
     limits : Limits
     start : array_like (k, 2)
-        Inclination and rotation of the planes to begin with, rad; as many planes are sought.
+        Initial inclination and rotation of the planes, rad; the number of planes is kept.
     seed : int
-        Of the search over all orientations; same seed, same answer.
+        Of the search over all orientations; the same seed gives the same result.
 
     Raises
     ------
@@ -280,13 +282,13 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
     starts[0] = search(nlopt.GN_CRS2_LM, starts[0], _EVALUATIONS * number)
     starts = [search(nlopt.LN_SBPLX, x, _EVALUATIONS * number) for x in starts]
     x = min(starts, key=lambda x: cost(x, x))
-    # The larger of two variances has an edge along which a search is slow: it is restarted.
+    # The larger of two variances is not smooth, which slows the search down: it is restarted.
     for algorithm in (nlopt.LN_COBYLA, nlopt.LN_SBPLX) * _ROUNDS:
         x = search(algorithm, x, _EVALUATIONS * number)
     if cost(x, x) >= _PENALTY:
         raise MethodError(
             f"No plane of the gauge meets the beam at {np.degrees(limits.max_inclination):.3g} deg or less. Expected a "
-            "nominal direction that looks down on the gauge, and a gauge that can be inclined towards it."
+            "nominal direction that points down to the gauge, and a gauge that can be inclined towards it."
         )
     planes, shares = _planes(x[: 2 * number], limits), x[2 * number :]
     order = np.lexsort((planes[:, 0], planes[:, 1]))
@@ -296,8 +298,8 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
 def _planes(about_beam: Array, limits: Limits) -> Array:
     """Return planes (k, 2) of the gauge from their inclinations to the beam and azimuths about it, flat (2 k,).
 
-    A plane beyond what the gauge can do becomes the nearest that it can; that is never steeper for a beam within the
-    gauge's own reach.
+    A plane outside the limits of the gauge is replaced by the nearest one within them, which is never steeper for a
+    beam within these limits.
     """
     inclination, azimuth = about_beam.reshape(-1, 2).T
     sideways = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) @ _basis(tuple(limits.beam))
@@ -315,7 +317,7 @@ def _about_beam(planes: Array, limits: Limits) -> Array:
 
 
 def check_numbers(planes: int, limits: Limits) -> None:
-    """Refuse what cannot determine a direction.
+    """Check the number of planes and readings.
 
     Raises
     ------
@@ -331,7 +333,7 @@ def check_numbers(planes: int, limits: Limits) -> None:
 
 
 def with_readings(planes: Array, shares: Array, limits: Limits) -> Design:
-    """Return the design with the longest strokes, and the readings shared out in whole numbers."""
+    """Return the design with the longest strokes, and the readings distributed in whole numbers."""
     strokes = longest_strokes(plane_normals(planes), limits)
     fractions = (shares[:, None] * shares_of_strokes(strokes, limits)[0]).ravel()
     spare = limits.readings - LEAST_READINGS * fractions.size
@@ -343,7 +345,7 @@ def with_readings(planes: Array, shares: Array, limits: Limits) -> Design:
 
 
 def equal_strokes(planes: Array, limits: Limits) -> Design:
-    """Return planes with strokes of one length and as many readings in each: as one does without a plan."""
+    """Return planes with strokes of one length and the same number of readings each, without optimisation."""
     planes = np.asarray(planes, np.float64).reshape(-1, 2)
     check_numbers(len(planes), limits)
     length = longest_strokes(plane_normals(planes), limits).min()

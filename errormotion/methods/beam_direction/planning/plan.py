@@ -1,4 +1,4 @@
-"""What to expect before anything is measured: of the set-up in the settings, of the paper's, and of the best one."""
+"""Expected uncertainty before a measurement: set-up of the settings, published set-up, and best set-up."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
 
 
 def plan(method: Method, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros with the covariance to expect of the set-up that the settings name.
+    """Return an error dataset of zeros with the expected covariance of the set-up in the settings.
 
     Further variables over ``setup``: the expected uncertainty of the worse angle of the beam, ``angle_uncertainty``
-    (rad), and what the readings alone make of it, ``readings_uncertainty``: of the published set-up (two faces turned
-    by 90 deg with strokes of one length), of that of the settings, and of the best that there is with two planes and
-    with as many as the settings name, all with as many readings in all. The last one is ``best_inclination``,
+    (rad), and its part from the readings alone, ``readings_uncertainty``: of the published set-up (two faces turned by
+    90 deg with strokes of one length), of that of the settings, and of the best one with two planes and with the number
+    of planes in the settings, all with the same total number of readings. The last one is ``best_inclination``,
     ``best_rotation`` (rad), ``best_stroke`` (m) and ``best_readings``; its ``gain`` is the factor over the published
     set-up. ``notes`` state it as text.
 
@@ -57,22 +57,22 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     Raises
     ------
     MethodError
-        Planes that leave the direction open; settings within which there is no set-up.
+        Planes that do not determine the direction; no set-up possible within the settings.
     """
-    left = _left(settings)
-    slope_uncertainty = left.table(settings.layout.max_inclination) if left is not None else None
+    remaining = _remaining(settings)
+    slope_uncertainty = remaining.table(settings.layout.max_inclination) if remaining is not None else None
     limits = design.limits_of(settings, slope_uncertainty=slope_uncertainty)
     number = len(settings.planes)
     own = as_set(settings, limits)
     pair = design.optimise(limits, np.array(PAPER))
     best = pair if number == 2 else design.optimise(limits, _angles(settings))
     setups = (design.equal_strokes(np.array(PAPER), limits), own, pair, best)
-    expected = [expected_direction(setup, settings, limits, left) for setup in setups]
+    expected = [expected_direction(setup, settings, limits, remaining) for setup in setups]
     totals = [readings + sources.T @ sources for readings, sources in expected]
     angles = np.array([_worse(total, limits) for total in totals])
     alone = np.array([_worse(readings, limits) for readings, _ in expected])
     gain = float(angles[0] / angles[3])
-    beam, u = expected_with_origin(own, settings, limits, left), limits.beam[None]
+    beam, u = expected_with_origin(own, settings, limits, remaining), limits.beam[None]
     known = np.isfinite(beam.covariance[0, 0])
     origin = np.array([settings.layout.nominal_origin if known else (np.nan,) * 3], np.float64)
     total = beam.covariance + beam.influence.T @ beam.influence
@@ -92,7 +92,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
         method=method.info.id,
         method_version=method.info.version,
         provenance=provenance.make(settings, None, None, steps=["plan"])
-        | ({"calibration": left.calibration.reference()} if left is not None else {}),
+        | ({"calibration": remaining.calibration.reference()} if remaining is not None else {}),
         influence=influence,
         sources=["scale", "triangulation plane", *(f"inclination calibration {i + 1}" for i in range(number))],
         source_groups=["sensor", "triangulation plane", *["inclination calibration"] * number],
@@ -106,11 +106,11 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
             "best_readings": xr.DataArray(best.readings, dims=(*plane, "direction")),
         },
     )
-    return ds.assign_attrs(notes=_notes(setups, angles, alone, limits, left))
+    return ds.assign_attrs(notes=_notes(setups, angles, alone, limits, remaining))
 
 
 def as_set(settings: Settings, limits: Limits) -> Design:
-    """Return the set-up that the settings name; positions of a path count by their spread."""
+    """Return the set-up of the settings; the positions of a path are used where one is given."""
     p, planes = settings.layout, _angles(settings)
     design.check_numbers(len(planes), limits)
     counts = np.full(3, p.readings // 3)
@@ -124,30 +124,34 @@ def as_set(settings: Settings, limits: Limits) -> Design:
     return design.Design(planes, strokes, np.tile(counts, (len(planes), 1)), path)
 
 
-def expected_direction(setup: Design, settings: Settings, limits: Limits, left: Left | None) -> tuple[Array, Array]:
-    """Return the bound (3, 3) of the direction by its readings, and what single sources add to it (source, 3).
+def expected_direction(
+    setup: Design, settings: Settings, limits: Limits, remaining: RemainingError | None
+) -> tuple[Array, Array]:
+    """Return the bound (3, 3) of the direction by its readings, and the influence of each source on it (source, 3).
 
-    The sources are the sensor's scale and its triangulation plane, common to all planes, and what the calibration
-    leaves of the inclination error at each plane, large where it does not cover that plane.
+    The sources are the sensor's scale and its triangulation plane, common to all planes, and the remaining
+    inclination error at each plane, large where the calibration does not cover that plane.
     """
     p, u, stages = settings.layout, limits.beam, setup.stages()
     noise = p.noise / np.sqrt(p.average)
     readings = bound(stages, setup.normals, u, noise, p.speckle, p.speckle_length)
     t = design.tilts(setup.normals, u)
     variance = [u @ gradient_covariance(stage, noise, p.speckle, p.speckle_length) @ u for stage in stages]
-    # How the direction follows the conditions of the planes, weighted as the method weights them: by the noise alone.
+    # Sensitivity of the direction to the conditions of the planes, weighted as in the method: by the noise alone.
     follow = readings @ across(u).T @ (t / np.array(variance)[:, None]).T
-    return readings, slopes_by_source(t, limits, left) @ follow.T
+    return readings, slopes_by_source(t, limits, remaining) @ follow.T
 
 
-def slopes_by_source(t: Array, limits: Limits, left: Left | None) -> Array:
-    """Return what one standard uncertainty of each source adds to the slopes at tilts (k, 2): (source, k)."""
-    own, common = left.at(t) if left is not None else np.zeros((2, len(t)))
+def slopes_by_source(t: Array, limits: Limits, remaining: RemainingError | None) -> Array:
+    """Return the influence of one standard uncertainty of each source on the slopes at tilts (k, 2): (source, k)."""
+    own, common = remaining.at(t) if remaining is not None else np.zeros((2, len(t)))
     return np.concatenate([np.full((1, len(t)), limits.scale_uncertainty), common[None], np.diag(own)])
 
 
-def expected_with_origin(setup: Design, settings: Settings, limits: Limits, left: Left | None) -> Propagated:
-    """Return what to expect of direction and zero point; NaN for the latter where drawing or pivot is not stated."""
+def expected_with_origin(
+    setup: Design, settings: Settings, limits: Limits, remaining: RemainingError | None
+) -> Propagated:
+    """Return expected direction and zero point; NaN for the latter where nominal origin or pivot is not given."""
     p, u, points = settings.layout, limits.beam, None
     stages, origin = setup.stages(), None
     if p.nominal_origin is not None and p.pivot is not None:
@@ -164,19 +168,19 @@ def expected_with_origin(setup: Design, settings: Settings, limits: Limits, left
         origin=origin,
         points=points,
         point_uncertainty=p.pivot_uncertainty,
-        slope_by_source=slopes_by_source(design.tilts(setup.normals, u), limits, left),
+        slope_by_source=slopes_by_source(design.tilts(setup.normals, u), limits, remaining),
     )
 
 
 @dataclass(frozen=True)
-class Left:
-    """What a calibration leaves of the inclination error.
+class RemainingError:
+    """Inclination error that remains after compensation with a calibration.
 
     Attributes
     ----------
     calibration : InclinationCalibration
     beam, triangulation_normal : ndarray (3,)
-        As drawn, unit vectors.
+        Nominal unit vectors.
     normal_uncertainty : float
         Standard uncertainty of the triangulation plane's angle about the beam, rad.
     extrapolate : bool
@@ -190,7 +194,7 @@ class Left:
     extrapolate: bool
 
     def at(self, t: Array) -> tuple[Array, Array]:
-        """Return what is left of the slope at tilts (k, 2), (k,) each: by the calibration, by the triangulation plane.
+        """Return the effects on the slope at tilts (k, 2), (k,) each: of the calibration, of the triangulation plane.
 
         The latter is common to all planes. Where the calibration does not cover a tilt, the remaining error is large.
         """
@@ -199,8 +203,8 @@ class Left:
         one_way, other_way = (self.calibration.slope(q @ np.array([[c, sine], [-sine, c]]))[0] for sine in (s, -s))
         return self.calibration.slope(q)[1], np.asarray(one_way - other_way) / 2
 
-    def speaks(self, t: Array) -> NDArray[np.bool_]:
-        """Return whether a measurement at tilts (k, 2) is compensated and not refused, (k,)."""
+    def covers(self, t: Array) -> NDArray[np.bool_]:
+        """Return whether the calibration can compensate a measurement at tilts (k, 2), (k,)."""
         return np.asarray(self.extrapolate | self.calibration.supported(self._tilt(t)))
 
     def _tilt(self, t: Array) -> Array:
@@ -209,15 +213,15 @@ class Left:
         return tilt(self.beam, self.triangulation_normal, normals)
 
     def table(self, max_inclination: float) -> Callable[[Array], Array]:
-        """Return the uncertainty as a function of tilts (k, 2), from a table: a search asks for it often.
+        """Return the uncertainty as a function of tilts (k, 2), interpolated in a table for speed.
 
-        At tilts that the calibration does not cover, it is that without compensation.
+        At tilts that the calibration does not cover, it is the one without compensation.
         """
         steep = np.linspace(0.0, max_inclination, max(2, round(max_inclination / _TABLE_STEP) + 1))
         azimuth = np.linspace(-np.pi, np.pi, round(2 * np.pi / _TABLE_STEP) + 1)
         A, B = np.meshgrid(steep, azimuth, indexing="ij")
         t = np.stack([np.tan(A) * np.cos(B), np.tan(A) * np.sin(B)], axis=-1).reshape(-1, 2)
-        values = np.where(self.speaks(t), np.hypot(*self.at(t)), _UNCOMPENSATED).reshape(A.shape)
+        values = np.where(self.covers(t), np.hypot(*self.at(t)), _UNCOMPENSATED).reshape(A.shape)
         per_step = np.array([(n - 1) / (x[-1] - x[0]) for x, n in ((steep, steep.size), (azimuth, azimuth.size))])
 
         def look_up(t: Array) -> Array:
@@ -227,8 +231,8 @@ class Left:
         return look_up
 
 
-def _left(settings: Settings) -> Left | None:
-    """Return what the calibration named in the settings leaves; None where they name none."""
+def _remaining(settings: Settings) -> RemainingError | None:
+    """Return the remaining error of the calibration in the settings; None where none is given."""
     if settings.compensation is None:
         return None
     p = settings.layout
@@ -239,7 +243,7 @@ def _left(settings: Settings) -> Left | None:
         )
     u, t = np.array(p.nominal_direction, np.float64), np.array(p.triangulation_normal, np.float64)
     calibration = InclinationCalibration.find(settings.compensation)
-    return Left(
+    return RemainingError(
         calibration,
         u / np.linalg.norm(u),
         t / np.linalg.norm(t),
@@ -257,11 +261,13 @@ def _worse(covariance: Array, limits: Limits) -> float:
     return design.worst_angle(basis @ covariance @ basis.T)
 
 
-def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limits, left: Left | None) -> list[str]:
+def _notes(
+    setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limits, remaining: RemainingError | None
+) -> list[str]:
     paper, own, pair, best = (format_quantity(float(angle), "arcsec", 3) for angle in angles)
     total = limits.readings
     tilts = [design.tilts(setup.normals, limits.beam) for setup in setups[:2]]
-    refused = [np.flatnonzero(~left.speaks(t)) + 1 if left is not None else np.zeros(0, int) for t in tilts]
+    refused = [np.flatnonzero(~remaining.covers(t)) + 1 if remaining is not None else np.zeros(0, int) for t in tilts]
     notes = [
         f"With {total} readings in all the worse of the beam's two angles has a standard uncertainty of {own} as set, "
         f"and of {paper} with the published two planes at 20 deg, turned by 90 deg, strokes of one length"
@@ -272,18 +278,18 @@ def _notes(setups: tuple[Design, ...], angles: Array, alone: Array, limits: Limi
         notes.append(f"The best {len(setups[3].planes)} planes: {best}, {angles[0] / angles[3]:.3g} times better.")
     if np.max(angles / alone) > _ADDED:
         notes.append(
-            "The noise of the readings alone makes "
+            "The contribution of the noise of the readings is "
             + ", ".join(
                 f"{format_quantity(float(angle), 'arcsec', 3)} ({name})"
                 for name, angle in dict(zip(SETUPS, alone, strict=True)).items()
             )
-            + "; the rest is the sensor's scale and what is left of its inclination error."
+            + "; the rest is the sensor's scale and its remaining inclination error."
         )
-    for name, dumb in zip(("the published set-up", "the set-up as set"), refused, strict=True):
-        if dumb.size:
+    for name, uncovered in zip(("the published set-up", "the set-up as set"), refused, strict=True):
+        if uncovered.size:
             notes.append(
-                f"The calibration does not cover plane {' and '.join(map(str, dumb))} of {name}: the "
-                "figures use its extrapolation and the uncertainty of it; a measurement would be refused."
+                f"The calibration does not cover plane {' and '.join(map(str, uncovered))} of {name}: the "
+                "figures use its extrapolation with the corresponding uncertainty; a measurement would be refused."
             )
     for i, (face, strokes, counts) in enumerate(
         zip(setups[3].planes, setups[3].strokes, setups[3].readings, strict=True)

@@ -25,7 +25,7 @@ __all__ = ["is_direction", "part"]
 _UNKNOWN = "the direction was not determined"
 _NO_ORIGIN = "no plane has a known point, so that the position of the beam is not determined"
 _NO_NOMINAL = "no nominal is known"
-_ABOUT_ITSELF = "the turn of a beam about itself is not seen"
+_ABOUT_ITSELF = "the rotation of a beam about its own axis cannot be measured"
 _INDEPENDENT = "noise of the readings"
 _UNITS = (("arcsec", ARCSEC), ("mrad", 1e-3), ("°", math.pi / 180))
 
@@ -111,7 +111,7 @@ def _summary(beam: Found, errors: xr.Dataset, bar: beam_direction_bar.Bar | None
     if not beam.known:
         words.append("The direction could not be determined.")
     elif not math.isfinite(angle):
-        words.append("The direction is known; no nominal direction to compare it with.")
+        words.append("The direction was determined; no nominal direction was given for comparison.")
     else:
         value, expanded = rounded(angle / ARCSEC, 2 * sigma / ARCSEC, signed=False)
         within = f" ± {expanded}" if expanded != DASH else ""
@@ -131,7 +131,7 @@ def _summary(beam: Found, errors: xr.Dataset, bar: beam_direction_bar.Bar | None
         )
     if bar is not None and math.isfinite(bar.radius):
         known = f" (known: {fixed(1e3 * bar.given, 4)} mm)" if math.isfinite(bar.given) else ""
-        words.append(f"The check bar came out with a radius of {fixed(1e3 * bar.radius, 4)} mm{known}.")
+        words.append(f"The measured radius of the check bar is {fixed(1e3 * bar.radius, 4)} mm{known}.")
     unseen = [name for name in FREEDOMS if not np.isfinite(errors[name].values).any()]
     if beam.known and unseen:
         words.append(f"Not determined: {listed(unseen)}. Reported as unknown, not as zero.")
@@ -144,14 +144,14 @@ def _inclination_in_words(beam: Found) -> list[str]:
         turned = beam_direction_figures.angle_between(beam.direction, beam.uncompensated)
         return [
             f"Up to {fixed(1e6 * finite(np.max, taken), 1)} µm of inclination error were subtracted from the readings; "
-            f"without that the direction would be {fixed(turned / ARCSEC, 0)} arcsec off."
+            f"without this correction the direction would differ by {fixed(turned / ARCSEC, 0)} arcsec."
         ]
     tilted = beam.planes.inclination[np.isfinite(beam.planes.inclination)]
     if beam.known and tilted.size and not np.nan_to_num(taken).any():
         return [
             "The readings were not compensated for the tilt of the planes (up to "
-            f"{fixed(np.rad2deg(tilted.max()), 0)}°); an inclination error of the sensor is in the direction and in no "
-            "uncertainty."
+            f"{fixed(np.rad2deg(tilted.max()), 0)}°); an inclination error of the sensor changes the direction and is "
+            "not included in the uncertainty."
         ]
     return []
 
@@ -176,8 +176,8 @@ def _angles(beam: Found, errors: xr.Dataset) -> Table:
         reason = _ABOUT_ITSELF if np.abs(beam.nominal[i]) > 0.99 else _UNKNOWN
         rows.append([f"{name}, about {STROKES[i]}", *_in_units(value, deviation, reason)])
     return Table(
-        "Angles from the nominal to the measured direction: the smallest rotation that takes one to the other, and its "
-        "parts about the machine's axes. After ±: expanded uncertainty, k = 2.",
+        "Angles from the nominal to the measured direction: the smallest rotation from one to the other, and its "
+        "components about the machine's axes. After ±: expanded uncertainty, k = 2.",
         ["angle", *(f"/ {unit}" for unit, _ in _UNITS)],
         rows,
     )
@@ -193,7 +193,7 @@ def _vectors(beam: Found) -> Table:
     rows: list[list[Cell | str]] = []
     for i, name in enumerate(STROKES):
         sine = math.sqrt(max(1 - beam.direction[i] ** 2, 0.0))
-        # Near an axis the angle to it has no linear part; the worst direction stands for it.
+        # Near an axis the angle to it has no linear part; the largest uncertainty of the direction is used.
         spread = sigma[i] / sine if sine > 1e-2 else _worst(beam)
         inclined = math.acos(float(np.clip(beam.direction[i], -1, 1)))
         row: list[Cell | str] = [
@@ -229,7 +229,7 @@ def _origins(beam: Found) -> Block:
         for i, name in enumerate(STROKES)
     ]
     return Table(
-        "Zero point: where the beam is when the reading is 0 and the stage stands at its zero. After ±: expanded "
+        "Zero point: point of the beam at which the reading is 0, with the stage at its zero. After ±: expanded "
         "uncertainty, k = 2.",
         ["", "measured / mm", "nominal / mm", "difference / µm"],
         rows,
@@ -243,8 +243,8 @@ def _compensation(beam: Found, errors: xr.Dataset, key: str) -> list[Block]:
             return taken
         return [
             Text(
-                "The readings were not corrected. A triangulating sensor has an error on an inclined surface, in "
-                "proportion to depth; on a plane that is a wrong gradient, and so a wrong direction.",
+                "The readings were not corrected. A triangulation sensor has an error on an inclined surface, in "
+                "proportion to depth; on a plane it changes the gradient, and therefore the direction.",
                 "note",
             )
         ]
@@ -274,11 +274,11 @@ def _rounds(errors: xr.Dataset) -> list[Block]:
     rounds = float(errors["iterations"].values.ravel()[0]) if "iterations" in errors else math.nan
     if not math.isfinite(rounds) or rounds < 1:
         return []
-    count = f"{integer(rounds)} rounds" if rounds > 1 else "one round"
+    count = f"{integer(rounds)} iterations" if rounds > 1 else "one iteration"
     return [
         Text(
-            "The compensation needs the tilt of each plane to the beam, and the beam needs compensated readings: "
-            f"{count} of one after the other."
+            "The compensation depends on the tilt of each plane to the beam, and the beam on the compensated "
+            f"readings. The result was found by iteration: {count}."
         )
     ]
 
@@ -298,7 +298,7 @@ def _uncertainty(errors: xr.Dataset, beam: Found) -> list[Block]:
         Text(
             f"The error motions are those of the beam against nominal, about the zero point ({point}) mm in the frame "
             f"'{errors.attrs.get('frame', 'not stated')}'. The uncertainty covers noise of the readings and the "
-            "sources that it names; how straight and square the stage is and how flat the planes are is not in it.",
+            "listed sources. It does not include straightness and squareness of the stage and flatness of the planes.",
             "note",
         )
     )
@@ -329,5 +329,5 @@ def _quality(source: Source) -> list[Block]:
     counted = quality.counts(errors, source.raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())
-        blocks.append(Text(f"Counted while measuring: {words}."))
-    return blocks or [Text("The result holds no remarks on the data.", "note")]
+        blocks.append(Text(f"Events during the measurement: {words}."))
+    return blocks or [Text("The result contains no remarks on the data.", "note")]

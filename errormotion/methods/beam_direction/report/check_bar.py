@@ -1,4 +1,4 @@
-"""The check bar that was measured with the beam: its circle, and the residuals enlarged about it."""
+"""The check bar measured with the beam: its circle and the enlarged residuals."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Bar:
 
 
 def bar_of(source: Source) -> Bar | None:
-    """Return the bar of a result; None where it holds none."""
+    """Return the bar of a result; None where there is none."""
     errors = source.errors
     if "bar_residual" not in errors or errors["bar_residual"].ndim != 1:
         return None
@@ -98,7 +98,7 @@ def blocks(bar: Bar, key: str) -> list[Block]:
     ]
     rows.append(["radius", "mm", estimate(1e3 * bar.radius, 2e3 * bar.radius_u, digits=6, signed=False)])
     if math.isfinite(bar.given):
-        rows.append(["radius of the bar as known", "mm", fixed(1e3 * bar.given, 4)])
+        rows.append(["known radius of the bar", "mm", fixed(1e3 * bar.given, 4)])
         off = 1e6 * (bar.radius - bar.given)
         rows.append(["difference of the radii", "µm", estimate(off, 2e6 * bar.radius_u)])
     rows.append(["points used", "", integer(used)])
@@ -131,7 +131,7 @@ def _named(bar: Bar) -> Table:
         for k in positions[:_NAMED]
     ]
     notes = [f"{len(positions) - _NAMED} more are in the dataset."] if len(positions) > _NAMED else []
-    caption = "Points of the bar that were left out, because they contradict the others."
+    caption = "Outliers among the points of the bar, which were left out."
     return Table(caption, ["point", "azimuth / °", "residual / µm"], rows, notes=notes)
 
 
@@ -171,7 +171,7 @@ def figure(bar: Bar, key: str) -> Figure | None:
     crosses = " Crosses: points left out, with their number." if (shown & bar.left_out).any() else ""
     caption = (
         f"The check bar across its axis, in mm. Dots: the measured points, their distance from the fitted circle "
-        f"{number(factor)} times enlarged; right: the same over azimuth.{crosses}"
+        f"enlarged {number(factor)} times; right: the same over azimuth.{crosses}"
     )
     alt = (
         f"Circle of radius {fixed(1e3 * bar.radius, 4)} mm with {integer(int(used.sum()))} points, residuals up to "

@@ -50,12 +50,10 @@ def space(beam: Found, key: str) -> Figure | None:
         _key(figure, beam, "uncompensated" in tips)
 
     angle = angle_between(beam.direction, beam.nominal)
-    words = f"Beam and nominal beam. Left, in space, from one zero point: the deviation {times(factor)} enlarged"
+    words = f"Beam and nominal beam. Left, in space, from one zero point: the deviation enlarged {times(factor)}"
     if cone is not None:
         words += f", the cone of the expanded uncertainty (k = 2) {times(cone_factor)}"
-    words += (
-        f"; the disc is square to the nominal beam and its rim {number(ring / ARCSEC)} arcsec from it. Right: seen "
-    )
+    words += f"; the disc is perpendicular to the nominal beam and its rim {number(ring / ARCSEC)} arcsec from it. Right: seen "
     words += "along the nominal beam, to scale" + ("." if cone is None else ", the ellipse as well.")
     towards = ", ".join(
         f"{fixed(tip / ARCSEC, 0, signed=True)} arcsec towards {name}"
@@ -171,10 +169,10 @@ def lines(beam: Found, key: str) -> Figure | None:
         for i, plane in enumerate(known)
         if steady[i]
     ]
-    check = " Two planes always meet in one point: they do not check one another." if steady.sum() == 2 else ""
+    check = " The lines of two planes always intersect: they are no check of each other." if steady.sum() == 2 else ""
     caption = (
-        "Condition of each plane for the direction, along the beam, which is in the middle: to each plane every "
-        "direction on its line is right. Bands: noise of its readings, k = 2; the steeper a plane, the narrower."
+        "Condition of each plane for the direction, along the beam, which is in the middle: every direction "
+        "on the line of a plane fulfils its condition. Bands: noise of its readings, k = 2; narrower for steeper planes."
     )
     return Figure(
         canvas.draw(paint, key, 3.3), caption + check, f"Lines of the planes about the beam: {'; '.join(words)}."
@@ -320,7 +318,7 @@ def _legend(room: Axes, beam: Found, planes: list[int], flat: list[str]) -> None
         label = f"plane {beam.planes.names[plane]}{tilt if np.isfinite(degrees[:, plane]).all() else ''}"
         handles.append(Line2D([], [], color=look_of(plane), lw=1.1, label=label))
     handles.append(
-        Patch(facecolor=canvas.VERMILLION, alpha=0.4, label="direction of the beam, all that is uncertain, k = 2")
+        Patch(facecolor=canvas.VERMILLION, alpha=0.4, label="direction of the beam, all sources of uncertainty, k = 2")
     )
     room.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.05, 1.02))
     words = []
@@ -333,5 +331,5 @@ def _legend(room: Axes, beam: Found, planes: list[int], flat: list[str]) -> None
                 f"{fixed(y, 0, signed=True)} towards {names[1]}"
             )
     if flat:
-        words.append(f"not drawn, square to the beam: plane {', '.join(flat)}")
+        words.append(f"not drawn, perpendicular to the beam: plane {', '.join(flat)}")
     room.text(1.07, 0.02, "\n".join(words), transform=room.transAxes, color=_GREY, va="bottom", linespacing=1.5)

@@ -26,7 +26,7 @@ def blocks(planes: Planes, key: str) -> list[Block]:
         return [Text("The result does not describe the planes.", "note")]
     found: list[Block] = [_table(planes), *_closures(planes)]
     drawn = residuals(planes, key)
-    return found + ([drawn] if drawn else [Text("The result holds no residuals.", "note")]) + left_out(planes)
+    return found + ([drawn] if drawn else [Text("The result contains no residuals.", "note")]) + left_out(planes)
 
 
 def rms(planes: Planes, plane: int) -> float:
@@ -42,7 +42,7 @@ def _table(planes: Planes) -> Table:
             [
                 name,
                 or_dash(fixed(np.rad2deg(planes.inclination[k]), 2), "not determined"),
-                or_dash(fixed(np.rad2deg(planes.rotation[k]), 2), "the plane of triangulation is not known"),
+                or_dash(fixed(np.rad2deg(planes.rotation[k]), 2), "the triangulation plane is unknown"),
                 integer(used),
                 integer(out),
                 or_dash(fixed(1e6 * rms(planes, k), 2), "no residuals"),
@@ -54,7 +54,7 @@ def _table(planes: Planes) -> Table:
         )
     return Table(
         "The planes. Inclination: angle between beam and normal; rotation: azimuth of the tilt about the beam, from "
-        "the plane of triangulation. Residual: of the readings used. Closure: 1 + g·u, with g the change of the "
+        "the triangulation plane. Residual: of the readings used. Closure: 1 + g·u, with g the change of the "
         "reading along the stage; 0 for a plane and a beam without error. After ±: expanded uncertainty, k = 2.",
         ["plane", "inclination / °", "rotation / °", "used", "left out", "rms / µm", "largest / µm", "closure / 10⁻⁶"],
         rows,
@@ -74,8 +74,8 @@ def _closures(planes: Planes) -> list[Block]:
     if known == 2:
         return [
             Text(
-                "Two planes fit every beam exactly: their closures are 0 by construction and check nothing. A third "
-                "plane would.",
+                "Two planes always fit a beam exactly: their closures are 0 by construction and are no check. A third "
+                "plane is required for a check.",
                 "note",
             )
         ]
@@ -85,8 +85,8 @@ def _closures(planes: Planes) -> list[Block]:
     words = listed([f"plane {name} by {fixed(ratio, 1)} times its standard uncertainty" for name, ratio in off])
     return [
         Text(
-            f"Not closed: {words}. Readings that depend on the tilt without (enough) compensation, a stage that is "
-            "not straight or square, or a plane that is not flat do this.",
+            f"The closure is not 0 within its uncertainty: {words}. Possible causes: missing or insufficient "
+            "compensation of the inclination error, a stage that is not straight or square, a plane that is not flat.",
             "warning",
         )
     ]
@@ -112,8 +112,8 @@ def residuals(planes: Planes, key: str) -> Figure | None:
     more = f" {len(picks)} of {len(shown)} planes are shown." if len(picks) < len(shown) else ""
     caption = (
         "Residuals by plane: reading minus that of the fitted plane. Letters: the axis of the stroke. Crosses: left "
-        "out of the fit, at the edge where they lie beyond it. An error in proportion to depth leaves a plane a plane "
-        f"and does not show here, but in the closures of three planes or more.{more}"
+        "out of the fit, at the edge where they lie beyond it. An error in proportion to depth "
+        f"does not change the residuals; it shows in the closures of three planes or more.{more}"
     )
     return Figure(
         canvas.draw(paint, key, canvas.stack_height(heights)), caption, f"Residuals by plane and stroke; rms: {worst}."
@@ -155,7 +155,7 @@ def _residuals_of(axes: Axes, planes: Planes, k: int, strokes: np.ndarray) -> No
 
 
 def left_out(planes: Planes) -> list[Block]:
-    """Return the table that names every reading that was left out."""
+    """Return the table of the readings that were left out."""
     positions = np.argwhere(planes.left_out)
     if not len(positions):
         return []
@@ -227,7 +227,7 @@ def compensation(planes: Planes, key: str) -> list[Block]:
         Figure(
             canvas.draw(paint, key, canvas.stack_height([1.5])),
             "Inclination error that was subtracted from the readings, over the raw reading.",
-            f"Taken off: {words}.",
+            f"Corrections: {words}.",
         ),
     ]
 

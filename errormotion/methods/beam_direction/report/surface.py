@@ -32,7 +32,7 @@ _SECTIONS = (0.0, np.pi / 2)
 
 @dataclass(frozen=True)
 class _Tilts:
-    """What was calibrated.
+    """Calibrated settings.
 
     Attributes
     ----------
@@ -69,9 +69,9 @@ def calibration_of(source: Source, planes: Planes) -> tuple[InclinationCalibrati
     try:
         calibration = InclinationCalibration.find(str(named), folder)
     except DatasetError as error:
-        return None, f"the calibration '{named}' cannot be shown here: {error}"
+        return None, f"the calibration '{named}' cannot be shown: {error}"
     if not _agrees(calibration, planes):
-        return None, f"the calibration '{named}' that is found here is not the one of the correction"
+        return None, f"the calibration '{named}' that was found is not the one used for the correction"
     return calibration, ""
 
 
@@ -96,19 +96,19 @@ def blocks(beam: Found, calibration: InclinationCalibration | None, why: str, ke
 
 
 def _extrapolated(planes: Planes, calibration: InclinationCalibration) -> list[Block]:
-    """Say which planes lie where nothing was calibrated."""
+    """Return a warning with the planes that the calibration does not cover."""
     known = np.isfinite(planes.inclination) & np.isfinite(planes.rotation)
     bare = known & ~calibration.supported(tilt_vector(planes.inclination, planes.rotation))
     if not bare.any():
         return []
     names = listed([planes.names[k] for k in np.flatnonzero(bare)])
     lies = f"planes {names} lie" if bare.sum() > 1 else f"plane {names} lies"
-    words = f"To the beam, {lies} outside the settings of the calibration: the correction there is extrapolated."
+    words = f"With the tilt to the beam, {lies} outside the settings of the calibration: the correction there is extrapolated."
     return [Text(words, "warning")]
 
 
 def in_words(calibration: InclinationCalibration) -> str:
-    """Say what the calibration is made of and what it leaves."""
+    """Return a description of the calibration and its remaining error."""
     ds = calibration.dataset
     low, high = (float(ds[name]) - calibration.mid_range for name in ("reading_low", "reading_high"))
     n, out = ds.sizes["setting"], int((ds["setting_left_out"].values > 0).sum())
@@ -159,7 +159,7 @@ def maps(planes: Planes, calibration: InclinationCalibration, key: str) -> Figur
     caption = (
         "Inclination error of the sensor, error = depth times k. Left: k over inclination (from the middle) and "
         "rotation; right: the error over depth in two sections, negative inclinations being those at the opposite "
-        "rotation. Dots: what was calibrated, in the colour of its own value; crosses: left out of the calibration. "
+        "rotation. Dots: calibrated settings, in the colour of their own value; crosses: left out of the calibration. "
         "Numbers: the planes of this measurement; in the sections, with their depths, those within 10° of them. "
         "Hatched: not supported by the calibration."
     )

@@ -1,4 +1,4 @@
-"""What a result of `beam_direction` holds, as plain arrays over its planes, whatever of it is missing."""
+"""Contents of a result of `beam_direction` as arrays over its planes, with NaN for missing data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OUT_OF_RANGE = 2
 
 @dataclass(frozen=True)
 class Planes:
-    """The planes that a beam was found from; NaN where something is not known.
+    """The planes that determine a beam; NaN for unknown values.
 
     Attributes
     ----------
@@ -31,9 +31,9 @@ class Planes:
     residual, compensation, raw, compensated : (plane, reading)
         m.
     left_out, given : (plane, reading) of bool
-        What the fit did not use, and where there was a reading at all.
+        Readings that the fit did not use, and readings that are not missing.
     beyond : (plane, reading) of bool
-        What of that lay out of the sensor's range.
+        Readings left out because they are out of the sensor's range.
     stage : (plane, reading, 3)
         m.
     """
@@ -85,7 +85,7 @@ def _axis_of(step: Array) -> str:
 
 @dataclass(frozen=True)
 class Found:
-    """One beam: where it was expected, where it is, and how well that is known. NaN where something is unknown.
+    """One beam: nominal and measured position and direction, and their uncertainty. NaN for unknown values.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ def is_direction(errors: xr.Dataset) -> bool:
 
 
 def found(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Found:
-    """Return the view of a result; ``raw`` gives the stage positions where the result does not hold them."""
+    """Return the view of a result; ``raw`` gives the stage positions where the result does not contain them."""
     name = str(errors["beam"].values[0]) if "beam" in errors.coords else "beam"
     direction, nominal = (_of_beam(errors, f"{kind}_direction") for kind in ("beam", "nominal"))
     covariance = np.full((6, 6), np.nan)

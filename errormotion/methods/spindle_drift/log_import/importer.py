@@ -12,7 +12,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.text.log_format import TIMESTAMP
-from errormotion.datasets.text.log_reader import Columns, Complaints, read_columns
+from errormotion.datasets.text.log_reader import Columns, Mistakes, read_columns
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.log_import.import_map import (
@@ -46,12 +46,12 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
         The map or the log is wrong; all mistakes are reported together, each with its line.
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
-    complaints = Complaints(log)
+    mistakes = Mistakes(log)
     dates = settings.time.unit == TIMESTAMP
-    columns = read_columns(_columns_of(settings), "time", settings.format, complaints, dates=dates)
-    _check_times(columns, complaints)
-    _check_magnitudes(columns, settings, complaints)
-    complaints.raise_any()
+    columns = read_columns(_columns_of(settings), "time", settings.format, mistakes, dates=dates)
+    _check_times(columns, mistakes)
+    _check_magnitudes(columns, settings, mistakes)
+    mistakes.raise_any()
     return _raw_dataset(columns, settings)
 
 
@@ -69,19 +69,19 @@ def _columns_of(settings: ImportMap) -> dict[str, str | int]:
     return found
 
 
-def _check_times(columns: Columns, complaints: Complaints) -> None:
+def _check_times(columns: Columns, mistakes: Mistakes) -> None:
     """Report times that do not increase."""
     t, lines = columns.values["time"], columns.lines
     known = np.flatnonzero(~np.isnan(t))
     for step in np.flatnonzero(np.diff(t[known]) <= 0):
         before, after = known[step], known[step + 1]
-        complaints.add(
+        mistakes.add(
             int(lines[after]),
             f"time: expected more than {t[before]:.9g} of line {int(lines[before])}; found {t[after]:.9g}",
         )
 
 
-def _check_magnitudes(columns: Columns, settings: ImportMap, complaints: Complaints) -> None:
+def _check_magnitudes(columns: Columns, settings: ImportMap, mistakes: Mistakes) -> None:
     """Report the first implausible value of each column."""
     for key, values in columns.values.items():
         row = _ROWS[_VARIABLE[key.partition(".")[0]]]
@@ -89,7 +89,7 @@ def _check_magnitudes(columns: Columns, settings: ImportMap, complaints: Complai
         outside = np.flatnonzero((inside < row.low) | (inside > row.high))
         if outside.size:
             first, unit = outside[0], _column(key, settings).unit
-            complaints.add(
+            mistakes.add(
                 int(columns.lines[first]),
                 f"{key}: {values[first]:.6g} is a {row.name} of {inside[first]:.6g} {row.unit}; expected "
                 f"{row.low:g}..{row.high:g} {row.unit}. Is the unit '{unit}' right? ({outside.size} such values)",

@@ -80,7 +80,7 @@ def _summary(source: Source) -> list[str]:
     errors = source.errors
     time, found, stop = minutes_of(errors), curves(errors), end_of_running(errors)
     if time.size < 2:
-        return ["The record holds fewer than two instants: there is no drift to report."]
+        return ["The record contains fewer than two instants: no drift can be reported."]
     words = [_what_was_done(errors)]
     by_size = sorted(
         (name for name in ("X1", "X2", "Y1", "Y2", "Z") if np.isfinite(found[name].values).any()),
@@ -96,7 +96,9 @@ def _summary(source: Source) -> list[str]:
     if largest:
         words.append(f"The largest share in the variance of Z {_when(errors)}: {largest[0]}, {largest[1]}.")
     if errors.attrs.get("beams") == "nominal":
-        words.append("The beams were taken from the drawing, not detected: the bar cannot be placed better than that.")
+        words.append(
+            "Nominal beams were used, not detected ones: the accuracy of the bar's position is limited to that of the drawing."
+        )
     unseen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if not np.isfinite(errors[name].values).any()]
     if unseen:
         names = iso_names("spindle")
@@ -112,7 +114,7 @@ def _what_was_done(errors: xr.Dataset) -> str:
     length = f"The record is {fixed(time[-1] - time[0], 1)} min long"
     if stop is None:
         known = "spindle_speed" in errors
-        return f"{length}; {'the spindle stood still' if known else 'the spindle speed was not recorded'}."
+        return f"{length}; {'the spindle did not turn' if known else 'the spindle speed was not recorded'}."
     speed = np.asarray(errors["spindle_speed"].values, float)
     turning = speed[np.abs(np.nan_to_num(speed)) > 0]
     low, high = (float(value) for value in np.percentile(np.abs(turning), [2, 98]))
@@ -136,7 +138,7 @@ def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
 
 
 def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
-    """Say what a switched compensation did: the mean of ten seconds after it, less that of ten seconds before it."""
+    """Return the effect of a switched compensation: mean of ten seconds after it minus mean of ten seconds before."""
     time, words = minutes_of(errors), []
     for event in done:
         for axis in event.axes:
@@ -169,16 +171,16 @@ def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> str:
 
 
 def _first_hour(errors: xr.Dataset) -> list[str]:
-    """Say the ranges of the first 60 min: Z, the largest lateral one, the largest tilt."""
-    told = []
+    """Return the ranges of the first 60 min: Z, the largest lateral one, the largest tilt."""
+    ranges = []
     for names in (("Z",), ("X1", "X2", "Y1", "Y2"), ("A", "B")):
         values = {name: iso230_3.value_of(errors, name, "range_60min")[0] for name in names}
         known = {name: value for name, value in values.items() if math.isfinite(value)}
         if known:
             name = max(known, key=lambda quantity: known[quantity])
             cell = iso230_3.cell(errors, name, "range_60min")
-            told.append(f"d({name}) {_with_uncertainty(cell)} {unit_of(name)[0]}")
-    return [f"Largest ranges within the first 60 min: {listed(told)}."] if told else []
+            ranges.append(f"d({name}) {_with_uncertainty(cell)} {unit_of(name)[0]}")
+    return [f"Largest ranges within the first 60 min: {listed(ranges)}."] if ranges else []
 
 
 def _still_moving(errors: xr.Dataset, by_size: list[str], done: Sequence[Event]) -> list[str]:
@@ -209,7 +211,7 @@ def _values(source: Source) -> list[Block]:
     errors = source.errors
     found: list[Block] = list(iso230_3.tables(errors, events(source)))
     if not found:
-        return [Text("The result holds no ISO 230-3 values.", "note")]
+        return [Text("The result contains no ISO 230-3 values.", "note")]
     meaning = "; ".join(f"{name}: {WHAT[name]}" for name in QUANTITIES)
     setup = setup_drawing.setup_of(errors)
     if setup is not None and setup.levels.size == 2:
@@ -264,7 +266,7 @@ def _temperature_table(errors: xr.Dataset) -> Table:
 def _setup(errors: xr.Dataset, key: str) -> list[Block]:
     figure, table = setup_drawing.figure(errors, f"{key}-setup"), setup_drawing.table(errors)
     if figure is None or table is None:
-        return [Text("The result does not hold the geometry of beams and bar.", "note")]
+        return [Text("The result does not contain the geometry of beams and bar.", "note")]
     return [figure, table]
 
 
@@ -284,9 +286,9 @@ def _uncertainty(errors: xr.Dataset) -> list[Block]:
         budget.table(errors.isel(time=place), f"{_when(errors)} ({fixed(time[place], 1)} min)"),
         Text(
             f"Functional point ({point}) mm in the frame '{errors.attrs.get('frame', 'not stated')}'. Sources that act "
-            "on many instants at once are one draw for all of them; differences between instants take their covariance "
+            "on many instants at once are common to all of them; differences between instants take their covariance "
             "into account, so that the uncertainty of a difference may be smaller than that of either value. "
-            "The budget covers the sources that it names and no others.",
+            "The budget covers only the listed sources.",
             "note",
         ),
     ]
@@ -303,8 +305,8 @@ def _quality(source: Source, key: str) -> list[Block]:
         if np.isfinite(largest).any() and np.nanmax(largest) < 1e-11:
             blocks.append(
                 Text(
-                    "The fit is exact: as many readings as unknowns. The residuals are zero by construction and say "
-                    "nothing of the accuracy; that comes from the sensors and the beam calibration.",
+                    "The fit is exact: as many readings as unknowns. The residuals are zero by construction and do "
+                    "not show the accuracy, which depends on the sensors and the beam calibration.",
                     "note",
                 )
             )

@@ -202,7 +202,7 @@ def _time_axis(axes: Axes, time: np.ndarray) -> None:
 
 
 def _in_words(what: str, rows: list[list[Curve]], time: np.ndarray) -> str:
-    """Say what a sighted reader takes from the curves: extremes and last value of each."""
+    """Return a text alternative of the curves: extremes and last value of each."""
     words = []
     for line in (line for row in rows for line in row):
         name, size = line.unit

@@ -1,4 +1,4 @@
-"""The tables of thermal drift values in the manner of ISO 230-3: ranges and differences, first hour and to the end."""
+"""Tables of thermal drift values as in ISO 230-3: ranges and differences, first hour and whole record."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from errormotion.report.series import QUANTITIES, Event, curves, end_of_running,
 from errormotion.report.text import fixed
 
 #: Factor from a measure to its field unit, beyond the field unit of the quantity, and that unit's suffix.
-_STEP = "holds the step of a compensation that was switched in this interval"
+_STEP = "includes the step of a compensation that was switched in this interval"
 _SLOPE_SPAN = 10.0  # min before the end of running, over which an end slope is taken
 _RATES = {"end_slope": (3600.0, "/h"), "per_kelvin": (1.0, "/K")}
 
 
 def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, float]:
-    """Return one ISO 230-3 value and its standard uncertainty in SI; NaN where the dataset does not hold it."""
+    """Return one ISO 230-3 value and its standard uncertainty in SI; NaN where the dataset does not contain it."""
     if "iso_value" not in errors:
         return math.nan, math.nan
     table = errors["iso_value"]
@@ -34,7 +34,7 @@ def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, fl
 
 
 def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] = ()) -> Cell:
-    """Return one value in field units with its expanded uncertainty, or a dash and why.
+    """Return one value in field units with its expanded uncertainty, or a dash and the reason.
 
     A value over an interval in which the quantity's compensation was switched carries that as its footnote.
     """
@@ -57,13 +57,13 @@ def holds_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[E
     if not (time.size and done):
         return False
     running = time[stop] if stop is not None else time[-1]
-    begin = running - _SLOPE_SPAN if measure == "end_slope" else time[0]
+    start = running - _SLOPE_SPAN if measure == "end_slope" else time[0]
     end = time[0] + 60 if measure.endswith("60min") else time[-1] if measure.endswith("total") else running
-    return any(begin < event.minute <= end and quantity[0] in event.axes for event in done)
+    return any(start < event.minute <= end and quantity[0] in event.axes for event in done)
 
 
 def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
-    """Say why a value is not there, from what the record holds."""
+    """Return the reason why a value is missing."""
     time = minutes_of(errors)
     values = curves(errors)[quantity].values
     if not np.isfinite(values).any():
@@ -84,7 +84,7 @@ def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
 
 
 def tables(errors: xr.Dataset, done: Sequence[Event] = ()) -> list[Table]:
-    """Return the table of drift values and the table of what describes the curves."""
+    """Return the table of drift values and the table of parameters of the curves."""
     if "iso_value" not in errors:
         return []
     time, stop = minutes_of(errors), end_of_running(errors)

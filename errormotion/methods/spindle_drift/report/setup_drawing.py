@@ -36,7 +36,7 @@ class Setup:
 
     @property
     def along(self) -> int:
-        """Index of the machine axis that the bar lies along."""
+        """Index of the machine axis along the bar."""
         return int(np.argmax(np.abs(self.axis_direction)))
 
     @property
@@ -52,7 +52,7 @@ class Setup:
 
 
 def setup_of(errors: xr.Dataset) -> Setup | None:
-    """Return the set-up that a drift dataset holds; None where something needed is missing or unknown."""
+    """Return the set-up of a drift dataset; None where required data are missing or unknown."""
     if any(name not in errors for name in _NEEDED):
         return None
     origin = errors["beam_origin"].transpose("channel", "direction").values
@@ -85,7 +85,7 @@ def setup_of(errors: xr.Dataset) -> Setup | None:
 
 
 def _levels(errors: xr.Dataset) -> np.ndarray:
-    """Return the heights of the levels, m; empty where the dataset does not hold them as numbers."""
+    """Return the heights of the levels, m; empty where the dataset does not contain them as numbers."""
     for name in ("level", "level_height", "level_z", "height"):
         if name in errors and errors[name].dtype.kind == "f":
             heights = np.atleast_1d(errors[name].values)
@@ -121,13 +121,11 @@ def figure(errors: xr.Dataset, key: str) -> Figure | None:
 
     svg = canvas.draw(paint, key, high)
     drift = (
-        f" Dashed: the bar at the end of running, its displacement drawn {integer(factor)} times larger."
-        if factor
-        else ""
+        f" Dashed: the bar at the end of running, its displacement enlarged {integer(factor)} times." if factor else ""
     )
     caption = (
         f"Set-up in machine coordinates, to scale: bar of {fixed(2e3 * setup.radius, 3)} mm diameter, levels of "
-        f"evaluation, and the beams from the start of their measuring range (dots) to the bar. Thin lines lead back to "
+        f"evaluation, and the beams from the start of their measuring range (dots) to the bar. Thin lines lead to "
         f"the sensors, which are not drawn; a ring is a beam along the line of sight.{drift}"
     )
     alt = (
@@ -173,7 +171,7 @@ def _limits(setup: Setup, i: int) -> tuple[float, float]:
 
 
 def _ends(setup: Setup) -> tuple[float, float]:
-    """Lowest and highest place of the drawn bar along its main axis."""
+    """Lowest and highest position of the drawn bar along its main axis."""
     k = setup.along
     parallel = np.flatnonzero(np.abs(setup.direction[:, k]) > 0.7)
     heights = np.concatenate([setup.levels, setup.hit[:, k]])

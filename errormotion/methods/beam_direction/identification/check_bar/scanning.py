@@ -1,11 +1,12 @@
-"""Surface points from the readings of a calibrated beam, with what is known of each and of all together.
+"""Surface points from the readings of a calibrated beam, with their own covariance and common influences.
 
 A reading d at the position s of the stage puts a point at p = p0 + s + d u, p0 the zero point, u the unit vector of the
-beam; readings grow away from the sensor. The noise is each point's own. What is not known of the beam, or of the
-calibration of its inclination error, is one draw for the whole scan: it is kept as influences, never as scatter.
+beam; readings increase with the distance from the sensor. The noise is independent for each point. Errors of the beam
+and of the calibration of its inclination error are common to the whole scan: they are stored as influences, not as
+scatter.
 
-The inclination error depends on the surface's normal and the normal on the points, so where the normals are not given
-both are found in turn, until the points rest.
+The inclination error depends on the surface's normal and the normal on the points. Where the normals are not given,
+both are found by iteration until the points no longer change.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from errormotion.methods.beam_direction.identification.check_bar.surfaces import
 __all__ = ["Points", "Surface", "along_curve", "over_surface", "points", "round_bar"]
 
 
-AT_REST = 1e-10
-"""Change of a point, m, below which it rests."""
-TURNS = 50
-"""Turns of normals and points until it is said that they do not settle."""
+CONVERGENCE_LIMIT = 1e-10
+"""Change of a point, m, below which the iteration ends."""
+MAX_ITERATIONS = 50
+"""Largest number of iterations of normals and points."""
 _ROUNDING = 1e-9
 _UNIT_NORM = 1e-6
 
@@ -47,25 +48,25 @@ class Points:
     points : ndarray (n, 3)
         m; NaN where there was no reading.
     covariance : ndarray (n, 3, 3)
-        What is each point's own: noise of reading and stage, m^2.
+        Independent part of each point: noise of reading and stage, m^2.
     influence : ndarray (source, n, 3)
         Signed effect, m, of one standard uncertainty of each source that all points share.
     sources : tuple of str
         Names of these sources; scans with the same beam and calibration share the sources of the same name.
     reading : ndarray (n,)
-        As read, m.
+        Uncorrected readings, m.
     distance : ndarray (n,)
         With the inclination error corrected, m; the same as `reading` where there is no calibration.
     direction : ndarray (3,)
-        Of the beam.
+        Direction of the beam.
     normals : ndarray (n, 3) or None
         Unit normals towards the sensor, where they are known.
     tilt : ndarray (n, 2) or None
         Tilt vectors of the surface to the beam, where a calibration was used.
-    turns : int
-        How often the normals were found again.
+    iterations : int
+        Number of iterations of the normals.
     notes : tuple of str
-        What a user should know.
+        Warnings and remarks.
     """
 
     points: Array
@@ -77,12 +78,12 @@ class Points:
     direction: Array
     normals: Array | None = None
     tilt: Array | None = None
-    turns: int = 0
+    iterations: int = 0
     notes: tuple[str, ...] = ()
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance (n, 3, 3) of each point by itself, with what it shares with the others."""
+        """Covariance (n, 3, 3) of each point, including the common sources."""
         return np.asarray(self.covariance + np.einsum("sni,snj->nij", self.influence, self.influence))
 
 
@@ -102,29 +103,29 @@ def points(
     moves: Literal["sensor", "target"] = "sensor",
     extrapolate: bool = False,
 ) -> Points:
-    """Return the points that a beam met.
+    """Return the points that a beam measured.
 
     Parameters
     ----------
     reading : array_like (n,)
-        m, growing away from the sensor; NaN where there was none.
+        m, increasing with the distance; NaN where missing.
     stage : array_like (n, 3)
         Position of the stage at each reading, m.
     origin, direction : array_like (3,)
-        Zero point of the beam while the stage is at 0, m, and the unit vector along which readings grow.
+        Zero point of the beam while the stage is at 0, m, and the unit vector along which readings increase.
     covariance : array_like (6, 6), optional
-        Of (origin, direction): one draw for all points.
+        Of (origin, direction), common to all points.
     noise, stage_noise : float
         Standard deviation of one reading, and of each coordinate of the stage, m.
     calibration : InclinationCalibration, optional
-        Of the sensor; without one the readings are taken as they are.
+        Of the sensor; without one the readings are not corrected.
     triangulation_normal : array_like (3,), optional
         Normal of the plane of emitted and received beam; needed with a calibration.
     mid_range : float, optional
         Reading at which the inclination error vanishes, m; default: that of the calibration.
     normals : array_like (n, 3) or Surface, optional
-        Unit normals, or what tells them from the points: `along_curve`, `over_surface`, `round_bar` or another. By
-        default a scan along one line is taken as a curve in its plane, any other one as a surface.
+        Unit normals, or a function that returns them from the points: `along_curve`, `over_surface`, `round_bar` or
+        another. By default a scan along one line is taken as a curve in its plane, any other one as a surface.
     moves : {"sensor", "target"}
         What the stage carries; if it is the target, the points are in the target's own frame.
     extrapolate : bool
@@ -133,8 +134,8 @@ def points(
     Raises
     ------
     MethodError
-        Input of the wrong shape, a beam without origin, a calibration without triangulation normal, normals that look
-        along the beam or do not settle, tilts and readings beyond the calibration.
+        Input of the wrong shape, a beam without origin, a calibration without triangulation normal, normals that are
+        perpendicular to the beam or do not converge, tilts and readings outside the calibration.
     """
     r, s = np.asarray(reading, float), np.asarray(stage, float)
     if r.ndim != 1 or s.shape != (len(r), 3):
@@ -148,11 +149,11 @@ def points(
     positions = s[measured] if moves == "sensor" else -s[measured]
     scan = _Scan(r[measured], positions, beam, calibration, triangulation_normal, mid_range, extrapolate)
     surface, notes = _surface(normals, measured, scan)
-    distance, N, turns = _at_rest(scan, surface)
+    distance, N, iterations = _converged(scan, surface)
     notes += _extrapolated(scan, N)
 
     influence, sources = _influences(scan, N, distance)
-    # The reading's noise comes through the compensation a little stretched.
+    # The compensation scales the noise of the reading.
     stretch = 1.0 if N is None or calibration is None else 1 / (1 + calibration.slope(scan.tilt(N))[0])
     u = scan.direction
     along = (noise * np.broadcast_to(stretch, distance.shape)) ** 2
@@ -177,14 +178,14 @@ def points(
         direction=u,
         normals=spread(N),
         tilt=spread(scan.tilt(N)) if N is not None and calibration is not None else None,
-        turns=turns,
+        iterations=iterations,
         notes=notes,
     )
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """Readings that are there, and all that turns them into points."""
+    """Valid readings and the data for their conversion to points."""
 
     reading: Array
     stage: Array
@@ -208,8 +209,8 @@ class _Scan:
         """Return the tilt vectors (n, 2) of a surface with these normals."""
         if self.triangulation_normal is None:
             raise MethodError(
-                "A calibration needs the triangulation normal, which says how the sensor is turned about its beam: the "
-                "normal of the plane that holds the emitted and the received beam."
+                "A calibration needs the triangulation normal, which states the rotation of the sensor about its beam: "
+                "the normal of the plane that contains the emitted and the received beam."
             )
         return np.asarray(tilt(self.beam[1] if direction is None else direction, self.triangulation_normal, normals))
 
@@ -217,7 +218,9 @@ class _Scan:
         """Return normals (n, 3) turned towards the sensor."""
         way = -(normals @ self.direction)
         if not (np.abs(way) > _ROUNDING).all():
-            raise MethodError("The beam runs along the surface at some points: it has no reading there. Check normals.")
+            raise MethodError(
+                "The beam is parallel to the surface at some points and has no reading there. Check the normals."
+            )
         return np.asarray(normals * np.sign(way)[:, None])
 
 
@@ -240,7 +243,7 @@ def _beam(origin: ArrayLike, direction: ArrayLike, covariance: ArrayLike | None)
 def _surface(
     normals: ArrayLike | Surface | None, measured: NDArray[np.bool_], scan: _Scan
 ) -> tuple[Array | Surface | None, tuple[str, ...]]:
-    """Return the normals or what tells them, and what has to be said of that."""
+    """Return the normals or a function for them, and notes."""
     if callable(normals):
         return normals, ()
     if normals is not None:
@@ -256,30 +259,34 @@ def _surface(
         return over_surface(), ()
     axis = np.cross(ways[0], scan.direction)
     if np.linalg.norm(axis) < 1e-3:
-        raise MethodError("The stage moved along the beam alone: such a scan shows no tilt. Give the normals.")
+        raise MethodError(
+            "The stage moved along the beam alone: the tilt cannot be determined from such a scan. Give the normals."
+        )
     note = (
-        "The scan runs along one line, where only the tilt in the plane of the scan can be seen; the tilt across it "
-        "was taken as 0. If the surface leans that way, give its normals or the surface, such as round_bar(axis)."
+        "The scan is along one line, which determines only the tilt in the plane of the scan; the tilt across it "
+        "was taken as 0. If the surface is inclined across the scan, give its normals or the "
+        "surface, such as round_bar(axis)."
     )
     return along_curve(axis / np.linalg.norm(axis)), (note,)
 
 
-def _at_rest(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Array | None, int]:
-    """Return distances (n,), normals (n, 3) and the number of turns."""
+def _converged(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Array | None, int]:
+    """Return distances (n,), normals (n, 3) and the number of iterations."""
     if surface is None:
         return scan.reading, None, 0
     if not callable(surface):
         return _compensated(scan, surface), surface, 0
     distance = scan.reading
-    for turn in range(1, TURNS + 1):
+    for iteration in range(1, MAX_ITERATIONS + 1):
         N = scan.facing(surface(scan.position(distance)))
         before, distance = distance, _compensated(scan, N)
-        if np.abs(distance - before).max() < AT_REST:
-            return distance, N, turn
+        if np.abs(distance - before).max() < CONVERGENCE_LIMIT:
+            return distance, N, iteration
     change = np.abs(distance - before).max()
     raise MethodError(
-        f"Normals and points do not settle: after {TURNS} turns the points still move by {1e6 * change:.3g} um. The "
-        "neighbours are closer than the noise allows: take more of them, or tell the surface, such as round_bar(axis)."
+        f"Normals and points do not converge: after {MAX_ITERATIONS} iterations the points still change by "
+        f"{1e6 * change:.3g} um. The distance of the neighbours is too small for the noise: use more neighbours, or "
+        "give the surface, such as round_bar(axis)."
     )
 
 
@@ -291,20 +298,20 @@ def _compensated(scan: _Scan, normals: Array) -> Array:
 
 
 def _extrapolated(scan: _Scan, normals: Array | None) -> tuple[str, ...]:
-    """Say how many points (normals (n, 3)) were compensated at tilts that the calibration does not cover."""
+    """Return a note with the number of points compensated at tilts outside the calibration; ``normals`` (n, 3)."""
     if scan.calibration is None or normals is None:
         return ()
     beyond = int((~scan.calibration.supported(scan.tilt(normals))).sum())
     if not beyond:
         return ()
     return (
-        f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not speak "
-        "for: what was corrected there is extrapolated.",
+        f"{beyond} of {len(normals)} points lie at tilts that the calibration '{scan.calibration.name}' does not "
+        "cover: the correction there is extrapolated.",
     )
 
 
 def _influences(scan: _Scan, normals: Array | None, distance: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return the effect (source, n, 3) of one standard uncertainty of what all points share."""
+    """Return the effect (source, n, 3) of one standard uncertainty of each common source."""
     found: list[Array] = []
     sources: list[str] = []
     p0, u, C = scan.beam

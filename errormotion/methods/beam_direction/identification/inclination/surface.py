@@ -1,14 +1,14 @@
 """A smooth surface k through the slopes of calibrated settings, its order chosen by leaving settings out.
 
-k is a sum of products of Legendre polynomials. A smooth function has coefficients that fall geometrically with their
-degree n, so each is held at 0 within a standard deviation s rho^n, and the settings scatter f times as much as their
-noise says. How well s, rho and f suit the data is told by predictions of settings that were left out, one at a time:
-the sum of the log densities of these predictions (Rasmussen and Williams, Gaussian Processes for Machine Learning,
-section 5.4.2). Few settings tell the three only roughly, so the surface is the average over a grid of them, each with
-the weight of how well it suits, and its covariance holds how they differ.
+k is a sum of products of Legendre polynomials. The coefficients of a smooth function decrease geometrically with their
+degree n, so the prior of each is 0 with the standard deviation s rho^n, and the settings scatter f times as much as
+their noise. The fit of s, rho and f to the data is measured by predictions of settings that were left out, one at a
+time: the sum of the log densities of these predictions (Rasmussen and Williams, Gaussian Processes for Machine
+Learning, section 5.4.2). Few settings determine the three only roughly, so the surface is the average over a grid of
+them, weighted by this density, and its covariance includes their differences.
 
-The order is the smallest one that predicts no worse than all degrees together. The degrees beyond it stay in the fit,
-held at what they may be: they are what the order leaves out, and make the uncertainty grow where there are no settings.
+The order is the smallest one that predicts no worse than all degrees together. Higher degrees remain in the fit with
+their prior: they represent the truncation error, and increase the uncertainty where there are no settings.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import terms
 
-HIGHEST = 12
+HIGHEST_ORDER = 12
 """Highest order that is tried."""
-BEYOND = 3
-"""Degrees in the fit beyond that."""
+EXTRA_DEGREES = 3
+"""Additional degrees in the fit."""
 
-_MOST = 600
-"""Settings that decide on s, rho and f; more would only take longer."""
+_MAX_SETTINGS = 600
+"""Largest number of settings used to determine s, rho and f; limits the computing time."""
 _SIZES = 10.0 ** np.arange(-6.0, 1.1, 0.2)
 """Standard deviations of the coefficients of degree `_MIDDLE`, over the largest slope."""
 _MIDDLE = 4
@@ -36,7 +36,7 @@ _DECAYS = 1.4 ** np.arange(-7.0, 1.0)
 _SCATTERS = np.array([1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0, 100.0])
 """f."""
 _LEAST_WEIGHT = 1e-3
-"""Weight, over the largest, below which a position of the grid does not count."""
+"""Weight, relative to the largest, below which a point of the grid is ignored."""
 _ROUNDING = 1e-9
 """Least share of a slope that its own reading does not determine."""
 _ON_LINE = 1e-6
@@ -52,7 +52,7 @@ class Prediction:
     density : ndarray (setting,)
         Log density of each slope under its prediction.
     slope, variance : ndarray (setting,)
-        The predicted k and its variance; noise and scatter of the setting itself are not in it.
+        The predicted k and its variance, without noise and scatter of the setting itself.
     z : ndarray (setting,)
         Deviation over its standard deviation.
     """
@@ -74,11 +74,11 @@ class Surface:
     coefficients : ndarray (term,)
     covariance : ndarray (term, term)
     order : int
-        That was chosen; the degrees go further.
+        Chosen order; `degrees` contains higher ones.
     mirror : bool
         Whether k is even in x2.
     scatter : float
-        f: how many times as much as their noise the settings scatter.
+        f: ratio of the scatter of the settings to their noise.
     prediction : Prediction
         Of every setting by all the others.
     """
@@ -106,18 +106,18 @@ def fit_surface(
     Parameters
     ----------
     x : ndarray (setting, 2)
-        Positions, scaled so that the farthest is at 1.
+        Tilts, scaled so that the largest is 1.
     slope, variance : ndarray (setting,)
         k of each setting and its variance from noise.
     highest : int
         Highest order that the number of settings allows.
     order : int, optional
-        Instead of the one that cross-validation chooses; the degrees then end there.
+        Replaces the order chosen by cross-validation; it is then the highest degree.
     mirror : bool, optional
-        Whether k is even in x2; default: if that predicts no worse, and there are settings on both sides to tell.
+        Whether k is even in x2; default: if that predicts no worse, and there are settings on both sides.
     """
     both_sides = bool((x[:, 1] > _ON_LINE).any() and (x[:, 1] < -_ON_LINE).any())
-    last = HIGHEST + BEYOND if order is None else order
+    last = HIGHEST_ORDER + EXTRA_DEGREES if order is None else order
     problem = _Problem.of(x, slope, variance, degrees_to(last, both_sides if mirror is None else mirror))
     positions, weights = problem.thinned().grid()
     prediction = problem.predict(positions[0])
@@ -128,7 +128,7 @@ def fit_surface(
             positions, weights = problem.thinned().grid()
             prediction = problem.predict(positions[0])
     coefficients, covariance = problem.average(positions, weights)
-    # Nothing says that the prior fits: the covariance is no smaller than the settings that were left out show.
+    # The prior may be wrong: the covariance is no smaller than the errors of the predictions.
     widening = max(1.0, float(np.mean(prediction.z**2)))
     return Surface(
         problem.degrees,
@@ -148,8 +148,8 @@ def _worse(density: Array, best: Array) -> bool:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """One position of the grid: s rho^4 over the largest slope, rho, f."""
+class _GridPoint:
+    """One point of the grid: s rho^4 over the largest slope, rho, f."""
 
     size: float
     decay: float
@@ -158,7 +158,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Terms and slopes over the standard deviations of the slopes."""
+    """Terms and slopes divided by the standard deviations of the slopes."""
 
     Phi: Array
     degrees: NDArray[np.int64]
@@ -171,10 +171,10 @@ class _Problem:
         return cls(terms(x, degrees) / deviation[:, None], degrees, slope / deviation, deviation)
 
     def thinned(self) -> _Problem:
-        """Return the problem with so many settings as are needed to weigh the grid."""
-        if len(self.y) <= _MOST:
+        """Return the problem with at most `_MAX_SETTINGS` settings."""
+        if len(self.y) <= _MAX_SETTINGS:
             return self
-        some = np.linspace(0, len(self.y) - 1, _MOST).astype(int)
+        some = np.linspace(0, len(self.y) - 1, _MAX_SETTINGS).astype(int)
         return _Problem(self.Phi[some], self.degrees, self.y[some], self.deviation[some])
 
     def up_to(self, degree: int) -> _Problem:
@@ -193,11 +193,11 @@ class _Problem:
         return np.maximum(values, 0.0), vectors
 
     def unit(self) -> float:
-        """Return the largest slope, which the sizes of the grid are told in."""
+        """Return the largest slope, the unit of the sizes of the grid."""
         return float(np.max(np.abs(self.y * self.deviation)))
 
-    def grid(self) -> tuple[list[_Place], Array]:
-        """Return the positions that suit, the best first, and their weights, sum 1."""
+    def grid(self) -> tuple[list[_GridPoint], Array]:
+        """Return the points with significant weight, the best first, and their weights, sum 1."""
         sizes, scatters = (part.ravel() for part in np.meshgrid(_SIZES, _SCATTERS))
         square, noise = (sizes * self.unit()) ** 2, scatters**2
         suits = np.empty((len(_DECAYS), len(sizes)))
@@ -210,13 +210,13 @@ class _Problem:
         order = np.argsort(-weights, kind="stable")
         order = order[weights[order] >= _LEAST_WEIGHT]
         positions = [
-            _Place(float(sizes[k % len(sizes)]), float(_DECAYS[k // len(sizes)]), float(scatters[k % len(sizes)]))
+            _GridPoint(float(sizes[k % len(sizes)]), float(_DECAYS[k // len(sizes)]), float(scatters[k % len(sizes)]))
             for k in order
         ]
         return positions, weights[order] / weights[order].sum()
 
-    def average(self, positions: list[_Place], weights: Array) -> tuple[Array, Array]:
-        """Return the mean of the coefficients over positions of the grid, and their covariance."""
+    def average(self, positions: list[_GridPoint], weights: Array) -> tuple[Array, Array]:
+        """Return the mean of the coefficients over points of the grid, and their covariance."""
         means = np.empty((len(positions), len(self.degrees)))
         C = np.zeros((len(self.degrees), len(self.degrees)))
         for decay in {position.decay for position in positions}:
@@ -235,7 +235,7 @@ class _Problem:
         C += off.T @ off
         return mean, (C + C.T) / 2
 
-    def predict(self, position: _Place) -> Prediction:
+    def predict(self, position: _GridPoint) -> Prediction:
         """Return the prediction of each setting by all the others, in closed form."""
         from scipy.linalg import solve_triangular
 
@@ -253,7 +253,7 @@ class _Problem:
             z,
         )
 
-    def choose_order(self, position: _Place, best: Prediction, highest: int) -> int:
+    def choose_order(self, position: _GridPoint, best: Prediction, highest: int) -> int:
         """Return the smallest order that predicts no worse than all degrees."""
         for order in range(highest):
             if not _worse(self.up_to(order).predict(position).density, best.density):
