@@ -97,7 +97,7 @@ def _summary(source: Source) -> list[str]:
         words.append(f"The largest share in the variance of Z {_when(errors)}: {largest[0]}, {largest[1]}.")
     if errors.attrs.get("beams") == "nominal":
         words.append(
-            "Nominal beams were used, not detected ones: the accuracy of the bar's position is limited to that of the drawing."
+            "Nominal beams were used, not detected ones: the position of the bar is only as accurate as the drawing."
         )
     unseen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if not np.isfinite(errors[name].values).any()]
     if unseen:
