@@ -11,16 +11,17 @@ LAYERS = [
     [("compensation", "thermal models")],
     [("testing", "conformance kit for plugins")],
     [("methods", "one folder a method"), ("instruments", "one folder a kind, a device")],
-    [("report", "what chapters are made of")],
+    [("report", "elements of chapters")],
     [("twin", "virtual machines, artefacts, sensors")],
     [("datasets", "schemas, units, provenance, files")],
-    [("kinematics", "poses, twists, chains, fits"), ("plugins", "contracts and registry")],
+    [("plugins", "contracts and registry")],
+    [("kinematics", "poses, twists, chains, fits")],
 ]
 COLOURS = ("#dbe9f6", "#e8eef4")
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(7.6, 6.8), dpi=130)
+    figure, axes = plt.subplots(figsize=(7.6, 7.4), dpi=130)
     height, gap = 0.78, 0.22
     for level, row in enumerate(reversed(LAYERS)):
         width = 8.0 / len(row)

@@ -114,7 +114,7 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     Raises
     ------
     DatasetError
-        Something is there already, the ending is unknown, an attribute cannot be stored, or the disk does not take it
+        The path exists already, the ending is unknown, an attribute cannot be stored, or the disk does not take it
         (nothing is left behind then).
     """
     path = Path(path)
@@ -186,14 +186,14 @@ def _engine_of(path: Path) -> str:
     if head == _HDF5_SIGNATURE:
         return "h5netcdf"
     if not head:
-        raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Its writing was cut off: make it anew")
+        raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Writing was interrupted: create it again")
     if head.startswith(_CLASSIC_SIGNATURE):
         return "scipy"
     if _HDF5_SIGNATURE.startswith(head):
-        raise DatasetError(f"{path}: is truncated; make it anew or fetch it again")
+        raise DatasetError(f"{path}: is truncated; create it again or copy it again")
     raise DatasetError(
-        f"{path}: is no dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log use "
-        "'errormotion import'"
+        f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log "
+        "use 'errormotion import'"
     )
 
 
@@ -215,8 +215,8 @@ def _reading(path: Path) -> Iterator[None]:
         raise DatasetError(f"{path}: cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
         # What h5py, zarr and xarray raise on files that were cut off or are something else.
-        what = "is truncated" if "truncated" in str(error) else "is damaged, or no dataset of ours"
-        raise DatasetError(f"{path}: {what}; make it anew or fetch it again. (The reader says: {error})") from error
+        what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
+        raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
 
 
 @contextmanager
@@ -231,7 +231,7 @@ def reading(path: str | Path) -> Iterator[None]:
         if not any(part in frame.filename for frame in frames for part in _READERS):
             raise
         raise DatasetError(
-            f"{path}: is damaged or was cut off; fetch it again, or measure again. (The reader says: {error})"
+            f"{path}: is damaged or incomplete; copy it again, or measure again. (Reader: {error})"
         ) from error
 
 
@@ -258,7 +258,7 @@ def _reason(error: Exception, missing: str) -> str:
 
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite and (path.exists() or path.is_symlink()):
-        raise DatasetError(f"{path}: is there already; choose another name, or allow overwriting")
+        raise DatasetError(f"{path}: exists already; choose another name, or allow overwriting")
 
 
 def _replace(part: Path, path: Path) -> None:

@@ -30,7 +30,7 @@ class PluginSettings(BaseModel):
 class InstrumentInfo:
     """Description of an instrument.
 
-    ``status`` is honest about what it has met: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
+    ``status`` states how it was verified: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
     ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
     """
 
@@ -123,7 +123,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Identity:
-    """Who answered at an address: goes into the provenance of everything that it measured."""
+    """Identity of the device at an address; recorded in the provenance of everything that it measured."""
 
     manufacturer: str
     model: str
@@ -135,7 +135,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class Samples:
-    """A block of equally spaced samples of one or more channels, as an instrument hands them over.
+    """A block of equally spaced samples of one or more channels, as delivered by an instrument.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Samples:
     rate : float
         Samples per second.
     host_time : float
-        ``time.monotonic()`` when the block had come off the wire, s.
+        ``time.monotonic()`` when the block was received, s.
     dropped : int
         Samples that the device counter shows missing inside this block; they are NaN in ``values``.
     invalid : mapping of str to int
@@ -180,7 +180,7 @@ class Touch:
 
 @dataclass(frozen=True)
 class Contact:
-    """What came of one touch.
+    """Result of one touch.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class Step:
 
 @runtime_checkable
 class Instrument(Protocol):
-    """A driver: one plain class. Nothing touches the wire before ``__enter__`` (or ``open``)."""
+    """A driver: one plain class. No communication before ``__enter__`` (or ``open``)."""
 
     info: ClassVar[InstrumentInfo]
     Settings: ClassVar[type[PluginSettings]]

@@ -55,7 +55,7 @@ def test_a_program_out_of_travel_writes_nothing(run, tmp_path):
         text = (GANTRY.parent / name).read_text().replace('travel.Y = ["-900 mm"', 'travel.Y = ["-620 mm"')
         (tmp_path / name).write_text(text)
     found = run("program", tmp_path / "campaign.toml", "--out", tmp_path / "nc", code=1)
-    assert "would go from Y-633.000" in found.stderr
+    assert "would move from Y-633.000" in found.stderr
     assert not (tmp_path / "nc").exists()
 
 

@@ -101,7 +101,7 @@ def test_a_stalled_channel_is_named(channel: str) -> None:
 
 
 def test_a_channel_that_is_not_there_is_named() -> None:
-    with pytest.raises(InstrumentTimeoutError, match=r"^Channel Y1: .* nothing came"):
+    with pytest.raises(InstrumentTimeoutError, match=r"^Channel Y1: .* received nothing"):
         FiveSensorFrame(settings=with_fault("Y1", "silence", timeout=0.5)).open()
 
 

@@ -488,7 +488,7 @@ def test_one_clock_is_driven_by_one_kind_of_device() -> None:
         controller.run_program(forwards(0, 100))
         stream = device.stream(10)
         next(stream)
-        with pytest.raises(InstrumentError, match="followed by another device"):
+        with pytest.raises(InstrumentError, match="Another device drives the clock"):
             sensor.read()
         next(stream)
         stream.close()

@@ -105,7 +105,7 @@ def test_garbage_is_no_request_and_no_reply(data: bytes) -> None:
 
 
 def test_a_reply_that_is_too_short_for_what_was_asked_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="Expected a reply with 6 bytes of data; 4 came"):
+    with pytest.raises(ProtocolError, match="Expected a reply with 6 bytes of data; found 4"):
         codec.parse_reply(codec.reply(bytes(4))).unpack("3h")
 
 

@@ -229,7 +229,10 @@ def test_a_profiler_that_waits_is_read_by_a_trigger(ramp: SimulatedLJX) -> None:
 
 @pytest.mark.parametrize(
     ("refused", "says"),
-    [(-1, "one by command brought none"), (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this")],
+    [
+        (-1, "a trigger by command had no effect"),
+        (codec.TRIGGER, r"by command was refused: .* 8080 \(not possible in this"),
+    ],
 )
 def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
     ramp: SimulatedLJX, monkeypatch: pytest.MonkeyPatch, refused: int, says: str
@@ -239,7 +242,7 @@ def test_where_no_profile_comes_the_message_says_what_the_profiler_waits_for(
         requests(ramp, monkeypatch, refused=refused)
         with pytest.raises(InstrumentTimeoutError, match=says) as caught:
             profiler.read()
-        assert "waits for its trigger (it has counted 0 triggers, its encoder is at 4711)" in str(caught.value)
+        assert "waits for its trigger (trigger count 0, encoder 4711)" in str(caught.value)
         assert "Move the axis" in str(caught.value)
         assert profiler.program() == 0  # it is not lost
 
@@ -250,7 +253,7 @@ def test_counts_that_cannot_be_had_are_left_out_of_the_message(
     ramp._feed = Waiting(obeys=False)
     with KeyenceLJX(reach(ramp), FAST) as profiler:
         requests(ramp, monkeypatch, refused=codec.GET_COUNTS)
-        with pytest.raises(InstrumentTimeoutError, match="waits for its trigger, and one by command"):
+        with pytest.raises(InstrumentTimeoutError, match="waits for its trigger, and a trigger by command"):
             profiler.read()
 
 
@@ -464,7 +467,7 @@ def test_only_one_notice_ahead_of_the_first_profile_is_taken_as_late() -> None:
     [
         (b"\0\0\0\0" * 8, ProtocolError, "A reply has 28 to"),
         (b"\xff" * 32, ProtocolError, "A reply has 28 to"),
-        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "expected 32 bytes within 0.5 s; 31 came"),
+        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "expected 32 bytes within 0.5 s; received 31"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", ProtocolError, "A reply has 28 to"),
     ],
 )
@@ -493,7 +496,7 @@ def test_a_stream_port_at_which_nobody_is_is_named(ramp: SimulatedLJX) -> None:
     [
         ("sim://cframe/profiler?wire=pty", "network connections only"),
         ("sim://cframe/profiler?artefact=cow", "'artefact=cow': expected one of .*swept"),
-        ("sim://cframe/profiler?fault=fire", "there is no such fault"),
+        ("sim://cframe/profiler?fault=fire", "unknown fault"),
         ("serial:///dev/ttyUSB0", "2 network connections"),
     ],
 )
@@ -509,7 +512,7 @@ def test_leaving_in_the_middle_of_a_stream_ends_every_thread() -> None:
         next(stream)
         assert any(thread.name == "reader-keyence_ljx" for thread in threading.enumerate())
     assert set(threading.enumerate()) == before
-    with pytest.raises(InstrumentError, match="this stream is over"):
+    with pytest.raises(InstrumentError, match="this stream was closed"):
         next(stream)
 
 

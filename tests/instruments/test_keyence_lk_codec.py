@@ -52,7 +52,7 @@ def test_anything_else_is_garbled(text: str) -> None:
 
 
 def test_other_decimals_than_the_display_has_are_an_error_and_no_reading_off_by_ten() -> None:
-    with pytest.raises(ProtocolError, match=r"4 decimals, as the settings state; found '\+001\.234'"):
+    with pytest.raises(ProtocolError, match=r"4 decimals, as in the settings; found '\+001\.234'"):
         codec.parse_value("+001.234", MM4)
 
 
@@ -121,14 +121,14 @@ def test_an_answer_to_something_else_is_a_protocol_error(text: str) -> None:
 @pytest.mark.parametrize(
     ("code", "name"),
     [
-        ("00", "does not know this command"),
-        ("01", "not in this state"),
+        ("00", "unknown command"),
+        ("01", "not possible in this mode"),
         ("20", "wrong length"),
         ("21", "wrong number of parameters"),
-        ("22", "out of its range"),
-        ("88", "time limit"),
+        ("22", "is out of range"),
+        ("88", "timeout"),
         ("99", "another error"),
-        ("47", "in no manual known here"),
+        ("47", "unknown code"),
     ],
 )
 def test_every_error_is_named(code: str, name: str) -> None:
@@ -166,5 +166,5 @@ def test_a_line_of_other_bytes_is_a_protocol_error(line: bytes) -> None:
 def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
     # 6 bytes to query, 15 to answer, 10 bits each: 210 bits a reading
     codec.check_rate(45.0, 9600, CONTROLLERS["LK-G5000"])
-    with pytest.raises(InstrumentError, match=r"6 bytes to query and 15 to answer, x 10 bits \(8N1\) = 10500 bit/s"):
+    with pytest.raises(InstrumentError, match=r"6 bytes of request and 15 of answer, x 10 bits \(8N1\) = 10500 bit/s"):
         codec.check_rate(50.0, 9600, CONTROLLERS["LK-G5000"])

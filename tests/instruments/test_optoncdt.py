@@ -113,8 +113,8 @@ def test_settings_from_a_file_have_units() -> None:
     ("wrong", "message"),
     [
         ({"rate": 20.5e3}, "ILD2300 measures at 1.5, 2.5, 5, 10, 20, 30, 49.14 kHz; found 20.5 kHz"),
-        ({"range": 3e-3}, "made for ranges of 2, 5, 10"),
-        ({"baudrate": 1234}, "speaks at"),
+        ({"range": 3e-3}, "has ranges of 2, 5, 10"),
+        ({"baudrate": 1234}, "has the baud rates"),
         ({"baudrate": 921600}, "= 1200000 bit/s"),
         ({"model": "ILD1420"}, "ILD1420 measures at"),
         ({"nois": 1e-6}, "nois"),
@@ -132,7 +132,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_it_is_opened(addr
 
 
 def test_another_sensor_than_the_settings_say_is_refused() -> None:
-    with pytest.raises(InstrumentError, match=r"model ILD1420; .* answers a 'ILD2300-2'"):
+    with pytest.raises(InstrumentError, match=r"model ILD1420; .* is a 'ILD2300-2'"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(model="ILD1420", range=0.01, rate=4e3)).open()
     with pytest.raises(InstrumentError, match=r"range of 10 mm; .* has 2.00 mm"):
         OptoNCDT("sim://cframe/X1?seed=3", OptoSettings(range=0.01)).open()
@@ -157,7 +157,7 @@ def test_a_beam_that_the_machine_does_not_have_is_refused() -> None:
 
 def test_silence_from_the_start_is_a_timeout_error() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
-    with pytest.raises(InstrumentTimeoutError, match="nothing came"):
+    with pytest.raises(InstrumentTimeoutError, match="received nothing"):
         OptoNCDT("sim://cframe/X1?seed=3&fault=silence", settings).open()
 
 
@@ -233,7 +233,7 @@ def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() ->
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"), [("checksum", "no such thing"), ("fire", "no such fault"), ("silenc", "choose from silence")]
+    ("fault", "message"), [("checksum", "no such fault"), ("fire", "unknown fault"), ("silenc", "choose from silence")]
 )
 def test_a_fault_that_is_not_on_the_menu_is_refused(fault: str, message: str) -> None:
     with pytest.raises(InstrumentError, match=message):

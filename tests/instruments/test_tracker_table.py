@@ -75,7 +75,7 @@ def test_units_are_those_of_the_title(tmp_path: Path, title: str, value: str, me
 
 def test_a_line_that_comes_again_is_refused_unless_settings_say_which_counts(tmp_path: Path) -> None:
     address = write(tmp_path, "S1,1,1500,20,1013,40", "S1,2,1510,20,1013,40", "S1,1,1502,22,1013,40")
-    assert "line 4: station 'S1', target '1': comes again; line 2 has it already" in refusal(address)
+    assert "line 4: station 'S1', target '1': expected one line; line 2 is another one" in refusal(address)
     for repeats, expected in (("last", 1.502), ("mean", 1.501)):
         with TrackerTable(address, TrackerTableSettings(repeats=repeats)) as table:
             assert table.read()[0, 0] == pytest.approx(expected, rel=1e-15)
@@ -100,7 +100,7 @@ def test_millimetres_called_metres_are_found(tmp_path: Path) -> None:
 
 def test_metres_called_millimetres_are_found(tmp_path: Path) -> None:
     address = write(tmp_path, "S1,1,1.5005", "S1,2,2.1", head="station,target,length [mm]")
-    assert "the longest length is 0.0021 m; is its unit right?" in refusal(address)
+    assert "the longest length is 0.0021 m; check its unit" in refusal(address)
     with TrackerTable(address, TrackerTableSettings(least_length=0.0)) as table:
         assert table.read()[0, 0] == pytest.approx(0.0015005, rel=1e-15)
 
@@ -128,7 +128,7 @@ def test_wrong_cells_are_named_with_line_and_column(tmp_path: Path, line: str, w
         ("station,target,length [kg]", "column 'length [kg]': expected a unit such as mm"),
         ("station,target,lenght [mm]", "did you mean 'length'?"),
         ("station,length [mm],pressure [hPa]", "expected a column 'target'"),
-        ("station,distance [mm],length [mm]", "there is a column for the length already"),
+        ("station,distance [mm],length [mm]", "expected one column for the length; found a second one"),
     ],
 )
 def test_wrong_titles_are_named(tmp_path: Path, head: str, words: str) -> None:
@@ -145,8 +145,8 @@ def test_all_mistakes_are_told_at_once(tmp_path: Path) -> None:
     ("lines", "words"),
     [
         ((), "expected lines of measurements"),
-        (("S1,1,,20,1013,40",), "not a single length in it"),
-        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "a second table starts"),
+        (("S1,1,,20,1013,40",), "expected lengths; found none"),
+        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second one"),
     ],
 )
 def test_tables_without_lengths_or_in_two_parts_are_refused(tmp_path: Path, lines: tuple[str, ...], words: str) -> None:

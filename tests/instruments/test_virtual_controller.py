@@ -90,12 +90,12 @@ def test_the_identity_says_simulated() -> None:
 @pytest.mark.parametrize(
     ("order", "message"),
     [
-        (lambda c: c.mount("hammer"), "'bar' and a 'sphere'"),
+        (lambda c: c.mount("hammer"), "Expected the tool 'bar', 'sphere' or 'probe'"),
         (lambda c: c.start([Event(0.0, spindle_speed=1e6)]), "refuses: The spindle turns at 0 to"),
-        (lambda c: c.elapse(-1.0), "forwards only"),
+        (lambda c: c.elapse(-1.0), "Expected a time of at least 0 s"),
         (lambda c: c.run_steps((0, 0, 0), (0, 1, 0), 20e-6, 5), "mount it first"),
-        (lambda c: c._call("dance"), "no such operation: dance"),
-        (lambda c: c._call("mount"), "no request"),
+        (lambda c: c._call("dance"), "unknown operation: dance"),
+        (lambda c: c._call("mount"), "expected a request in JSON"),
     ],
 )
 def test_what_the_machine_cannot_do_is_refused_in_words(order: object, message: str) -> None:

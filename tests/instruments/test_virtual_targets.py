@@ -45,7 +45,7 @@ def test_a_move_takes_the_time_of_its_way() -> None:
         ([0.31, 0.0, 0.0], None, "X travels from -0.305 to 0.305 m; found 0.31"),
         ([0.0, 0.0, -0.01], None, "Z travels from 0 to 0.46 m"),
         ([0.0, 0.0], None, "Expected a position X, Y, Z in m"),
-        ([0.1, 0.0, 0.0], 0.0, "feed is above 0"),
+        ([0.1, 0.0, 0.0], 0.0, "Expected a feed above 0"),
         ([0.1, 0.0, 0.0], 1.0, "at most 0.333333 m/s; found 1"),
     ],
 )
@@ -73,10 +73,10 @@ def test_the_state_names_the_target_only_while_there_is_one() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("cube",), "targets are a 'plane', a 'bar'"),
+        (("cube",), "Expected the target 'plane', 'bar' or None"),
         (("plane",), "inclination and rotation"),
         (("plane", 0.1), "inclination and rotation"),
-        (("bar", 0.1, 0.2), "for nothing else"),
+        (("bar", 0.1, 0.2), "for a plane only"),
         (("plane", 1.2, 0.0), "inclination from 0 to 60 deg; found 68.7"),
     ],
 )

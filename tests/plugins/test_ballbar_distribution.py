@@ -187,11 +187,13 @@ def test_a_campaign_is_planned(installed):
     assert "G(b)" in planned["notes"][0]
 
 
+@pytest.mark.slow
 def test_it_passes_the_kit(installed):
     answer = installed("plugins", "check", "ballbar")
     assert "ballbar: passes" in answer
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass_where_it_lies():
     """Without the kit, which the command above runs."""
     arguments = ["-q", "-c", "pyproject.toml", "--rootdir", ".", "-p", "no:cacheprovider", "-k", "not TestBallbar"]

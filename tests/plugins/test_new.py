@@ -13,6 +13,7 @@ from errormotion.cli.commands.new import id_of
 from errormotion.errors import PluginError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "name"), [("instrument", "LX9 gauge"), ("method", "dial drift")])
 def test_the_tests_of_a_new_plugin_pass(what: str, name: str, tmp_path: Path) -> None:
     folder = tmp_path / "new"

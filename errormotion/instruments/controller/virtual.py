@@ -97,7 +97,7 @@ class VirtualController(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines."""
+        """Return the subject of the conformance kit."""
         # Faults of the machine show when it moves, not when it is read.
         harmless = ("split", "alarm", "estop", "no_trip", "tripped")
         return InstrumentSubject(cls, "sim://cframe/controller", harmless=harmless)
@@ -122,7 +122,7 @@ class VirtualController(Driver):
         return self.state()
 
     def state(self) -> dict[str, Any]:
-        """Return what the control shows.
+        """Return the state of the control.
 
         As every controller: ``time`` (s since the start of the schedule), ``position`` and ``commanded_position`` (X,
         Y, Z, m), ``spindle_speed`` (1/min, as it turns), ``spindle_load`` (share of that at top speed), ``feed`` (m/s,
@@ -130,7 +130,8 @@ class VirtualController(Driver):
         runs), ``program`` (its title), ``running`` (whether an NC program waits or runs), ``homed``, ``enabled``,
         ``estop``, ``alarms`` (list of str).
 
-        And what others do not show: ``commanded_spindle_speed`` (1/min), ``compensation`` (axis to on or off),
+
+        Only of this controller: ``commanded_spindle_speed`` (1/min), ``compensation`` (axis to on or off),
         ``tool``, ``stepping`` (whether a step program waits or runs); ``target`` where one is set (``kind``, and of a
         plane ``inclination`` and ``rotation``, rad).
         """
@@ -139,7 +140,7 @@ class VirtualController(Driver):
     def mount(self, tool: str) -> None:
         """Put ``"bar"``, ``"sphere"`` or ``"probe"`` into the spindle.
 
-        The probe comes by itself when the machine probes, and goes, for the bar, when the spindle is to turn.
+        The probe is mounted automatically for a probing move, and replaced by the bar before the spindle turns.
         """
         self._call("mount", tool=tool)
 
@@ -152,12 +153,12 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            A stream is running, or the machine cannot do that.
+            A stream is running, or the machine cannot follow the schedule.
         """
         self._call("start", schedule=[event_fields(event) for event in schedule])
 
     def elapse(self, seconds: float) -> None:
-        """Let simulated time pass without samples: go on with a schedule where an earlier session stopped."""
+        """Let simulated time pass without samples."""
         self._call("elapse", seconds=float(seconds))
 
     def run_steps(
@@ -171,7 +172,7 @@ class VirtualController(Driver):
     ) -> dict[str, Any]:
         """Step the mounted sphere along a line; returns at once.
 
-        The motion starts some time after the next sample; that time is short but not known. The sphere rests
+        The motion starts a short and unknown time after the next sample. The sphere rests
         ``dwell`` s at each of ``count`` positions and travels ``travel`` s between two.
 
         Parameters
@@ -213,8 +214,8 @@ class VirtualController(Driver):
         ----------
         text : str
             ISO 6983: G0 and G1 with X, Y, Z (mm) and F (mm/min), G4 P (s), G21, G90, G94, M3 S (1/min) and M5, M30 or
-            M2, and comments. Besides, G31, a move that ends where the probe trips, and DPRNT[...], which prints where
-            that was (#5061 to #5063, mm).
+            M2, and comments; further G31, a move that ends where the probe trips, and DPRNT[...], which prints
+            that position (#5061 to #5063, mm).
 
         Returns
         -------
@@ -224,7 +225,7 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            Another program runs; a word is not understood or a position out of travel: nothing moves, and the message
+            Another program runs, a word is unknown or a position out of travel: nothing moves, and the message
             names the line.
         """
         return dict(self._call("run_program", text=str(text)))
@@ -232,7 +233,7 @@ class VirtualController(Driver):
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
         """Move the axes in a straight line.
 
-        Simulated time passes by as much as the move takes; while sensors stream it passes with their samples, and
+        Simulated time passes by the duration of the move; while sensors stream it passes with their samples, and
         ``state()["running"]`` states when the move is over.
 
         Parameters
@@ -240,7 +241,7 @@ class VirtualController(Driver):
         position : (3,)
             X, Y, Z, m.
         feed : float, optional
-            m/s; as fast as the machine can where not given.
+            m/s; default: rapid.
 
         Returns
         -------
@@ -250,10 +251,10 @@ class VirtualController(Driver):
         Raises
         ------
         InstrumentError
-            The position is out of travel, or something else moves: nothing moves.
+            The position is out of travel, or another motion runs: nothing moves.
         """
-        place = [float(x) for x in position]
-        return dict(self._call("move_to", position=place, feed=None if feed is None else float(feed)))
+        goal = [float(x) for x in position]
+        return dict(self._call("move_to", position=goal, feed=None if feed is None else float(feed)))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move the touch probe in a straight line until it trips; the machine then rests there, or at the target.
@@ -302,30 +303,30 @@ class VirtualController(Driver):
         self._call("reset")
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
-        """Put a target before the point sensors, which ride on the stage while there is one.
+        """Put a target in front of the point sensors, which are then mounted on the stage.
 
         Parameters
         ----------
         kind : {"plane", "bar"} or None
-            A face of a sine gauge on a turntable, a check bar, or nothing: then they are those of the frame again.
+            A face of a sine gauge on a turntable, a check bar, or none: the sensors are then those of the frame.
         inclination, rotation : float, optional
             Of the gauge and its turntable, rad; for a plane.
 
         Raises
         ------
         InstrumentError
-            A sensor streams, or there is no such target.
+            A sensor streams, or the target is unknown.
         """
         angles = {"inclination": inclination, "rotation": rotation}
         self._call("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
     def set_station(self, position: Sequence[float]) -> None:
-        """Have the laser tracker beside the machine carried to a position in its coordinates, m, to some millimetres.
+        """Carry the laser tracker to a position in machine coordinates, m, to within some millimetres.
 
         Raises
         ------
         InstrumentError
-            No tracker is there, or something streams.
+            No tracker is open, or a sensor streams.
         """
         self._call("set_station", position=[float(x) for x in position])
 

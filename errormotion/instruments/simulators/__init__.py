@@ -1,11 +1,11 @@
-"""Wire simulators: devices that speak the real protocols over real sockets and ptys, and query the twin for the truth.
+"""Wire simulators: devices with the real protocols over real sockets and ptys, which read the truth from the twin.
 
 All ``sim://`` addresses with one machine name and seed share one `VirtualWorld`, that is one machine and one clock. The
 name is ``cframe``, ``gantry``, or ``machine`` for the machine that the bench file describes.
 ``world("cframe", seed=3)`` returns it, so that a test can compare with the truth.
 
-Parameters of every address: ``seed`` (0), ``pace`` (simulated seconds per second; default as fast as the readers
-take it), ``warm`` (1; 0 = the sensors were switched on just now), ``wire`` (``tcp`` or ``pty``), and the fault menu of
+Parameters of every address: ``seed`` (0), ``pace`` (simulated seconds per second; default: as fast as the readers
+read), ``warm`` (1; 0 = the sensors were switched on just now), ``wire`` (``tcp`` or ``pty``), and the fault menu of
 `simulators.faults`.
 """
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def world(machine: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
-    """Return the world of a machine and seed; made when it is not there yet."""
+    """Return the world of a machine and seed, which is created at the first call."""
     from errormotion.instruments.simulators.virtual_world.world import world as find
 
     return find(machine, seed, warm=warm)

@@ -1,4 +1,4 @@
-"""What the simulated devices share: a position in a world, a wire, a fault, and answering by lines."""
+"""Base of simulated devices: world, connection, fault, and answers by line."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class SimulatedDevice:
     address : Address
         ``sim://machine/device?seed=...``
     line_end : bytes
-        What ends a request.
+        End of a request.
     default_name : str
-        Device where the address names none.
+        Name of the device where the address has none.
     every : int
         Default period of faults.
 
     Attributes
     ----------
     url : str
-        Where its wire ends.
+        Address of the device for the driver.
     """
 
     def __init__(self, address: Address, *, line_end: bytes, default_name: str, every: int = 1) -> None:
@@ -55,10 +55,10 @@ class SimulatedDevice:
         self._server.start()
 
     faults: tuple[str, ...] = ()
-    """What of the fault menu the device offers."""
+    """Faults that the device offers."""
 
     drops_answers = True
-    """Whether ``drop`` and ``disconnect`` count answers; else they are about samples."""
+    """Whether ``drop`` and ``disconnect`` count answers; else samples."""
 
     def close(self) -> None:
         """End the device; with the last one of its world the world ends."""
@@ -66,14 +66,14 @@ class SimulatedDevice:
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
-        """Take note of how many samples of the running stream its reader has had."""
+        """Record the number of samples of the running stream that the reader has received."""
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request, given without its line end."""
         raise NotImplementedError
 
     def reply(self, data: bytes) -> None:
-        """Send an answer, with whatever fault is due."""
+        """Send an answer, with the fault that is due."""
         number, fault = self._answers, self.fault
         self._answers += 1
         if (fault.kind == "silence" and self._silent()) or (fault.hits("drop", number) and self.drops_answers):

@@ -1,18 +1,18 @@
-"""The fault menu: what can go wrong at a device, chosen by parameters of its address.
+"""Faults of simulated devices, selected by parameters of the address.
 
 ``fault=`` one of
 
-* ``silence``: it sends nothing any more
-* ``split``: everything comes in pieces of a few bytes
-* ``garbage``: stray bytes between the right ones
+* ``silence``: the device sends nothing
+* ``split``: all data arrive in pieces of a few bytes
+* ``garbage``: stray bytes between valid ones
 * ``checksum``: wrong checksums, where the protocol has one
 * ``out_of_range``: nothing to measure
 * ``drop``: samples, or answers, are missing
 * ``disconnect``: the connection breaks; it can be opened again
 
-``fault_at`` is the sample (of a stream) or answer (of others) from which on; default 0. A silence without ``fault_at``
-starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for`` how many
-samples ``out_of_range`` lasts (default: without end).
+``fault_at`` is the first sample (of a stream) or answer (of others) with the fault; default 0. ``silence`` without
+``fault_at`` starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for``
+the number of samples that ``out_of_range`` lasts (default: no limit).
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ FAULTS = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "di
 
 @dataclass
 class Fault:
-    """One entry of the menu, and where it starts.
+    """One fault and its start.
 
     Attributes
     ----------
     kind : str
         Empty: none.
     at : int
-        Sample or answer from which on.
+        First sample or answer with the fault.
     every : int
         Period.
     length : int
-        Samples; 0 = without end.
+        Number of samples; 0 = no limit.
     from_the_start : bool
-        Whether ``fault_at`` was left out.
+        Whether ``fault_at`` is not given.
     """
 
     kind: str = ""
@@ -59,18 +59,18 @@ class Fault:
         return (number - self.at) % self.every == 0
 
     def pieces(self, data: bytes) -> Iterator[bytes]:
-        """Yield what goes out at once: all, or with ``split`` 1 to 7 bytes at first, then a good many, but never whole.
+        """Yield the pieces that are sent: all data, or with ``split`` 1 to 7 bytes at first, later 1009 bytes.
 
-        A thousand and nine is a prime: no frame's length divides it.
+        1009 is a prime, so that pieces do not coincide with frames.
         """
         if self.kind != "split":
             yield data
             return
-        place = count = 0
-        while place < len(data):
+        start = count = 0
+        while start < len(data):
             size = count % 7 + 1 if count < 50 else 1009
-            yield data[place : place + size]
-            place, count = place + size, count + 1
+            yield data[start : start + size]
+            start, count = start + size, count + 1
 
 
 def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -> Fault:
@@ -79,13 +79,13 @@ def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -
     Raises
     ------
     InstrumentError
-        Not on the menu, or not for this device.
+        Unknown, or not offered by this device.
     """
     kind = address.params.get("fault", "")
     if not kind:
         return Fault()
     if kind not in offered:
-        why = "this device has no such thing" if kind in FAULTS else "there is no such fault"
+        why = "this device has no such fault" if kind in FAULTS else "unknown fault"
         raise InstrumentError(f"'fault={kind}' in '{address.url}': {why}; choose from {', '.join(offered)}")
     return Fault(
         kind,

@@ -122,6 +122,7 @@ def test_step_is_measured_with_its_covariance():
     assert 6 / 4 < np.mean(score) < 8
 
 
+@pytest.mark.slow
 def test_clean_campaigns_stay_quiet():
     cycles, places = CYCLES[[0, 3, 6, 8]], PLACES[:6]
     alarms = sum(bool(moved(cycles, places, *campaign(seed, cycles, places)[:2])) for seed in range(200))

@@ -63,7 +63,7 @@ def test_readings_lost_here_and_there_count_as_equations():
 @pytest.mark.parametrize("many", [60, 1000])
 def test_stations_in_one_plane_leave_two_freedoms_loose_whatever_the_targets(many):
     u = targets(many)
-    with pytest.raises(MethodError, match=r"found 2 freedoms loose .* the stations stand in one plane"):
+    with pytest.raises(MethodError, match=r"found 2 undetermined freedoms .* the stations stand in one plane"):
         solve(displacements(u, FLAT), u, FLAT, noise=1e-6)
     with pytest.raises(MethodError, match="the stations stand in one plane"):
         bound(u, FLAT)
@@ -89,13 +89,13 @@ def test_four_stations_at_one_place_are_called_so(noise):
 def test_stations_nearly_in_one_plane_are_refused_in_words(height):
     # Right-angled and doubled places, too: the information is singular to all its digits, or a little better.
     u, station = targets(), np.add(FLAT, np.outer([0, 0, 0, height], [0, 0, 1]))
-    with pytest.raises(MethodError, match=r"2 freedoms loose .* the stations stand in one plane"):
+    with pytest.raises(MethodError, match=r"2 undetermined freedoms .* the stations stand in one plane"):
         bound(u, station)
 
 
 @pytest.mark.parametrize("spread", [[1, 0, 0], [1, 1e-9, 1e-9], [0, 0, 0], [1e-12, 1e-12, 1e-12]])
 def test_a_bound_of_targets_on_a_line_or_at_a_point_is_refused_in_words(spread):
-    with pytest.raises(MethodError, match="freedoms loose"):
+    with pytest.raises(MethodError, match="undetermined freedoms"):
         bound(targets() * spread, GOOD)
 
 
@@ -103,7 +103,7 @@ def test_a_target_at_a_station_and_noise_beyond_numbers_are_refused_in_words():
     u = targets()
     with pytest.raises(MethodError, match="every target away from every station"):
         bound(np.vstack([u, GOOD[:1]]), GOOD)
-    with pytest.raises(MethodError, match="a weight beyond all numbers"), np.errstate(over="ignore"):
+    with pytest.raises(MethodError, match="a weight that is not finite"), np.errstate(over="ignore"):
         bound(u, GOOD, noise=1e-200)
     with pytest.raises(MethodError, match="found NaN or infinite ones"):
         bound(u, np.where(GOOD[0, 0] == GOOD, np.nan, GOOD))
@@ -150,7 +150,7 @@ def test_the_loose_freedom_is_named():
     seen = np.ones((5, 60), dtype=bool)
     seen[4, 4:] = False
     u[:4] = u[0] + 1e-4 * np.arange(4)[:, None] * [1.0, 0.3, -0.4]
-    with pytest.raises(MethodError, match=r"loose \(.*\): station 5 "):
+    with pytest.raises(MethodError, match=r"undetermined freedoms \(.*\): station 5 "):
         bound(u, station, seen=seen)
 
 

@@ -47,6 +47,7 @@ def compile_always(monkeypatch):
         monkeypatch.setattr(module, "COMPILED_FROM", 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "further"), [(4, 0), (4, 1), (5, 0), (5, 2)])
 def test_both_loops_give_the_same_result_within_a_billionth_of_its_uncertainty(monkeypatch, n, further):
     d, u = network(200, n)
@@ -80,6 +81,7 @@ def test_both_loops_give_the_same_result_within_a_billionth_of_its_uncertainty(m
         np.testing.assert_allclose(one, other, atol=1e-6 * 1e-6)
 
 
+@pytest.mark.slow
 def test_a_large_network_has_the_same_bits_on_any_number_of_threads():
     d, u = network(25_000, 4)
     threads, found = numba.get_num_threads(), []
@@ -93,6 +95,7 @@ def test_a_large_network_has_the_same_bits_on_any_number_of_threads():
         assert np.array_equal(getattr(found[0], name), getattr(found[-1], name), equal_nan=True), name
 
 
+@pytest.mark.slow
 def test_the_compiled_elimination_of_four_stations_is_the_general_one(monkeypatch):
     # A further parameter that is held at 0 makes the general elimination do the work.
     compile_always(monkeypatch)

@@ -1,15 +1,15 @@
 #!/usr/bin/python3
 """Connects LinuxCNC with other programs: JSON lines on a port of this computer.
 
-LinuxCNC's own Python module works only in the Python of the system, beside LinuxCNC. So this file runs there, as the
-``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs nothing but that Python. A request is
+LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC. This file therefore runs there, as the
+``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. A request is
 ``{"id": 1, "op": "move_to", "position": [0.1, 0, 0]}``, its answer ``{"id": 1, "ok": true, "result": ...}`` or
-``{"id": 1, "ok": false, "error": "..."}``. While an order lasts, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
+``{"id": 1, "ok": false, "error": "..."}``. While an order runs, ``{"id": 1, "beat": 7, "time": 3.2}`` is sent five
 times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
 what is unknown is null. Positions are those of the machine (G53), without any offset of work or tool.
 
-Several clients may be there. One order at a time moves the machine. What a client has started ends with its connection:
-if that breaks, or the client dies, the bridge has LinuxCNC abort. Nothing that comes in can end the bridge.
+Several clients can be connected. One order at a time moves the machine. An order or program ends with the connection of
+its client: if that is lost, the bridge aborts the motion. No request can end the bridge.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from pathlib import Path
 from typing import Any
 
 PORT = 5007
-POLL_INTERVAL = 0.01  # s between two looks at an order
+POLL_INTERVAL = 0.01  # s between two checks of an order
 BEAT_INTERVAL = 0.2  # s
-ACCEPT_TIMEOUT = 5.0  # s that LinuxCNC may take to accept an order
-START_TIMEOUT = 30.0  # s
-REST_TIMEOUT = 0.5  # s that a machine without orders may seem to move
-CHANGE_TIMEOUT = 1.0  # s that a change of state or mode may take
-TEXT_TIMEOUT = 0.3  # s that the text of an error may lag behind the error
-POSITION_TOLERANCE = 1e-6  # m: an order that ends closer than this has reached its goal
-MAX_REQUEST_BYTES = 1 << 24  # bytes of a request
-MAX_UNREAD_BYTES = 1 << 20  # bytes of answers
+ACCEPT_TIMEOUT = 5.0  # s for LinuxCNC to accept an order
+START_TIMEOUT = 30.0  # s for LinuxCNC to start
+REST_TIMEOUT = 0.5  # s for a machine without orders to come to rest
+CHANGE_TIMEOUT = 1.0  # s for a change of state or mode
+TEXT_TIMEOUT = 0.3  # s for the text of an error to arrive
+POSITION_TOLERANCE = 1e-6  # m between goal and final position
+MAX_REQUEST_BYTES = 1 << 24  # of one line
+MAX_UNREAD_BYTES = 1 << 20  # of answers to one client
 AXES = "XYZ"
-MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order must put back
+MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order restores
 ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
 
 
 class RefusedError(Exception):
-    """An order that LinuxCNC, or the bridge, does not carry out."""
+    """LinuxCNC or the bridge refuses an order."""
 
 
 class Client:
@@ -58,7 +58,7 @@ class Client:
         self.tasks: set[asyncio.Task[None]] = set()
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send a line; to a client that is gone it goes nowhere, and one that never reads is hung up on."""
+        """Send a line; ignored for a lost client. A client that does not read is disconnected."""
         if self.gone or self.writer.is_closing():
             return
         self.writer.write(json.dumps(message).encode() + b"\n")
@@ -67,7 +67,7 @@ class Client:
 
 
 class Job:
-    """What moves the machine now, who ordered it, and why it has to end early."""
+    """The running order, its client, and the reason of an abort."""
 
     def __init__(self, client: Client, what: str) -> None:
         self.client = client
@@ -76,7 +76,7 @@ class Job:
 
 
 class Bridge:
-    """LinuxCNC, as requests see it.
+    """Operations of LinuxCNC by request.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Bridge:
         self._work: dict[Any, Callable[..., Any]] = {each.__name__: each for each in (*quick, *waits, *orders)}
 
     async def await_linuxcnc(self) -> None:
-        """Wait until LinuxCNC has started, for a while: until then its state means nothing."""
+        """Wait until LinuxCNC has started or START_TIMEOUT has passed; until then its state is invalid."""
         until = time.monotonic() + START_TIMEOUT
         while not self.stat.linear_units > 0 and time.monotonic() < until:
             await asyncio.sleep(POLL_INTERVAL)
@@ -118,14 +118,14 @@ class Bridge:
     # ------------------------------------------------------------------ requests
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer one client until it hangs up."""
+        """Answer one client until it disconnects."""
         client = Client(writer)
         self.clients.add(client)
         try:
             while line := await reader.readline():
                 await self._take(client, line)
         except ValueError:
-            client.send(self._failure(None, f"a request of more than {MAX_REQUEST_BYTES} bytes"))
+            client.send(self._failure(None, f"expected a request of at most {MAX_REQUEST_BYTES} bytes"))
         except OSError:
             pass
         finally:
@@ -141,10 +141,10 @@ class Bridge:
             number, op = request.pop("id"), request.pop("op")
             work = self._work.get(op)
         except Exception as error:  # noqa: BLE001 - a request must not end the bridge
-            client.send(self._failure(number, f"this is no request: {error!r}"))
+            client.send(self._failure(number, f"expected a request in JSON: {error!r}"))
             return
         if work is None:
-            client.send(self._failure(number, f"no such operation: {op}"))
+            client.send(self._failure(number, f"unknown operation: {op}"))
         elif op in self._quick:
             client.send(await self._answer(number, partial(work, **request)))
         elif op in self._waits:
@@ -164,7 +164,7 @@ class Bridge:
         self.alarms.clear()
         answer = await self._with_beats(client, number, self._answer(number, work))
         if not answer["ok"]:
-            self._calm()
+            self._abort_motion()
         if self.program is None:
             await self._rest()
         self.job = None  # before the answer, which the next order may follow at once
@@ -207,7 +207,7 @@ class Bridge:
         return time.monotonic() - self._began
 
     def _look(self) -> None:
-        """Renew the state and take the texts of errors."""
+        """Read the state and the texts of errors."""
         self.stat.poll()
         while (message := self.errors.poll()) is not None:
             kind, text = message
@@ -267,7 +267,7 @@ class Bridge:
         }
 
     def _spindle_speed(self) -> float:
-        """Return the speed that was measured, where something measures it, else the commanded one; 1/min."""
+        """Return the measured speed where HAL has an encoder, else the commanded one; 1/min."""
         pin = "spindle.0.speed-in"
         with contextlib.suppress(Exception):
             if self.hal.pin_has_writer(pin):
@@ -299,12 +299,12 @@ class Bridge:
             raise RefusedError(f"LinuxCNC does not go into e-stop{await self._texts()}")
 
     async def reset(self) -> None:
-        """Release the e-stop and forget the alarms; the machine stays off."""
+        """Release the e-stop and clear the alarms; the machine stays off."""
         self._look()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             self.command.state(self.cnc.STATE_ESTOP_RESET)
             if not await self._becomes(lambda: self.stat.task_state != self.cnc.STATE_ESTOP):
-                raise RefusedError(f"the e-stop stays: is a button pressed?{await self._texts()}")
+                raise RefusedError(f"the e-stop cannot be released; check the buttons{await self._texts()}")
         self.alarms.clear()
 
     async def stop(self, spindle: bool = False) -> None:
@@ -326,16 +326,16 @@ class Bridge:
             raise RefusedError(f"the machine stays off{await self._texts()}")
 
     async def home(self) -> None:
-        """Home all joints; return when they are."""
+        """Home all joints; return when all are homed."""
         await self._demand(homed=False)
         await self._mode(self.cnc.MODE_MANUAL)
         self.command.teleop_enable(0)
         await self._settle("joint mode")
-        await self._ended(self.job)  # it may have been broken off already
+        await self._ended(self.job)  # it may have been aborted already
         self.command.home(-1)
         await self._settle("homing")
         while not (self._homed() and self._idle()):
-            await self._go_on()
+            await self._poll()
             homing = any(joint["homing"] for joint in self.stat.joint[: self.stat.joints])
             if not homing and not self._homed() and (self.alarms or self.stat.state == self.cnc.RCS_ERROR):
                 raise RefusedError(f"homing failed{await self._texts()}")
@@ -386,7 +386,7 @@ class Bridge:
         await self._mode(self.cnc.MODE_AUTO)
         self.command.program_open(str(file))
         await self._settle("opening the program")
-        await self._ended(self.job)  # it may have been broken off already
+        await self._ended(self.job)  # it may have been aborted already
         self.command.auto(self.cnc.AUTO_RUN, 0)
         await self._settle("starting the program", running=True)
         assert self.job is not None
@@ -429,10 +429,10 @@ class Bridge:
             await asyncio.sleep(min(left, 0.05))
 
     async def set_pins(self, pins: dict[str, float]) -> None:
-        """Set HAL pins, those that the bridge was started for."""
+        """Set HAL pins whose names have the prefix `pins`."""
         for name, value in pins.items():
             if not name.startswith(self.pins):
-                raise RefusedError(f"no client may set the pin {name}")
+                raise RefusedError(f"the pin {name} is not among those that clients may set")
             self.hal.set_p(name, repr(float(value)))
 
     # ------------------------------------------------------------------ steps of orders
@@ -448,7 +448,7 @@ class Bridge:
         if homed and not self._homed():
             raise RefusedError("the machine is not homed; home it first")
         if not self._idle():
-            raise RefusedError("the machine is busy: it moves, and not by an order through this bridge")
+            raise RefusedError("the machine is busy with a motion that this bridge has not ordered")
 
     def _goal(self, position: Any) -> list[float]:
         if not isinstance(position, list) or len(position) != 3:
@@ -476,38 +476,38 @@ class Bridge:
                 raise RefusedError(f"LinuxCNC does not change its mode{await self._texts()}")
 
     async def _mdi(self, line: str) -> None:
-        """Have one line carried out to its end in mm and mm/min, and the modes be as before."""
+        """Execute one line in mm and mm/min, then restore the modes."""
         await self._mode(self.cnc.MODE_MDI)
         before = [word for code, word in MODAL_CODES.items() if code in self.stat.gcodes]
-        if before:  # on a line of its own: a feed beside it would be read in the units before
+        if before:  # on a separate line: a feed on the same line would be read in the previous units
             await self._line(ORDER_MODES)
         await self._line(line)
         if before and self.stat.state != self.cnc.RCS_ERROR:
             await self._line(" ".join(before))
 
     async def _line(self, line: str) -> None:
-        await self._ended(self.job)  # it may have been broken off already
+        await self._ended(self.job)  # it may have been aborted already
         self.command.mdi(line)
         while not await self._ended(self.job):
             await asyncio.sleep(POLL_INTERVAL)
 
     async def _ended(self, job: Job | None) -> bool:
-        """Whether LinuxCNC has done the last order; RefusedError where it was kept from it."""
+        """Whether LinuxCNC has finished the last order; RefusedError where it was aborted."""
         self._look()
         if job is not None and job.ended_by:
-            raise RefusedError(f"{job.what} was broken off: {job.ended_by}")
+            raise RefusedError(f"{job.what} was aborted: {job.ended_by}")
         if self.stat.task_state != self.cnc.STATE_ON:
             what = "e-stop" if self.stat.task_state == self.cnc.STATE_ESTOP else "the machine was switched off"
-            raise RefusedError(f"{job.what if job else 'order'} was broken off: {what}{await self._texts()}")
+            raise RefusedError(f"{job.what if job else 'order'} was aborted: {what}{await self._texts()}")
         taken = self.stat.echo_serial_number >= self.command.serial and self.stat.state != self.cnc.RCS_EXEC
         return taken and self._idle()
 
-    async def _go_on(self) -> None:
+    async def _poll(self) -> None:
         await asyncio.sleep(POLL_INTERVAL)
         await self._ended(self.job)
 
     async def _settle(self, what: str, *, running: bool = False) -> None:
-        """Wait until LinuxCNC has taken an order, and carried it out unless it is one that runs on."""
+        """Wait until LinuxCNC has accepted an order and, unless ``running``, carried it out."""
         until = time.monotonic() + ACCEPT_TIMEOUT
         while True:
             self._look()
@@ -515,29 +515,29 @@ class Bridge:
             if self.stat.echo_serial_number >= self.command.serial and done:
                 return
             if time.monotonic() > until:
-                self.command.abort()  # what is not taken now must not be carried out later
+                self.command.abort()  # an order that is not accepted now must not be carried out later
                 raise RefusedError(f"LinuxCNC does not respond: {what} took more than {ACCEPT_TIMEOUT:g} s")
             await asyncio.sleep(POLL_INTERVAL / 2)
 
-    def _calm(self) -> None:
-        """After an order that failed, whatever the reason, nothing moves on."""
+    def _abort_motion(self) -> None:
+        """Abort all motion after a failed order."""
         with contextlib.suppress(Exception):
             self._look()
             if self._idle():
                 return
-        with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
+        with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
             self.command.abort()
 
     async def _rest(self, limit: float = ACCEPT_TIMEOUT) -> None:
-        """Wait until nothing moves, as it soon does."""
+        """Wait until nothing moves, at most ``limit`` s."""
         until = time.monotonic() + limit
-        with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
+        with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
             while not self._idle() and time.monotonic() < until:
                 await asyncio.sleep(POLL_INTERVAL)
                 self._look()
 
     async def _becomes(self, condition: Callable[[], bool]) -> bool:
-        """Wait until something is so, for a while; whether it is."""
+        """Wait for a condition, at most CHANGE_TIMEOUT; return whether it holds."""
         until = time.monotonic() + CHANGE_TIMEOUT
         while True:
             self._look()
@@ -549,10 +549,10 @@ class Bridge:
         place = self._metres(self.stat.position)
         if math.dist(goal, place) > POSITION_TOLERANCE:
             found = ", ".join(f"{1e3 * x:.4f}" for x in place)
-            raise RefusedError(f"the machine has stopped at {found} mm before its goal{await self._texts()}")
+            raise RefusedError(f"the machine has stopped before its goal, at {found} mm{await self._texts()}")
 
     async def _texts(self) -> str:
-        """Return what LinuxCNC states of an error, to be appended."""
+        """Return the error texts of LinuxCNC, to be appended to a message."""
         until = time.monotonic() + TEXT_TIMEOUT
         while not self.alarms and time.monotonic() < until:
             await asyncio.sleep(POLL_INTERVAL)
@@ -560,12 +560,12 @@ class Bridge:
         return f": {'; '.join(self.alarms)}" if self.alarms else ""
 
     def _end_jobs(self, why: str, client: Client | None, *, abort: bool = True) -> None:
-        """End what runs, all or that of one client."""
+        """Abort order and program, of all clients or of one."""
         ended = [job for job in (self.job, self.program) if job and client in (None, job.client)]
         for job in ended:
             job.ended_by = job.ended_by or why
         if abort and (ended or client is None):
-            with contextlib.suppress(Exception):  # of a LinuxCNC that is gone nothing moves
+            with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
                 self.command.abort()
 
 
@@ -576,7 +576,7 @@ def _number(value: Any, what: str, least: float = -math.inf) -> float:
 
 
 def _speed(feed: Any, word: str = "G1") -> str:
-    """Return the words of a feed in m/s; of a rapid move where there is none."""
+    """Return the words of a feed in m/s; of a rapid move without a feed."""
     if feed is None and word == "G1":
         return "G0"
     if (speed := _number(feed, "a feed in m/s")) <= 0:
@@ -589,7 +589,7 @@ def _axis_words(place: list[float]) -> str:
 
 
 async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> None:
-    """Serve until this process is ended, or no client has been connected for a while."""
+    """Serve until this process is ended, or no client has been connected for ``idle`` s."""
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -602,22 +602,24 @@ async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> 
         part = announce.with_suffix(".part")
         part.write_text(json.dumps({"port": port, "pid": os.getpid()}))
         part.rename(announce)
-    alone = time.monotonic()
-    while not ended.is_set() and time.monotonic() - alone < idle:
+    last_client = time.monotonic()
+    while not ended.is_set() and time.monotonic() - last_client < idle:
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(ended.wait(), 0.1)
         if bridge.clients:
-            alone = time.monotonic()
+            last_client = time.monotonic()
     server.close()
 
 
 def main(words: list[str]) -> int:
     """Run beside LinuxCNC."""
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
-    parser.add_argument("-ini", metavar="FILE", help="LinuxCNC gives it to its display; the running one's is taken")
-    parser.add_argument("--port", type=int, default=PORT, help="of 127.0.0.1; 0: any that is free")
-    parser.add_argument("--announce", type=Path, help="file that states the port and the process")
-    parser.add_argument("--idle", type=float, default=math.inf, help="end after so many seconds without a client")
+    parser.add_argument("-ini", metavar="FILE", help="passed by LinuxCNC to its display; ignored")
+    parser.add_argument("--port", type=int, default=PORT, help="port of 127.0.0.1; 0: any free port")
+    parser.add_argument("--announce", type=Path, help="file to which port and process are written")
+    parser.add_argument(
+        "--idle", type=float, default=math.inf, help="time without a client after which the bridge ends, s"
+    )
     parser.add_argument("--pins", default="", help="prefix of the HAL pins that clients may set")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
     options = parser.parse_args(words)

@@ -1,4 +1,4 @@
-"""The wire of the bridge: JSON lines. Pure functions between bytes and values; see `bridge` for what goes over it."""
+"""Protocol of the bridge: JSON lines. Pure functions between bytes and values; see `bridge` for the messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MODES = ("manual", "mdi", "automatic", "")
 
 @dataclass(frozen=True)
 class Beat:
-    """A sign that an order lasts."""
+    """A sign of life while an order runs."""
 
     number: int
     time: float
@@ -24,7 +24,7 @@ class Beat:
 
 @dataclass(frozen=True)
 class Answer:
-    """How an order, or a question, ended: with a result, or refused with a text."""
+    """Answer to a request: a result, or a refusal with a text."""
 
     number: Any
     ok: bool
@@ -46,7 +46,7 @@ def decode(line: bytes) -> Answer | Beat:
     Raises
     ------
     ProtocolError
-        It is neither an answer nor a beat.
+        Neither an answer nor a sign of life.
     """
     try:
         message = json.loads(line)
@@ -67,7 +67,7 @@ def decode_state(result: Any) -> dict[str, Any]:
     Raises
     ------
     ProtocolError
-        A value is missing, or is of another kind than it has to be.
+        A value is missing or has the wrong type.
     """
     try:
         state = dict(result)
@@ -75,8 +75,8 @@ def decode_state(result: Any) -> dict[str, Any]:
             raise ValueError(f"mode {state['mode']!r}")
         return {
             "time": _known(state, "time"),
-            "position": _place(state["position"]),
-            "commanded_position": _place(state["commanded_position"]),
+            "position": _position(state["position"]),
+            "commanded_position": _position(state["commanded_position"]),
             "spindle_speed": _number(state["spindle_speed"]),
             "spindle_load": _number(state["spindle_load"]),
             "feed": _number(state["feed"]),
@@ -93,10 +93,10 @@ def decode_state(result: Any) -> dict[str, Any]:
 
 
 def decode_touch(result: Any) -> dict[str, Any]:
-    """Return ``tripped``, ``position`` (m, or None) and ``time`` of a touch; ProtocolError where they are not there."""
+    """Return ``tripped``, ``position`` (m, or None) and ``time`` of a touch; ProtocolError where they are missing."""
     try:
         tripped = _switch(result, "tripped")
-        position = _place(result["position"]) if tripped else None
+        position = _position(result["position"]) if tripped else None
         if position is not None and not all(math.isfinite(x) for x in position):
             raise ValueError("a touch at an unknown position")
         return {"tripped": tripped, "position": position, "time": _known(result, "time")}
@@ -108,7 +108,7 @@ def _number(value: Any) -> float:
     if value is None:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is no number")
+        raise TypeError(f"{value!r} is not a number")
     return float(value)
 
 
@@ -119,9 +119,9 @@ def _known(values: Mapping[str, Any], name: str) -> float:
     return value
 
 
-def _place(value: Any) -> list[float]:
+def _position(value: Any) -> list[float]:
     if not isinstance(value, list) or len(value) != 3:
-        raise TypeError(f"{value!r} is no position")
+        raise TypeError(f"{value!r} is not a position")
     return [_number(x) for x in value]
 
 

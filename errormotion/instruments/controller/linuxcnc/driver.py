@@ -19,10 +19,10 @@ from errormotion.plugins import Identity, InstrumentInfo, lazy
 class LinuxCNC(Driver):
     """A machine under LinuxCNC.
 
-    Positions are those of the machine's own coordinates (G53) in m, whatever offsets of work and tool are in force.
+    Positions are those of the machine's own coordinates (G53) in m, independent of the offsets of work and tool.
 
-    What moves the machine is requested once. If the connection breaks or stops answering meanwhile, that is an
-    InstrumentError, the bridge has LinuxCNC abort, and nothing is repeated; the next call connects again. `stop` may be
+    An order is sent once. If the connection breaks or no answer arrives, an InstrumentError is raised, the bridge
+    aborts the motion, and nothing is repeated; the next call connects again. `stop` may be
     called from another thread.
 
     Parameters
@@ -47,12 +47,12 @@ class LinuxCNC(Driver):
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
         super().__init__(address, settings, record=record)
-        self._talk = threading.Lock()
+        self._exchange_lock = threading.Lock()
         self._number = 0
         self._unawaited: set[int] = set()
         self._lost = False
 
-    # ------------------------------------------------------------------ questions
+    # ------------------------------------------------------------------ state
 
     def identify(self) -> Identity:
         """Request the identity of the machine."""
@@ -78,7 +78,7 @@ class LinuxCNC(Driver):
         return self.state()
 
     def state(self) -> dict[str, Any]:
-        """Return what the machine does.
+        """Return the state of the machine.
 
         ``time`` (s since the bridge started; of the virtual world where simulated), ``position`` (X, Y, Z as measured,
         m), ``commanded_position`` (m), ``spindle_speed`` (1/min; as measured, where HAL has an encoder),
@@ -91,7 +91,7 @@ class LinuxCNC(Driver):
     # ------------------------------------------------------------------ orders
 
     def reset(self) -> None:
-        """Release the e-stop and forget the alarms; then `enable`."""
+        """Release the e-stop and clear the alarms; then `enable`."""
         self._order("reset")
 
     def enable(self) -> None:
@@ -100,16 +100,16 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            E-stop, or it stays off.
+            E-stop, or the machine stays off.
         """
         self._order("enable")
 
     def estop(self) -> None:
-        """Press LinuxCNC's e-stop. Not what makes a machine safe: that is the button."""
+        """Set LinuxCNC's e-stop. It does not replace the emergency stop button."""
         self._order("estop")
 
     def home(self) -> None:
-        """Home all axes; return when they are."""
+        """Home all axes; return when all are homed."""
         self._order("home")
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class LinuxCNC(Driver):
         position : (3,)
             X, Y, Z, m.
         feed : float, optional
-            m/s; in rapid where not given. LinuxCNC slows down what is too fast for its axes.
+            m/s; default: rapid. LinuxCNC limits the feed to that of its axes.
 
         Returns
         -------
@@ -130,17 +130,17 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            Not homed, off or in e-stop, out of travel; stopped, an error of LinuxCNC or a broken connection on the
-            way. The message has LinuxCNC's own words.
+            Not homed, off or in e-stop, out of travel; stopped, an error of LinuxCNC or a lost connection during the
+            move. The message contains the text of LinuxCNC.
         """
-        place = [float(x) for x in position]
-        return dict(self._order("move_to", position=place, feed=None if feed is None else float(feed)))
+        goal = [float(x) for x in position]
+        return dict(self._order("move_to", position=goal, feed=None if feed is None else float(feed)))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move in a straight line until the probe trips; return when the machine rests.
 
-        LinuxCNC latches the position in the servo cycle in which it sees the probe, so up to a cycle of travel, 1 ms x
-        feed, behind the contact; and as much later as the probe's signal takes (`LinuxCNCSettings.trip_delay`).
+        LinuxCNC latches the position in the servo cycle in which it detects the trip: up to one cycle of travel, 1 ms x
+        feed, after the contact, plus the delay of the probe's signal (`LinuxCNCSettings.trip_delay`).
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class LinuxCNC(Driver):
         Returns
         -------
         dict
-            ``tripped``; ``position`` where it did, m, or None; ``time`` on the machine's clock, s. Without a trip the
+            ``tripped``; ``position`` of the trip, m, or None; ``time`` on the machine's clock, s. Without a trip the
             machine is at the target.
 
         Raises
@@ -176,10 +176,10 @@ class LinuxCNC(Driver):
     def stop(self, spindle: bool = False) -> None:
         """Abort all motion. LinuxCNC's abort stops the spindle, whatever the value of ``spindle``.
 
-        From another thread it ends the call that waits there, with an InstrumentError.
+        From another thread it ends a waiting call with an InstrumentError.
         """
-        if self._talk.acquire(blocking=False):
-            self._talk.release()
+        if self._exchange_lock.acquire(blocking=False):
+            self._exchange_lock.release()
             self._order("stop", spindle=bool(spindle))
             return
         self._number += 1
@@ -213,11 +213,11 @@ class LinuxCNC(Driver):
         Raises
         ------
         InstrumentError
-            It ended early: the message has LinuxCNC's words.
+            It ended early; the message contains the text of LinuxCNC.
         """
         return dict(self._order("finish"))
 
-    # ------------------------------------------------------------------ the wire
+    # ------------------------------------------------------------------ connection
 
     def _query(self, op: str) -> Any:
         """Send a request, and once more over a new connection if it breaks."""
@@ -226,20 +226,20 @@ class LinuxCNC(Driver):
         except InstrumentTimeoutError:
             raise
         except InstrumentError:
-            if not (self._lost and self._may_connect_anew):
+            if not (self._lost and self._may_reconnect):
                 raise
             return self._order(op)
 
     @property
-    def _may_connect_anew(self) -> bool:
+    def _may_reconnect(self) -> bool:
         return self._record is None and not self.address.startswith("replay://")
 
     def _order(self, op: str, **arguments: Any) -> Any:
         """Send a request, once, and wait for its answer."""
-        with self._talk:
+        with self._exchange_lock:
             line = self.transport
-            if self._lost and self._may_connect_anew:
-                line = self._connect_anew()
+            if self._lost and self._may_reconnect:
+                line = self._reconnect()
             self._number += 1
             request = codec.encode_request(self._number, op, arguments)
             try:
@@ -247,12 +247,12 @@ class LinuxCNC(Driver):
                 answer = self._await(line, self._number)
             except InstrumentError as error:
                 self._cut(line)
-                raise type(error)(f"{error}. LinuxCNC was ordered to {op.replace('_', ' ')} meanwhile") from None
+                raise type(error)(f"{error}; during the order '{op.replace('_', ' ')}'") from None
             except BaseException:  # an interrupted wait: the bridge aborts an order without a waiting client
                 self._cut(line)
                 raise
         if not answer.ok:
-            raise InstrumentError(f"{self.address} does not {op.replace('_', ' ')}: {answer.error}")
+            raise InstrumentError(f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}")
         return answer.result
 
     def _await(self, line: Transport, number: int) -> codec.Answer:
@@ -261,7 +261,7 @@ class LinuxCNC(Driver):
                 message = codec.decode(line.read_until(codec.LINE_END, timeout=self.settings.timeout))
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
-                    f"{self.address}: LinuxCNC's bridge did not answer for {self.settings.timeout:g} s"
+                    f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
                 ) from None
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
@@ -272,13 +272,13 @@ class LinuxCNC(Driver):
                 return message
 
     def _cut(self, line: Transport) -> None:
-        """Have the bridge abort, if the order still reaches it, and drop the connection; the next call opens one."""
+        """Send an abort to the bridge and drop the connection; the next call opens another one."""
         self._lost = True
         self._number += 1
         with suppress(InstrumentError):
             line.write(codec.encode_request(self._number, "stop", {}))
 
-    def _connect_anew(self) -> Transport:
+    def _reconnect(self) -> Transport:
         """Open another connection, then close the lost one: a simulated machine ends with its last connection."""
         self._transport, lost = self._connect(), self._transport
         self._lost = False

@@ -11,10 +11,10 @@ from errormotion.plugins import PluginSettings
 class LinuxCNCSettings(PluginSettings):
     """Settings of ``linuxcnc``."""
 
-    timeout: Time = Field(default=3.0, description="how long LinuxCNC may take to answer, also while it moves", gt=0)
+    timeout: Time = Field(default=3.0, description="time limit without data from the bridge, also during motion", gt=0)
     trip_delay: Time = Field(
         default=0.0,
-        description="from the contact until LinuxCNC latches the position; a touch is put back by as much travel",
+        description="delay from the contact until LinuxCNC latches the position; touches are corrected by its travel",
         ge=0,
         le=0.1,
     )

@@ -202,7 +202,7 @@ def parse(data: bytes) -> Document:
 class _NoDoctype(ElementTree.TreeBuilder):
     def doctype(self, name: str, *_: str | None) -> None:
         """Refuse a document type: no document of MTConnect has one, and all entities are made there."""
-        raise ProtocolError(f"Expected a document of MTConnect; found one with a document type '{name[:40]}', refused")
+        raise ProtocolError(f"Expected a document of MTConnect without document type; found '{name[:40]}'")
 
 
 def _tree(data: bytes) -> ElementTree.Element:
@@ -211,7 +211,7 @@ def _tree(data: bytes) -> ElementTree.Element:
         parser.feed(data)
         root: Any = parser.close()
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # the others: unknown encodings
-        raise ProtocolError(f"Expected XML; it cannot be read ({error}); it starts {data[:60]!r}") from None
+        raise ProtocolError(f"Expected XML; it cannot be parsed ({error}); it starts with {data[:60]!r}") from None
     if not isinstance(root, ElementTree.Element):
         raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
     return root
@@ -276,8 +276,8 @@ def _devices(root: ElementTree.Element) -> Iterator[Device]:
         for device in devices:
             if _local(device) != "Device":  # an agent describes itself as well
                 continue
-            told = _child(device, "Description")
-            about = {} if told is None else told.attrib
+            description = _child(device, "Description")
+            about = {} if description is None else description.attrib
             items = {item.id: item for item in _items(device)}
             yield Device(
                 name=device.get("name", ""),
@@ -290,7 +290,7 @@ def _devices(root: ElementTree.Element) -> Iterator[Device]:
 
 
 def _items(device: ElementTree.Element) -> Iterator[DataItem]:
-    """Yield the data items of a device; those of a component stand in its ``DataItems``."""
+    """Yield the data items of a device; those of a component are in its ``DataItems``."""
     waiting = [device]
     while waiting:
         component = waiting.pop()
@@ -340,4 +340,4 @@ def _observations(root: ElementTree.Element) -> Iterator[Observation]:
 def _errors(root: ElementTree.Element) -> dict[str, str]:
     found = {each.get("errorCode", ""): " ".join("".join(each.itertext()).split()) for each in root.iter()}
     found.pop("", None)
-    return found or {"UNKNOWN": "no error is named"}
+    return found or {"UNKNOWN": "error without a code"}

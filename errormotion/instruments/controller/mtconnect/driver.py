@@ -94,7 +94,8 @@ class MTConnect(Driver):
         self.restarts = 0
         self._instance: int | None = None
         self._next: int | None = None
-        self._began: float | None = None
+
+        self._started_at: float | None = None
         self._restarted = False  # while no client was connected
         self._device = Device("", "")
         self._items: Mapping[str, DataItem] = {}
@@ -123,11 +124,11 @@ class MTConnect(Driver):
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return the state now, without what the agent never reports."""
+        """Return the state now, without values that are None."""
         return {name: value for name, value in self.state().items() if value is not None}
 
     def state(self) -> dict[str, Any]:
-        """Return what the agent knows of the machine now.
+        """Return the state of the machine as the agent reports it.
 
         Returns
         -------
@@ -142,7 +143,7 @@ class MTConnect(Driver):
         Raises
         ------
         ProtocolError
-            No answer of an agent, or a value that is none.
+            Not an answer of an agent, or an invalid value.
         InstrumentTimeoutError
             No answer within the time limit.
         """
@@ -151,12 +152,12 @@ class MTConnect(Driver):
         last = {each.item: each for each in document.observations if not each.level}
         now = document.header.created - self._start(document)
         values = {key: last.get(item.id) for key, item in self._items.items()}
-        position, moved = self._places("position", values)
+        position, moved = self._position("position", values)
         text = {key: _text(values.get(key)) for key in ("mode", "program", "execution", "estop", "availability")}
         state: dict[str, Any] = {
             "time": now,
             "position": position,
-            "commanded_position": self._places("commanded_position", values)[0],
+            "commanded_position": self._position("commanded_position", values)[0],
             "position_time": moved - self._start(document),
             **{key: self._number(key, values) for key in ("spindle_speed", "spindle_load", "feed")},
             "mode": _MODES.get(text["mode"], ""),
@@ -176,7 +177,7 @@ class MTConnect(Driver):
         return state
 
     def sample(self) -> Observed:
-        """Return what was observed since the last call; the first call returns the last value of every data item.
+        """Return the observations since the last call; the first call returns the last value of every data item.
 
         Raises
         ------
@@ -191,12 +192,13 @@ class MTConnect(Driver):
             restarted, self._restarted = self._restarted, False
             return self._taken(document, 0, restarted=restarted)
         document = self._query("sample", self._from(), refused=False)
-        return self._understood(document) or self._caught_up(document)
+        return self._continued(document) or self._resynchronised(document)
 
     def observations(self, interval: float = 0.1) -> Iterator[Observed]:
-        """Yield what is observed as the agent sends it, starting where `sample` or an earlier stream ended.
+        """Yield observations as the agent sends them, starting where `sample` or an earlier stream ended.
 
-        A stream that the agent ends is requested again. While it runs nothing else can be queried on this connection.
+        A stream that the agent ends is requested again. During a stream nothing else can be requested on this
+        connection.
 
         Parameters
         ----------
@@ -206,7 +208,7 @@ class MTConnect(Driver):
         Raises
         ------
         InstrumentTimeoutError
-            Not even the heartbeat came, which is requested at half the time limit.
+            No data and no heartbeat, which is requested at half the time limit.
         ProtocolError, InstrumentError
             As of `sample`.
         """
@@ -222,14 +224,14 @@ class MTConnect(Driver):
             try:
                 for part in parts:
                     document, came = parse(part), True
-                    observed = self._understood(document)
+                    observed = self._continued(document)
                     if observed is None:
                         break
                     yield observed
             finally:
                 parts.close()  # type: ignore[attr-defined]
             if not came:
-                raise InstrumentError(f"The agent at {self.address} ends its stream before anything came")
+                raise InstrumentError(f"The agent at {self.address} ended its stream without data")
             yield self.sample()
 
     # ------------------------------------------------------------------ sequence numbers
@@ -237,8 +239,8 @@ class MTConnect(Driver):
     def _from(self) -> dict[str, str]:
         return {"from": str(self._next), "count": str(self.settings.count)}
 
-    def _understood(self, document: Document) -> Observed | None:
-        """Return what is in an answer to a request for what follows; None where the numbers have to be found again."""
+    def _continued(self, document: Document) -> Observed | None:
+        """Return the observations of an answer; None where the sequence numbers must be determined again."""
         assert self._next is not None
         if document.header.instance != self._instance or OUT_OF_RANGE in document.errors:
             return None
@@ -246,21 +248,21 @@ class MTConnect(Driver):
         return self._taken(document, max(0, document.header.first - self._next), restarted=False)
 
     def _taken(self, document: Document, lost: int, *, restarted: bool) -> Observed:
-        begin = 0 if self._next is None else self._next
-        fresh = tuple(each for each in document.observations if each.sequence >= begin)
-        self._next = max(document.header.next, begin)
+        first = 0 if self._next is None else self._next
+        fresh = tuple(each for each in document.observations if each.sequence >= first)
+        self._next = max(document.header.next, first)
         self._count(lost)
         return Observed(fresh, self._next, lost, restarted)
 
-    def _caught_up(self, document: Document) -> Observed:
-        """Go on at the first observation that the agent still holds."""
+    def _resynchronised(self, document: Document) -> Observed:
+        """Continue at the first observation that the agent still has."""
         lost, restarted = 0, False
         for _ in range(_ATTEMPTS):
             document = self._query("current")
             header = document.header
             assert self._next is not None
             again = self._notice(document)
-            if again or self._next > header.next:  # a restart shows in the numbers too, whatever the instance states
+            if again or self._next > header.next:  # a restart also shows in the numbers
                 restarted = True
                 self._next = header.first
             elif header.first > self._next:
@@ -296,15 +298,15 @@ class MTConnect(Driver):
     # ------------------------------------------------------------------ values
 
     def _start(self, document: Document) -> float:
-        if self._began is None:
-            self._began = document.header.created
-        return self._began
+        if self._started_at is None:
+            self._started_at = document.header.created
+        return self._started_at
 
     def _number(self, key: str, values: Mapping[str, Observation | None]) -> float:
         observation = values.get(key)
         return math.nan if observation is None else observation.number(self._items[key].scale)
 
-    def _places(self, key: str, values: Mapping[str, Observation | None]) -> tuple[list[float], float]:
+    def _position(self, key: str, values: Mapping[str, Observation | None]) -> tuple[list[float], float]:
         """Return X, Y, Z, and when they last changed, s since 1970."""
         keys = [f"{key}.{axis}" for axis in "XYZ"]
         if key in self._items and (whole := values.get(key)) is not None:
@@ -339,8 +341,8 @@ class MTConnect(Driver):
 
     def _refuse(self, document: Document, request: str) -> None:
         if document.errors:
-            told = "; ".join(f"{code}: {text}" for code, text in document.errors.items())
-            raise InstrumentError(f"The agent at {self.address} refuses '{request}': {told}")
+            errors = "; ".join(f"{code}: {text}" for code, text in document.errors.items())
+            raise InstrumentError(f"The agent at {self.address} refuses '{request}': {errors}")
 
     def _one(self, document: Document) -> Device:
         if len(document.devices) != 1:
@@ -381,7 +383,7 @@ def _text(observation: Observation | None) -> str:
 
 
 def _conditions(document: Document, level: str) -> list[str]:
-    """Return what conditions of a level state, such as ``SYSTEM 1104: overtravel``."""
+    """Return the texts of the conditions of a level, such as ``SYSTEM 1104: overtravel``."""
     return [
         f"{' '.join(filter(None, (each.type, each.code)))}: {each.value}".rstrip(": ")
         for each in document.observations

@@ -12,7 +12,7 @@ KEYS = (
     *("commanded_position.X", "commanded_position.Y", "commanded_position.Z"),
     *("spindle_speed", "spindle_load", "feed", "mode", "program", "execution", "estop", "availability"),
 )
-"""What of the state may be tied to a data item."""
+"""Quantities that can be assigned to a data item."""
 
 
 class MTConnectSettings(PluginSettings):
@@ -26,10 +26,10 @@ class MTConnectSettings(PluginSettings):
     )
     items: dict[str, str] = Field(
         default_factory=dict,
-        description="ids of data items, where type and name do not suffice: spindle_speed = 'S2rpm'",
+        description="ids of data items, where type and name are not sufficient: spindle_speed = 'S2rpm'",
     )
-    count: int = Field(default=1000, description="most observations that are requested at once", ge=1)
-    most_bytes: int = Field(default=16 << 20, description="largest document that is taken", ge=1024)
+    count: int = Field(default=1000, description="largest number of observations in one request", ge=1)
+    most_bytes: int = Field(default=16 << 20, description="largest accepted document, bytes", ge=1024)
     timeout: Time = Field(default=2.0, description="time limit without data", gt=0)
 
     @field_validator("items")

@@ -1,12 +1,12 @@
-"""A virtual machine under the real LinuxCNC: its bridge hears the driver, its probe sees what the twin has.
+"""A virtual machine under the real LinuxCNC, which probes the balls of the twin.
 
-The device sits between the driver and the bridge. Before each order it sets in HAL where the balls are now: where they
-stand less the error of the tip there, so that the machine trips in its servo thread where the twin would have it trip.
-The world's clock goes on with the real time that the machine moves, and jumps with ``elapse``.
+The device forwards messages between the driver and the bridge. Before each order it sets the positions of the balls in
+HAL, less the error of the tip there, so that the servo thread of the machine trips at the positions of the twin.
+The world's clock advances with the real time of motion, and at once with ``elapse``.
 
 Parameters of the address besides the common ones: ``ready`` (1; 0 = in e-stop and not homed, as after power-on),
-``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; how long LinuxCNC stays up when the last driver has
-gone; 0 = not at all. It ends with the process anyway), ``wait`` (90 s; for another simulated LinuxCNC on this computer
+``unit`` (``mm`` or ``inch``, of the INI file), ``linger`` (10 s; time that LinuxCNC runs on after the last driver has
+closed; it always ends with the process), ``wait`` (90 s; for another simulated LinuxCNC on this computer
 to end).
 """
 
@@ -33,9 +33,9 @@ LINGER = 10.0  # s
 START_TIMEOUT = 90.0  # s
 LEAST_IDLE = 5.0  # s that LinuxCNC waits for its first driver, at least
 OWN = "simulator"
-"""What the numbers of requests start with that the driver knows nothing of."""
-ANSWER = 10.0  # s
-GLANCE = 0.1  # s between two looks whether the device is still wanted
+"""Prefix of the numbers of the simulator's own requests."""
+ANSWER_TIMEOUT = 10.0  # s
+CHECK_INTERVAL = 0.1  # s between two checks whether the device is still open
 
 Message = dict[str, Any]
 
@@ -69,30 +69,30 @@ class Control:
         return LinuxCNCProcess(files, BRIDGE, wait=address.number("wait", START_TIMEOUT))
 
     def join(self, world: VirtualWorld) -> None:
-        """Count a device in, and start again with another world."""
+        """Register a device, and start again with another world."""
         with self.lock:
             self.users += 1
             if self.world is not world:
                 self.world, self._seen, self._moving, self._speed = world, None, False, 0.0
 
     def leave(self, linger: float) -> None:
-        """Count a device out; without lingering LinuxCNC ends with the last one."""
+        """Unregister a device; without ``linger`` LinuxCNC ends with the last one."""
         with self.lock:
             self.users -= 1
             if linger <= 0 and self.users == 0:
                 self.process.end()
 
     def follow(self, time: float, moving: bool) -> None:
-        """Let the world's clock go on by the time that the machine has moved since the last call."""
+        """Advance the world's clock by the time of motion since the last call."""
         with self.lock:
             passed = 0.0 if self._seen is None or not self._moving else time - self._seen
             self._seen, self._moving = time, moving
             if passed > 0:
-                with suppress(InstrumentError):  # while sensors stream the clock is theirs
+                with suppress(InstrumentError):  # streams drive the clock
                     self.world.elapse(passed)
 
     def turn(self, speed: float) -> None:
-        """Have the twin's spindle turn as the commanded one does."""
+        """Set the speed of the twin's spindle to the commanded one."""
         with self.lock:
             if speed != self._speed:
                 self._speed = speed
@@ -101,7 +101,7 @@ class Control:
     # ------------------------------------------------------------------ the probe
 
     def balls_for(self, start: list[float], target: list[float] | None, feed: float | None) -> dict[str, float]:
-        """Return the pins that put the balls where they are now.
+        """Return the pins with the present positions of the balls.
 
         On the way from the start to the target the probe trips where the twin states, its scatter and the lobes of its
         pre-travel included; elsewhere with its mean pre-travel.
@@ -153,8 +153,8 @@ def _end_unused() -> None:
     for key, control in list(_controls.items()):
         if control.users and control.process.running:
             raise InstrumentError(
-                f"LinuxCNC runs for {key[0]} with seed {key[1]} in this process, and a computer has room for one; "
-                "close that driver first, or give both addresses the same seed and parameters"
+                f"A computer can run one LinuxCNC, and it runs for {key[0]} with seed {key[1]}; "
+                "close that driver first, or use the same seed and parameters in both addresses"
             )
         control.process.end()
         del _controls[key]
@@ -167,16 +167,16 @@ def end() -> None:
 
 
 class SimulatedLinuxCNC(SimulatedDevice):
-    """Passes messages between the driver and the bridge of a real LinuxCNC."""
+    """Forwards messages between the driver and the bridge of a real LinuxCNC."""
 
     faults = ("silence", "split", "garbage", "drop", "disconnect")
 
     def __init__(self, address: Address) -> None:
         self._numbers = 0
         self._then: dict[str, Callable[[Message], None]] = {}
-        self._asked: dict[Any, str] = {}
+        self._requests: dict[Any, str] = {}
         self._closed = False
-        self._trouble = ""  # of a request that the driver knows nothing of
+        self._own_error = ""  # error of the simulator's own requests
         super().__init__(address, line_end=b"\n", default_name="linuxcnc")
         self._linger = address.number("linger", LINGER)
         try:
@@ -185,7 +185,9 @@ class SimulatedLinuxCNC(SimulatedDevice):
             super().close()
             raise
         try:
-            self._bridge: Transport = open_transport(f"tcp://127.0.0.1:{self._control.process.port}", timeout=ANSWER)
+            self._bridge: Transport = open_transport(
+                f"tcp://127.0.0.1:{self._control.process.port}", timeout=ANSWER_TIMEOUT
+            )
             if self._control.users == 1 and self._control.ready:
                 self._make_ready()
         except BaseException:
@@ -196,7 +198,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         self._pump.start()
 
     def close(self) -> None:
-        """Hang up; LinuxCNC ends a while after the last device has gone. Idempotent."""
+        """Disconnect; LinuxCNC ends a while after the last device. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -221,7 +223,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             except (ValueError, KeyError, TypeError):
                 self._forward_line(line + b"\n")  # the bridge states what is wrong with it
                 continue
-            self._asked[number] = op
+            self._requests[number] = op
             if op in ("elapse", "move_to", "probe", "run_program"):
                 self._ask_state(partial(self._prepared, request))
             else:
@@ -292,7 +294,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         buffer = b""
         while not self._closed:
             try:
-                buffer += self._bridge.read(timeout=GLANCE)
+                buffer += self._bridge.read(timeout=CHECK_INTERVAL)
             except InstrumentTimeoutError:
                 continue
             except InstrumentError:
@@ -307,7 +309,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         state = result if isinstance(result, dict) and "spindle_commanded" in result else None
         beating = "beat" in message
         running = bool(message["running"] if beating else state["running"] if state else False)
-        if beating or state or self._asked.get(number) in ("move_to", "probe", "home"):
+        if beating or state or self._requests.get(number) in ("move_to", "probe", "home"):
             self._control.follow(message["time"], running)
         if state:
             self._control.turn(state["spindle_commanded"])
@@ -316,12 +318,12 @@ class SimulatedLinuxCNC(SimulatedDevice):
             if then is not None and state:
                 then(state)
             elif not message["ok"]:
-                self._trouble = str(message["error"])
+                self._own_error = str(message["error"])
             return
-        if self._trouble:
-            message = {"id": number, "ok": False, "error": f"the simulated probe is out of order: {self._trouble}"}
+        if self._own_error:
+            message = {"id": number, "ok": False, "error": f"error of the simulated probe: {self._own_error}"}
         if not beating:
-            self._asked.pop(number, None)
+            self._requests.pop(number, None)
         if isinstance(result, dict):
             if "time" in result:
                 result["time"] = self.world.time

@@ -1,8 +1,8 @@
-"""LinuxCNC itself, started without hardware and ended with everything that it has started.
+"""The real LinuxCNC, started without hardware and ended with all its processes.
 
-A computer has room for one LinuxCNC: its realtime memory has a fixed name. So a file is locked while one of ours runs
-(its processes hold the lock, and nobody else), a second start waits for that, and a LinuxCNC that is not ours, which
-may be running a machine, is never touched.
+A computer can run one LinuxCNC: its realtime memory has a fixed name. A file is therefore locked while a simulated one
+runs (only its processes hold the lock), a second start waits for the end of the first, and another LinuxCNC, which may
+run a machine, is never changed.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ LOCK = Path("/tmp/errormotion-linuxcnc.lock")
 LINUXCNC_LOCK = Path("/tmp/linuxcnc.lock")
 FOLDER = "errormotion-linuxcnc-"
 MARKER_FILE = "processes"
-"""File in its folder that all of its processes, and they alone, hold open."""
+"""File in its folder that all of its processes, and no others, hold open."""
 PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 NML = Path("/usr/share/linuxcnc/linuxcnc.nml")
 PROCESSES = ("milltask", "rtapi_app", "linuxcncsvr")
 MEMORY = ("0x48414c32", "0x90280a48", "0x48484c34", *(f"0x{key:x}" for key in range(1001, 1006)))
 """Keys of the shared memory that LinuxCNC leaves when it is killed: HAL, RTAPI, and its messages."""
-START_TIMEOUT = 15.0  # s
-END_TIMEOUT = 10.0  # s
+START_TIMEOUT = 15.0  # s for LinuxCNC to start
+END_TIMEOUT = 10.0  # s for LinuxCNC to end
 
 
 def why_not() -> str:
-    """Return why no LinuxCNC can be started here; empty where it can."""
+    """Return the reason why LinuxCNC cannot be started; empty where it can."""
     if shutil.which("linuxcnc") is None:
         return f"LinuxCNC is not installed on this computer; on Debian: apt install {PACKAGE}"
     if not NML.exists():
@@ -58,7 +58,7 @@ def installed() -> str:
 
 
 def for_doctor() -> str:
-    """Return which LinuxCNC is installed; only its simulation needs one, so none is no failure, a broken one is."""
+    """Return the installed LinuxCNC, which only the simulation needs; InstrumentError for a broken installation."""
     if shutil.which("linuxcnc") is None:
         return f"not installed; needed for sim://.../linuxcnc only: {why_not()}"
     if reason := why_not():
@@ -80,7 +80,7 @@ class LinuxCNCProcess:
     bridge : Path
         The display.
     wait : float
-        How long another one of ours is waited for, s.
+        Longest wait for the end of another simulated LinuxCNC, s.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class LinuxCNCProcess:
     Raises
     ------
     InstrumentError
-        Not installed; another one runs, and does not end in time; it does not start: with the end of what it stated.
+        Not installed; another one does not end in time; it does not start: with the end of its log.
     """
 
     def __init__(self, files: dict[str, str], bridge: Path, *, wait: float = 60.0) -> None:
@@ -123,7 +123,7 @@ class LinuxCNCProcess:
         return self._child.poll() is None
 
     def end(self) -> None:
-        """End LinuxCNC and whatever it has started; idempotent."""
+        """End LinuxCNC and all its processes; idempotent."""
         atexit.unregister(self.end)
         if self.running:
             with suppress(ProcessLookupError, AttributeError):
@@ -141,7 +141,7 @@ class LinuxCNCProcess:
             (self.folder / name).write_text(text.replace("{folder}", str(self.folder)))
         (self.folder / "linuxcnc.tbl").touch()
         (self.folder / "linuxcnc.var").touch()
-        nml = NML.read_text().replace(" TCP=5005", "")  # nobody from outside
+        nml = NML.read_text().replace(" TCP=5005", "")  # no connections from other computers
         (self.folder / "linuxcnc.nml").write_text(nml)
         shutil.copy(bridge, self.folder / "bridge.py")
         (self.folder / "bridge.py").chmod(0o755)
@@ -175,10 +175,10 @@ class LinuxCNCProcess:
             if not self.running or time.monotonic() > until:
                 why = "ended at once" if not self.running else f"did not start within {START_TIMEOUT:g} s"
                 log = (self.folder / "log.txt").read_text(errors="replace")
-                raise InstrumentError(f"LinuxCNC {why}; the end of what it stated:\n{log[-2000:]}")
+                raise InstrumentError(f"LinuxCNC {why}; the end of its log:\n{log[-2000:]}")
             time.sleep(0.02)
-        told = json.loads(file.read_text())
-        return int(told["port"]), int(told["pid"])
+        announced = json.loads(file.read_text())
+        return int(announced["port"]), int(announced["pid"])
 
     # ------------------------------------------------------------------ end
 
@@ -201,22 +201,22 @@ class LinuxCNCProcess:
 
 
 def _user() -> pwd.struct_passwd | None:
-    """Return who LinuxCNC runs as: it refuses root, so then nobody; else whoever queries (None)."""
+    """Return the user of LinuxCNC, which refuses root: ``nobody`` for root, else None for the present user."""
     return pwd.getpwnam("nobody") if os.geteuid() == 0 else None
 
 
 def _parts(of: Path | None = None) -> dict[int, str]:
-    """Return the processes of simulated LinuxCNCs, or of that in a folder, by name: they hold a file of its folder.
+    """Return the processes of simulated LinuxCNCs, or of that in a folder, by name; they hold a file of it open.
 
-    What belongs to another user cannot be seen.
+    Processes of other users are not visible.
     """
-    begin = f"{of or Path(tempfile.gettempdir()) / FOLDER}"
+    prefix = f"{of or Path(tempfile.gettempdir()) / FOLDER}"
     found = {}
     for pid, (name, _) in _processes().items():
         with suppress(OSError):
             links = [os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()]
             if any(
-                link.startswith(begin) and Path(link.removesuffix(" (deleted)")).name == MARKER_FILE for link in links
+                link.startswith(prefix) and Path(link.removesuffix(" (deleted)")).name == MARKER_FILE for link in links
             ):
                 found[pid] = name
     return found
@@ -232,8 +232,8 @@ def _kill(processes: dict[int, str]) -> None:
 
 
 def _lock(wait: float) -> int:
-    """Return the locked file; InstrumentError while another LinuxCNC of ours runs for too long."""
-    until, led = time.monotonic() + wait, time.monotonic()
+    """Return the locked file; InstrumentError where another simulated LinuxCNC does not end."""
+    until, last_led = time.monotonic() + wait, time.monotonic()
     with suppress(FileExistsError):
         os.close(os.open(LOCK, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644))
     file = os.open(LOCK, os.O_RDONLY)
@@ -244,25 +244,25 @@ def _lock(wait: float) -> int:
         except BlockingIOError:
             parts = _parts()
             if not parts or "bridge.py" in parts.values():
-                led = time.monotonic()
-            elif time.monotonic() - led > 2 * START_TIMEOUT:  # they run on without a head
+                last_led = time.monotonic()
+            elif time.monotonic() - last_led > 2 * START_TIMEOUT:  # processes without a bridge
                 _kill(parts)
             if time.monotonic() < until:
                 time.sleep(0.1)
                 continue
             os.close(file)
             raise InstrumentError(
-                "Another simulated LinuxCNC runs on this computer, which has room for one; it did not end in time, "
+                "A computer can run one LinuxCNC; another simulated one did not end in time, "
                 f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address"
             ) from None
 
 
 def _refuse_beside_another() -> None:
-    """Leave a LinuxCNC alone that is not ours: it may be running a machine."""
+    """Refuse to start beside a LinuxCNC that is not simulated: it may run a machine."""
     found = {name: pid for pid, (name, state) in _processes().items() if name in PROCESSES and state != "Z"}
     if found:
         named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
-        raise InstrumentError(f"A LinuxCNC runs on this computer that is not a simulated one of ours: {named}")
+        raise InstrumentError(f"A LinuxCNC that is not simulated runs on this computer: {named}")
     with suppress(OSError):
         LINUXCNC_LOCK.unlink()  # left by one that was killed
 

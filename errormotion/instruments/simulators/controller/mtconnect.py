@@ -192,7 +192,7 @@ class SimulatedAgent:
                 part = f"--{BOUNDARY}\r\nContent-type: text/xml\r\nContent-length: {len(body)}\r\n\r\n".encode()
                 part += body + b"\r\n"
                 yield from self.fault.pieces(f"{len(part):x}\r\n".encode() + part + b"\r\n")
-            if b"<MTConnectError" in body:  # who has fallen behind is left alone
+            if b"<MTConnectError" in body:  # the stream ends after an overrun
                 yield b"0\r\n\r\n"
                 return
             if self._server.ended.wait(pause):
@@ -209,28 +209,30 @@ class SimulatedAgent:
         elif what == "sample":
             text = self._sample(query)
         else:
-            text = self._error("UNSUPPORTED", f"there is no '{path}'")
+            text = self._error("UNSUPPORTED", f"unknown path '{path}'")
         return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
 
     @property
     def _first(self) -> int:
         return self._buffer[0][0] if self._buffer else self._next
 
-    def _asked(self, query: Mapping[str, str]) -> tuple[int, int]:
+    def _range(self, query: Mapping[str, str]) -> tuple[int, int]:
         return int(query.get("from", self._first)), int(query.get("count", 100))
 
     def _next_of(self, query: Mapping[str, str]) -> int:
         """Return the number that follows an answer to a request."""
-        begin, count = self._asked(query)
+        begin, count = self._range(query)
         return min(self._next, max(begin, self._first) + count)
 
     def _sample(self, query: Mapping[str, str]) -> str:
         try:
-            begin, count = self._asked(query)
+            begin, count = self._range(query)
         except ValueError:
             return self._error("INVALID_REQUEST", "from and count are numbers")
         if count < 1 or not (self._first <= begin or self.fault.kind == "jump") or begin > self._next:
-            return self._error("OUT_OF_RANGE", f"'from' is from {self._first} to {self._next}, and 'count' above 0")
+            return self._error(
+                "OUT_OF_RANGE", f"expected 'from' from {self._first} to {self._next}, and 'count' above 0"
+            )
         end = self._next_of(query)
         return self._streams((seen for seen in self._buffer if begin <= seen[0] < end), end)
 
@@ -268,18 +270,18 @@ class SimulatedAgent:
 
     @staticmethod
     def _items(key: tuple[str, str, str]) -> str:
-        told = []
+        items = []
         for item_id, (_, kind, sub_type, category, units) in ITEMS[key].items():
             more = (f' subType="{sub_type}"' if sub_type else "") + (f' units="{units}"' if units else "")
-            told.append(f'<DataItem category="{category}" id="{item_id}" type="{kind}"{more}/>')
-        return f"<DataItems>{''.join(told)}</DataItems>"
+            items.append(f'<DataItem category="{category}" id="{item_id}" type="{kind}"{more}/>')
+        return f"<DataItems>{''.join(items)}</DataItems>"
 
     def _streams(self, observations: Any, following: int) -> str:
         by_component: dict[tuple[str, str, str], dict[str, list[str]]] = {}
         for seen in observations:
             (_, _, _, category, _), component = _ELEMENTS[seen[1]]
             groups = by_component.setdefault(component, {"SAMPLE": [], "EVENT": [], "CONDITION": []})
-            groups[category].append(_told(seen))
+            groups[category].append(_element(seen))
         wrapped = {"SAMPLE": "Samples", "EVENT": "Events", "CONDITION": "Condition"}
         components = "".join(
             f'<ComponentStream component="{kind}" name="{name}" componentId="{component_id}">'
@@ -295,16 +297,16 @@ class SimulatedAgent:
         )
 
 
-def _told(seen: Seen) -> str:
+def _element(seen: Seen) -> str:
     """Return one observation as XML."""
     sequence, item_id, time, value = seen
     element, kind, sub_type, category, _ = _ELEMENTS[item_id][0]
-    told = f'dataItemId="{item_id}" timestamp="{time}" sequence="{sequence}"'
+    attributes = f'dataItemId="{item_id}" timestamp="{time}" sequence="{sequence}"'
     if category == "CONDITION":
         level, _, rest = value.partition(",")
         code, _, text = rest.partition(",")
         element = "Unavailable" if value == "UNAVAILABLE" else level
         native = f' nativeCode="{code}"' if code else ""
-        return f'<{element} {told} type="{kind}"{native}>{escape(text)}</{element}>'
+        return f'<{element} {attributes} type="{kind}"{native}>{escape(text)}</{element}>'
     sub = f' subType="{sub_type}"' if sub_type else ""
-    return f"<{element} {told}{sub}>{escape(value)}</{element}>"
+    return f"<{element} {attributes}{sub}>{escape(value)}</{element}>"

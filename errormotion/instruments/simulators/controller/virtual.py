@@ -1,4 +1,4 @@
-"""The controller of the virtual machine: what executes its commands in the world."""
+"""The controller of the virtual machine: executes commands in the world."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MACHINE_FAULTS = ("alarm", "estop", "no_trip", "tripped")
 class SimulatedController(SimulatedDevice):
     """Answers requests in JSON lines.
 
-    Further parameters of the address: ``balls`` (how many are on the table; 4), and of faults, counted in requests:
+    Further parameters of the address: ``balls`` (number on the table; 4), and of faults, counted in requests:
     ``alarm`` and ``estop`` (at request ``fault_at`` the machine goes into alarm, or emergency
-    stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or for good, the probe never trips, or
-    is stuck).
+    stop), ``no_trip`` and ``tripped`` (from then on, for ``fault_for`` requests or permanently, the probe never trips,
+    or is stuck).
     """
 
     faults = ("silence", "split", "garbage", "drop", "disconnect", *MACHINE_FAULTS)
@@ -35,18 +35,18 @@ class SimulatedController(SimulatedDevice):
         """Return the answer to one request."""
         number: Any = None
         try:
-            self._befall()
+            self._apply_fault()
             message = json.loads(request)
             number = message.pop("id")
-            reply = {"id": number, "ok": True, "result": self._obey(message.pop("op"), message)}
+            reply = {"id": number, "ok": True, "result": self._execute(message.pop("op"), message)}
         except ErrormotionError as error:
             reply = {"id": number, "ok": False, "error": str(error)}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            reply = {"id": number, "ok": False, "error": f"this is no request: {error!r}"}
+            reply = {"id": number, "ok": False, "error": f"expected a request in JSON: {error!r}"}
         return json.dumps(reply).encode() + b"\n"
 
-    def _befall(self) -> None:
-        """Let happen to the machine what is due at this request."""
+    def _apply_fault(self) -> None:
+        """Apply the fault of the machine that is due at this request."""
         if self.fault.kind == "alarm" and self._answers == self.fault.at:
             self.world.raise_alarm("servo alarm (simulated)")
         if self.fault.kind == "estop" and self._answers == self.fault.at:
@@ -57,7 +57,7 @@ class SimulatedController(SimulatedDevice):
             how: Literal["open", "closed"] = "open" if self.fault.kind == "no_trip" else "closed"
             self.world.stuck = how if broken else None
 
-    def _obey(self, op: str, arguments: Mapping[str, Any]) -> Any:
+    def _execute(self, op: str, arguments: Mapping[str, Any]) -> Any:
         world = self.world
         match op:
             case "identify":
@@ -95,5 +95,5 @@ class SimulatedController(SimulatedDevice):
             case "set_station":
                 world.set_station(**arguments)
             case _:
-                raise ValueError(f"no such operation: {op}")
+                raise ValueError(f"unknown operation: {op}")
         return None

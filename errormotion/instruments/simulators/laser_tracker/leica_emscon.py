@@ -23,7 +23,7 @@ LENGTHS = {0: 1.0, 1: 1e3, 2: 1e6}  # units a metre
 REFLECTORS = (("RRR 1.5in", 5, 19.05e-3), ("RRR 0.5in", 6, 6.35e-3), ("Cat's eye", 2, 0.0))
 MODELS = {"AT901": (14, "AT901-MR", 80.0), "AT4xx": (72, "AT402", 160.0)}
 NEST = (0.0, math.pi / 2, 0.3)  # direction (rad) and distance (m) of the position at the tracker for a reflector
-CARRIED = 5e-3  # m, one sigma: how well people put a tracker where they are asked to
+CARRIED = 5e-3  # m, one sigma: deviation of a carried tracker from its station
 BEAM_ERROR = 201  # (m): a number of the tracker processor
 
 
@@ -50,7 +50,7 @@ class SimulatedEmScon(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, KeyError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' describes no tracker that there is: {error}") from None
+            raise InstrumentError(f"'{address.url}' has invalid parameters of a tracker: {error}") from None
 
     def _set_up(self, address: Address) -> None:
         self.scene = TrackerScene(self.world, address, self._rng)
@@ -66,7 +66,7 @@ class SimulatedEmScon(SimulatedDevice):
         self._system = {"meteo": codec.METEO_OFF, "unsolicited": 1, "reflector_position": 1, "level": 1}
         self._set_air = (20.0, 101_325.0, 50.0)
         self._set_index = refraction_index(*self._set_air)
-        self._told_index = 0.0
+        self._reported_index = 0.0
         self._mode, self._milliseconds, self._reflector = codec.STATIONARY, 10, 1
         self._radius = 0.05
         self._tries = 0
@@ -76,7 +76,7 @@ class SimulatedEmScon(SimulatedDevice):
         self._stop = threading.Event()
         self._sender: threading.Thread | None = None
         self._starting = False
-        self._begin = 0.0
+        self._start_time = 0.0
 
     def close(self) -> None:
         """End the device and its stream."""
@@ -87,7 +87,7 @@ class SimulatedEmScon(SimulatedDevice):
 
     def report_delivered(self, samples: int) -> None:
         """Let the world's clock follow the reader, unless others drive it."""
-        now = self._begin + samples * self._milliseconds / 1000.0
+        now = self._start_time + samples * self._milliseconds / 1000.0
         if not self.world.streaming and now > self.world.time:
             self.world.elapse(now - self.world.time)
 
@@ -345,8 +345,8 @@ class SimulatedEmScon(SimulatedDevice):
     def _single(self) -> bytes:
         temperature, pressure, humidity = self._air()
         change = b""
-        if abs(self._index() - self._told_index) > 1e-8:
-            self._told_index = self._index()
+        if abs(self._index() - self._reported_index) > 1e-8:
+            self._reported_index = self._index()
             change = self._said(statuses.REFRACTION_CHANGED)
         spread = {"std1": self._angle_noise, "std2": self._angle_noise, "std3": self._noise * self._length}
         air = {"temperature": temperature, "pressure": pressure / 100.0, "humidity": humidity}
@@ -374,7 +374,7 @@ class SimulatedEmScon(SimulatedDevice):
     def _start_stream(self) -> None:
         self._end_stream()
         self._stop = threading.Event()
-        self._begin = self.world.time
+        self._start_time = self.world.time
         self._sender = threading.Thread(target=self._send_points, name=f"sim-{self.name}-points", daemon=True)
         self._sender.start()
 
@@ -403,7 +403,7 @@ class SimulatedEmScon(SimulatedDevice):
 
     def _packets(self, first: int) -> Iterator[bytes]:
         """Yield what is sent for the next points: those of them that are there, and news of the beam."""
-        times = self._begin + (first + np.arange(POINTS_A_PACKET)) * self._milliseconds / 1000.0
+        times = self._start_time + (first + np.arange(POINTS_A_PACKET)) * self._milliseconds / 1000.0
         points: list[dict[str, Any]] = []
         for k, seen in enumerate(self._seen(times), first):
             if self._mends():

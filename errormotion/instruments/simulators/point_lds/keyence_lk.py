@@ -69,7 +69,7 @@ class SimulatedKeyenceLK(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, KeyError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' describes no controller that there is: {error}") from None
+            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
 
     def _set_up(self, address: Address) -> None:
         self._controller = CONTROLLERS[address.params.get("controller", "LK-G5000")]
@@ -147,8 +147,8 @@ class SimulatedKeyenceLK(SimulatedDevice):
         return self.world.read_point(self.name)
 
     def _faulty(self) -> bool:
-        begun = self._answers - self.fault.at
-        return begun >= 0 and (self.fault.length == 0 or begun < self.fault.length)
+        count = self._answers - self.fault.at
+        return count >= 0 and (self.fault.length == 0 or count < self.fault.length)
 
     def _setting(self, text: str) -> str:
         """Read or write a setting: SR,name,output and SW,name,output,value."""

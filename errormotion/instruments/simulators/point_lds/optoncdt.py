@@ -115,7 +115,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
         if self.name not in self.world.machine.frame.channels and self.world.stand.target is None:
             return "E300 No such beam in the frame of this machine"
         if self.world.following:
-            return "E301 The machine is being followed by another device"
+            return "E301 Another device drives the clock of this machine"
         self._stop()
         self._stream = SensorStream(
             self._server,
@@ -226,15 +226,16 @@ class SensorStream:
     def _spoilt(self, raws: Array, first: int) -> bytes:
         fault = self._fault
         numbers = first + np.arange(raws.size)
-        begun = numbers >= fault.at
-        due = begun & ((numbers - fault.at) % fault.every == 0)
+
+        active = numbers >= fault.at
+        due = active & ((numbers - fault.at) % fault.every == 0)
         match fault.kind:
             case "silence" | "disconnect":
-                raws[begun] = -1
+                raws[active] = -1
             case "drop":
                 raws[due] = -1
             case "out_of_range":
-                raws[begun & ((numbers < fault.at + fault.length) | (fault.length == 0))] = NO_PEAK
+                raws[active & ((numbers < fault.at + fault.length) | (fault.length == 0))] = NO_PEAK
         data = self._encoded(raws, first)
         if fault.kind == "garbage":
             for place in sorted(self._rng.integers(0, len(data) + 1, int(due.sum())), reverse=True):

@@ -27,7 +27,7 @@ PACED_BLOCK = 0.01  # s, when running at a pace
 
 
 class SampleClock:
-    """Time, and those who stream.
+    """The clock and the streams of a world.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class SampleClock:
     pace : float or None
         Simulated seconds per second; None = as fast as the readers.
     ticking : float or None
-        Simulated seconds per second by which time goes on while nothing streams; None = it does not advance.
+        Simulated seconds per second while nothing streams; None = the clock stops.
     """
 
     name: str
@@ -72,7 +72,7 @@ class SampleClock:
         self._wound = now
 
     def tick(self, rate: float) -> None:
-        """Let time go on by itself from now on, in simulated seconds per second."""
+        """Advance the time continuously from now on, in simulated seconds per second."""
         with self._change:
             self._wound, self.ticking = time.monotonic(), rate
 
@@ -82,7 +82,7 @@ class SampleClock:
         self._settings_of_clock += 1
 
     def _next_instant(self) -> float:
-        """Return the first time for which no sample is made or under way: from then on acts what is ordered."""
+        """Return the first time for which no sample is made or under way: orders take effect from then on."""
         return float(max(self._front, self._making, self.time))
 
     @property
@@ -101,7 +101,7 @@ class SampleClock:
             raise InstrumentError(f"Cannot {what} while {', '.join(names)} stream; stop the streams first")
 
     def _forget_streams(self) -> threading.Thread | None:
-        """Forget all who stream, and let the thread end; return it, to be joined."""
+        """Remove all streams, and let the thread end; return it, to be joined."""
         self._streams.clear()
         self._armed.clear()
         self._triggered.clear()
@@ -109,7 +109,7 @@ class SampleClock:
         self._change.notify_all()
         return thread
 
-    # ------------------------------------------------------------------ who streams
+    # ------------------------------------------------------------------ streams
 
     def start_stream(self, stream: Stream) -> None:
         """Start making samples: at once, for a slave when its master starts, for a master with all its slaves."""

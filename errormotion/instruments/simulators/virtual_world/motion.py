@@ -1,6 +1,6 @@
-"""How the axes of a virtual world move: steps of a sphere, NC programs, straight moves, and the touch probe.
+"""Motion of the axes of a virtual world: steps of a sphere, NC programs, straight moves, and the touch probe.
 
-The time of a program passes with samples or by waiting. The time of a straight move and of a probing passes at once.
+The time of a program passes with samples or by ``elapse``. The time of a straight move and of a touch passes at once.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ class Motion(SampleClock):
     Attributes
     ----------
     tool : str
-        In the spindle. The probe comes by itself when it is needed, and goes when the spindle is to turn.
+        Tool in the spindle. The probe is mounted automatically for probing, and removed before the spindle turns.
     motion : StepProgram or None
-        What steps the sphere.
+        Steps of the sphere.
     path : Path
-        Of the axes, otherwise.
+        Path of the axes without a step program.
     program : str
-        Title of the NC program that was started last; empty when it was something else.
+        Title of the NC program that was started last; empty after other motions.
     balls : Balls
-        On the table. They are in the way of the probe alone.
+        Balls on the table; obstacles for the probe only.
     alarms : list of str
-        Why nothing moves.
+        Texts of the alarms; while there are any, nothing moves.
     estop : bool
         Whether the emergency stop is pressed.
     stuck : {"open", "closed"} or None
         A fault of the probe: it never trips, or always.
     printed : list of (float, str)
-        Lines that NC programs have printed and will print, and when, s.
+        Lines of NC programs with the times at which they are printed, s.
     """
 
     seed: int
@@ -76,7 +76,7 @@ class Motion(SampleClock):
     def mount(self, tool: str) -> None:
         """Put the bar, the sphere or the touch probe into the spindle."""
         if tool not in TOOLS:
-            raise InstrumentError(f"The machine has a 'bar' and a 'sphere' to mount, and a 'probe'; found '{tool}'")
+            raise InstrumentError(f"Expected the tool 'bar', 'sphere' or 'probe'; found '{tool}'")
         with self._change:
             self._refuse_while_streaming("change the tool")
             self._refuse_in_alarm()
@@ -88,7 +88,7 @@ class Motion(SampleClock):
         """Step the sphere along a line; the motion starts a short and unknown time from now."""
         with self._change:
             if self.tool != "sphere":
-                raise InstrumentError("Only the sphere is stepped; mount it first")
+                raise InstrumentError("Only the sphere can be stepped; mount it first")
             self._refuse_to_move()
             begin = self._start_of_motion()
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
@@ -100,16 +100,16 @@ class Motion(SampleClock):
         with self._change:
             self._refuse_to_move()
             place, begin = self.path.place(self.time), self._start_of_motion()
-            errands = Errands(self, begin)
+            actions = ProgramActions(self, begin)
             try:
-                path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, errands)
+                path = interpret(text, tuple(place), self.machine.travel, self.machine.rapid, actions)
             except ErrormotionError:
-                errands.undo()
+                actions.undo()
                 self._programs -= 1
                 raise
             self.motion, self.path = None, path.beginning(begin)
-            self.program, self._program_events = title(text), errands.events
-            self.printed += errands.printed
+            self.program, self._program_events = title(text), actions.events
+            self.printed += actions.printed
             if self._warm_up is None:
                 self._warm_up = self.path.warm_up()
             return self.path
@@ -128,7 +128,7 @@ class Motion(SampleClock):
             if place is not None:
                 self._go(start, place, begin, feed)
                 way = float(np.linalg.norm(place - start))
-                self.raise_alarm(f"the probe has tripped during a move, {way * 1e3:.3f} mm on its way")
+                self.raise_alarm(f"the probe has tripped during a move, after {way * 1e3:.3f} mm")
                 self._refuse_in_alarm()
             return self._go(start, goal, begin, feed)
 
@@ -162,7 +162,7 @@ class Motion(SampleClock):
             if self.stuck == "closed" or not (
                 self.stuck == "open" or self.machine.released(start, begin, balls=self.balls)
             ):
-                raise InstrumentError("The probe is tripped before it moves; move it off what it touches, or mend it")
+                raise InstrumentError("The probe is tripped before it moves; remove the contact or repair the probe")
             self.tool = "probe"
             place = self.trip(start, goal, begin, feed)
             self._go(start, goal if place is None else place, begin, feed)
@@ -189,11 +189,11 @@ class Motion(SampleClock):
         with self._change:
             now = self._next_instant()
             if self.motion is not None and now < self.motion.end:
-                self.motion, self.path = None, Path.resting(self._sphere(now))  # the sphere is out of sight
+                self.motion, self.path = None, Path.resting(self._sphere(now))  # the sphere leaves the beams
             elif now < self.path.end:
                 self.path = self.path.cut(now)
                 self.machine.forget(self._program_events, now)
-                self.printed = [each for each in self.printed if each[0] <= now]  # the same ones: a printer knows them
+                self.printed = [each for each in self.printed if each[0] <= now]  # the same objects, see the printer
                 if self._warm_up is not None and self._warm_up > now:
                     self._warm_up = None
             self.program = ""
@@ -211,13 +211,15 @@ class Motion(SampleClock):
             self.alarms.clear()
             self.estop = False
 
-    # ------------------------------------------------------------------ what holds it back
+    # ------------------------------------------------------------------ refusals
 
     def _refuse_in_alarm(self) -> None:
         if self.estop:
             raise InstrumentError("The machine is in emergency stop; release it and reset the machine")
         if self.alarms:
-            raise InstrumentError(f"The machine is in alarm: {'; '.join(self.alarms)}. See to it and reset the machine")
+            raise InstrumentError(
+                f"The machine is in alarm: {'; '.join(self.alarms)}. Remove the cause and reset the machine"
+            )
 
     def _refuse_to_move(self) -> None:
         self._refuse_in_alarm()
@@ -240,14 +242,14 @@ class Motion(SampleClock):
     def _possible_feed(self, feed: float | None) -> float:
         chosen = self.machine.rapid if feed is None else float(feed)
         if not 0 < chosen <= self.machine.rapid * (1 + 1e-9):
-            raise InstrumentError(f"The feed is above 0 and at most {self.machine.rapid:g} m/s; found {chosen:g}")
+            raise InstrumentError(f"Expected a feed above 0 and at most {self.machine.rapid:g} m/s; found {chosen:g}")
         return chosen
 
     def commanded_speed(self, time: float) -> float:
         """Return the spindle speed that is commanded at a time, 1/min."""
         raise NotImplementedError
 
-    # ------------------------------------------------------------------ where it is
+    # ------------------------------------------------------------------ position
 
     def _go(self, start: Array, goal: Array, begin: float, feed: float) -> float:
         """Go in a straight line; return how long it takes, s."""
@@ -304,8 +306,8 @@ class Motion(SampleClock):
         return np.zeros_like(times) if begin is None else np.maximum(times - begin, 0.0)
 
 
-class Errands:
-    """What an NC program orders beside its path; see `nc_program.Peripherals`."""
+class ProgramActions:
+    """Actions of an NC program beside its path; see `nc_program.Peripherals`."""
 
     def __init__(self, world: Motion, begin: float) -> None:
         self._world, self._begin = world, begin
@@ -316,7 +318,7 @@ class Errands:
     def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
         """Refuse a move on which the probe would run into a ball."""
         if self._world.obstacle(start, goal, self._begin + time, feed) is not None:
-            raise InstrumentError("the probe would trip on this way")
+            raise InstrumentError("the probe would trip on this path")
 
     def skip(self, start: Array, goal: Array, feed: float, time: float) -> Array:
         """Return where the probe stops a move."""
@@ -335,7 +337,7 @@ class Errands:
             self._world.tool = "bar"
 
     def print(self, line: str, time: float) -> None:
-        """Print a line when the program is there."""
+        """Print a line at a time of the program."""
         self.printed.append((self._begin + time, line))
 
     def clock(self, time: float) -> float:
@@ -343,6 +345,6 @@ class Errands:
         return self._begin + time
 
     def undo(self) -> None:
-        """Take back what an aborted program has ordered."""
+        """Cancel the actions of an aborted program."""
         self._world.machine.forget(self.events, self._begin)
         self._world.tool = self._tool

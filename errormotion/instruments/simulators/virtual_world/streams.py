@@ -1,4 +1,4 @@
-"""What the virtual world knows of those who stream from it."""
+"""Interfaces of the devices of a virtual world."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 
 class Stream(Protocol):
-    """A channel that wants samples.
+    """A channel that receives samples.
 
-    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is how many its
-    reader has passed on, None where it is unknown. A stream that has ``ended`` wants no more. Its readings count
+    ``start`` and ``position`` are the numbers of its first and next sample since time 0, ``taken`` is the number
+    that its reader has delivered, None where unknown. A stream that has ``ended`` receives no more. Its readings count
     from the start of its ``measuring_range`` (m).
     """
 
@@ -52,7 +52,7 @@ class Carried(Protocol):
     """A simulated device that is carried from station to station beside the machine."""
 
     def carry_to(self, position: Sequence[float]) -> None:
-        """Put it near a position in machine coordinates, m, and have it take up its beam again."""
+        """Move it near a position in machine coordinates, m, and let it lock on to its reflector again."""
 
 
 class Device(Protocol):

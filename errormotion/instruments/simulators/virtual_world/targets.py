@@ -1,4 +1,4 @@
-"""What the point sensors of a virtual world look at, once a target is put before them."""
+"""Targets of the point sensors of a virtual world."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = np.ndarray[Any, Any]
 
 
 class TargetStand:
-    """Holds one target, or none, and states what the machine's point sensor reads of it.
+    """Holds one target, or none, and returns the readings of the machine's point sensor.
 
     Every point sensor in the world is then that one on the stage, whatever its name: one that counts from the middle
     of a range of its own, or one that counts from the start.
@@ -39,7 +39,7 @@ class TargetStand:
         self.target: Target | None = None
         self.order: dict[str, Any] | None = None
         self._machine = machine
-        self._settings = 0  # each time the gauge is set its face stands a little different
+        self._settings = 0  # each setting of the gauge has other deviations
 
     def put(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
         """Put ``"plane"`` (with its angles, rad) or ``"bar"`` before the sensors, or take away what is there (None).
@@ -51,11 +51,10 @@ class TargetStand:
         """
         plane = kind == "plane"
         if kind not in (None, "plane", "bar"):
-            raise InstrumentError(f"The targets are a 'plane', a 'bar', or None for none; found {kind!r}")
+            raise InstrumentError(f"Expected the target 'plane', 'bar' or None; found {kind!r}")
         if [angle is not None for angle in (inclination, rotation)] != [plane, plane]:
             raise InstrumentError(
-                "Expected inclination and rotation (rad) for a plane, and for nothing else; found "
-                f"{kind!r}, {inclination}, {rotation}"
+                f"Expected inclination and rotation (rad) for a plane only; found {kind!r}, {inclination}, {rotation}"
             )
         if inclination is not None and rotation is not None:
             face = self._machine.sine_gauge.face(float(inclination), float(rotation), self._settings)
@@ -72,11 +71,11 @@ class TargetStand:
         Parameters
         ----------
         name : str
-            Of the sensor: another name, other noise.
+            Name of the sensor; determines its noise.
         times : (n,)
             s.
         stage : (n, 3) or (3,)
-            Where the stage is then, m.
+            Positions of the stage, m.
         first : int
             Number of the first reading.
         measuring_range : float, optional

@@ -33,9 +33,9 @@ class VirtualWorld(Motion):
     Attributes
     ----------
     machine : VirtualMachine
-        The twin, which knows the truth.
+        The twin with the true errors.
     stand : TargetStand
-        What the point sensors look at.
+        Target of the point sensors.
     """
 
     def __init__(self, name: str, seed: int, *, warm: bool = True) -> None:
@@ -47,24 +47,24 @@ class VirtualWorld(Motion):
         self._compile()
         super().__init__()
         self.stand = TargetStand(self.machine)
-        self._asked = 0  # readings by command
+        self._readings = 0  # by command
         self._devices: set[Device] = set()
 
     def _compile(self) -> None:
-        """Have the twin's loops compiled now, so that the first samples are not late."""
+        """Compile the twin's loops before the first samples."""
         resting = StepProgram((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1e-5, 1)
         self.machine.distances(0, 1, 1e3, tool="bar")
         self.machine.distances(0, 1, 1e3, tool="sphere", motion=resting)
 
     def attach(self, device: Device, pace: float | None = None) -> None:
-        """Count a device in; ``pace`` holds for the whole world."""
+        """Register a device; ``pace`` holds for the whole world."""
         with self._change:
             self._devices.add(device)
             if pace is not None:
                 self.pace = pace
 
     def detach(self, device: Device) -> None:
-        """Count a device out; with the last one the world ends."""
+        """Unregister a device; with the last one the world ends."""
         with self._change:
             self._devices.discard(device)
             empty = not self._devices
@@ -72,7 +72,7 @@ class VirtualWorld(Motion):
             self.end()
 
     def end(self) -> None:
-        """Forget this world, end its devices and its thread; its truth can still be read. Idempotent."""
+        """End this world, its devices and its thread; its truth can still be read. Idempotent."""
         with _lock:
             if _worlds.get(self._key) is self:
                 del _worlds[self._key]
@@ -104,7 +104,7 @@ class VirtualWorld(Motion):
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
         if not seconds >= 0:
-            raise InstrumentError(f"Time passes forwards only; found {seconds} s")
+            raise InstrumentError(f"Expected a time of at least 0 s; found {seconds} s")
         with self._change:
             self._refuse_while_streaming("let time pass")
             self._set_clock(self.time + seconds)
@@ -130,7 +130,7 @@ class VirtualWorld(Motion):
         """How long the sensors have been on, s."""
         return self.machine.sensors_on_for + self.time
 
-    # ------------------------------------------------------------------ what a controller shows
+    # ------------------------------------------------------------------ state of the controller
 
     def commanded_speed(self, time: float) -> float:
         """Return the spindle speed that is commanded at a time, 1/min."""
@@ -186,7 +186,7 @@ class VirtualWorld(Motion):
         """Have the trackers beside the machine carried to a position in its coordinates, m."""
         trackers = [device for device in self._devices if isinstance(device, Carried)]
         if not trackers:
-            raise InstrumentError("No tracker is beside this machine; open it first, at the same machine and seed")
+            raise InstrumentError("This machine has no tracker; open one first, at the same machine and seed")
         with self._change:
             self._refuse_while_streaming("carry a tracker")
         for tracker in trackers:
@@ -198,9 +198,9 @@ class VirtualWorld(Motion):
         Minus or plus infinity before or behind its range; NaN without a target, and where the beam misses it.
         """
         with self._change:
-            self._asked += 1
+            self._readings += 1
             now = np.array([self.time])
-            return float(self.stand.read(name, now, self.path.place(now), self._asked)[0])
+            return float(self.stand.read(name, now, self.path.place(now), self._readings)[0])
 
     def _distances(self, first: int, n: int, rate: float, streams: Sequence[Stream]) -> np.ndarray[Any, Any]:
         if self.stand.target is not None:
@@ -216,7 +216,7 @@ _lock = threading.RLock()
 
 
 def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualWorld:
-    """Return the world of a machine and seed; made when it is not there yet."""
+    """Return the world of a machine and seed, which is created at the first call."""
     with _lock:
         key = (name, int(seed), warm)
         machine = described(name)

@@ -60,9 +60,9 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
         full = -(-needed // (n - 3))
         raise MethodError(
             f"expected at least {full} targets seen by all {n} stations, or as many readings spread otherwise, for "
-            f"{needed} unknowns of the stations (places and dead paths); found {equations} equations in {m} targets, "
-            f"of which {int(np.count_nonzero(count == n))} are seen by all and {int(np.count_nonzero(count < 3))} by "
-            "fewer than three; measure more targets"
+            f"{needed} unknowns of the stations (positions and dead paths); found {equations} equations in {m} "
+            f"targets, of which {int(np.count_nonzero(count == n))} are seen by all and "
+            f"{int(np.count_nonzero(count < 3))} by fewer than three; measure more targets"
         )
 
 
@@ -71,7 +71,7 @@ def refuse_nowhere(*sums: Array) -> None:
     if not all(np.isfinite(each).all() for each in sums):
         raise MethodError(
             "expected every target away from every station, and noise and distances in metres, found a distance that "
-            "has no direction or a weight beyond all numbers; check places and noise"
+            "is zero or a weight that is not finite; check positions and noise"
         )
 
 
@@ -100,8 +100,8 @@ def refuse_loose(information: Array, basis: Array, stations: Stations, target: A
     named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(loose)[:_NAMED])
     worst = sigma[0] if values[0] > DIGITS * values[-1] else np.inf
     raise MethodError(
-        f"expected places of stations and targets whose distances fix them all, found {k} "
-        f"{'freedom' if k == 1 else 'freedoms'} loose (standard uncertainty {_length(worst)}): {named}. "
+        f"expected positions of stations and targets that the distances determine, found {k} "
+        f"undetermined {'freedom' if k == 1 else 'freedoms'} (standard uncertainty {_length(worst)}): {named}. "
         f"Cause: {_reason(rough, target)}"
     )
 

@@ -72,7 +72,7 @@ def solve(
     Raises
     ------
     MethodError
-        Fewer readings than unknowns, places that leave a freedom loose, or readings that fit no network.
+        Fewer readings than unknowns, positions that leave a freedom undetermined, or readings that fit no network.
 
     Notes
     -----

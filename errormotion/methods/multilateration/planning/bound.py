@@ -50,7 +50,7 @@ def bound(
     Raises
     ------
     MethodError
-        Places that leave a freedom loose.
+        Positions that leave a freedom undetermined.
     """
     u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
     if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:

@@ -60,7 +60,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     Raises
     ------
     MethodError
-        The layout leaves a freedom loose, or there is no better one within the boxes.
+        The layout leaves a freedom undetermined, or there is no better one within the boxes.
     """
     p = settings.layout
     planning = planning or settings.planning

@@ -124,7 +124,7 @@ def _motion(data: Readings, settings: Settings) -> Motion:
 
 
 def _noise_factor(found: rigid.Rigid, stated: bool, settings: Settings, notes: list[str]) -> float:
-    """Return the variance of a number of weight 1."""
+    """Return the variance of unit weight (variance factor)."""
     if found.freedom < 1 and not stated:
         raise MethodError(
             "The noise of a touch is not stated (touch_noise), and there are no redundant touches to estimate it. "

@@ -205,7 +205,7 @@ def moving_to(fake: FakeLinuxCNC, place: tuple[float, ...]) -> Callable[[str], N
 def test_nothing_that_comes_in_ends_it(play: Callable[[Test], None], line: bytes) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         wire.reader.feed_data(line + b"\n")
-        assert "no request" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
+        assert "expected a request in JSON" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
         assert (await wire.ask("state"))["enabled"] is True
 
     play(test)
@@ -226,8 +226,8 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monke
 @pytest.mark.parametrize(
     ("op", "arguments", "said"),
     [
-        ("fly", {}, "no such operation: fly"),
-        ("_take", {}, "no such operation"),
+        ("fly", {}, "unknown operation: fly"),
+        ("_take", {}, "unknown operation"),
         ("state", {"of": 1}, "TypeError"),
         ("move_to", {}, "TypeError"),
         ("move_to", {"position": "home"}, "expected a position"),
@@ -239,7 +239,7 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monke
         ("spindle", {"speed": "fast"}, "expected spindle speed"),
         ("run_program", {"text": 5}, "expected the text"),
         ("elapse", {"seconds": -1}, "expected a time"),
-        ("set_pins", {"pins": {"spindle.0.speed-in": 1}}, "no client may set"),
+        ("set_pins", {"pins": {"spindle.0.speed-in": 1}}, "not among those that clients may set"),
     ],
 )
 def test_wrong_orders_are_refused_in_words(
@@ -291,7 +291,9 @@ def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test],
     """Another display may have taken the text: it is the position that reports."""
 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        assert "stopped at 0.0000, 0.0000, 0.0000 mm before its goal" in await wire.ask("move_to", position=[0, 0, 0.1])
+        assert "stopped before its goal, at 0.0000, 0.0000, 0.0000 mm" in await wire.ask(
+            "move_to", position=[0, 0, 0.1]
+        )
 
     play(test)
 
@@ -299,7 +301,9 @@ def test_an_error_without_a_text_is_an_error_all_the_same(play: Callable[[Test],
 def test_the_text_of_an_error_may_come_late(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: asyncio.get_running_loop().call_later(0.02, fake.error, "too bad")  # type: ignore[assignment,return-value]
-        assert (await wire.ask("move_to", position=[0, 0, 0.1])).endswith("before its goal: too bad")
+        assert (await wire.ask("move_to", position=[0, 0, 0.1])).endswith(
+            "before its goal, at 0.0000, 0.0000, 0.0000 mm: too bad"
+        )
 
     play(test)
 
@@ -339,7 +343,7 @@ def test_probing_is_in_the_work_frame_and_its_result_is_not(play: Callable[[Test
         ({"task_state": FakeLinuxCNC.STATE_OFF}, "is off"),
         ({"homed": (1, 0, 1)}, "not homed"),
         ({"joints": 0}, "not homed"),
-        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "not by an order through this bridge"),
+        ({"interp_state": FakeLinuxCNC.INTERP_READING}, "this bridge has not ordered"),
         ({"probe_val": 1}, "tripped before it moves"),
         ({"spindle": ({"speed": 9.0, "direction": 1},)}, "spindle turns"),
     ],
@@ -358,7 +362,7 @@ def test_probes_with_a_machine_that_is_ready_only(
 def test_an_e_stop_by_hand_breaks_a_move_off(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.on_mdi = lambda line: setattr(fake.values, "task_state", fake.STATE_ESTOP)
-        assert "move to was broken off: e-stop" in await wire.ask("move_to", position=[0, 0, 0.1])
+        assert "move to was aborted: e-stop" in await wire.ask("move_to", position=[0, 0, 0.1])
         fake.values.task_state = fake.STATE_ON
         fake.on_mdi = lambda line: setattr(fake.values, "task_state", fake.STATE_OFF)
         assert "switched off" in await wire.ask("move_to", position=[0, 0, 0.1])
@@ -380,7 +384,7 @@ def test_the_e_stop_that_stays_pressed_is_told(play: Callable[[Test], None]) -> 
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
         fake.state = lambda state: fake._took("ignored")  # type: ignore[method-assign]
         fake.values.task_state = fake.STATE_ESTOP
-        assert "is a button pressed" in await wire.ask("reset")
+        assert "check the buttons" in await wire.ask("reset")
         fake.values.task_state = fake.STATE_OFF
         assert "stays off" in await wire.ask("enable")
 
@@ -405,7 +409,7 @@ def test_an_order_beats_until_it_ends_and_others_wait_their_turn(play: Callable[
             await asyncio.sleep(0.01)
         assert await other.ask("spindle", speed=1) == "the machine is busy: move to"
         assert await other.ask("stop") is None
-        assert "broken off: it was stopped" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
+        assert "aborted: it was stopped" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
         assert wire.beats >= 1
         assert fake.lines.count("abort") == 1
         await other.disconnect()
@@ -447,7 +451,7 @@ def test_what_is_broken_off_before_it_began_does_not_begin(
             bridge._end_jobs("it was stopped", None)
 
         fake.mode = interrupted  # type: ignore[method-assign]
-        assert "broken off: it was stopped" in await wire.ask(op, **arguments)
+        assert "aborted: it was stopped" in await wire.ask(op, **arguments)
         assert "abort" in fake.lines
         assert not [line for line in fake.lines if line.startswith(("G", "M", "run"))]
 

@@ -33,7 +33,7 @@ def test_a_second_one_waits_and_then_says_why(own_lock: Path) -> None:
     first = os.open(own_lock, os.O_RDONLY)
     fcntl.flock(first, fcntl.LOCK_EX)
     try:
-        with pytest.raises(InstrumentError, match="room for one; it did not end in time"):
+        with pytest.raises(InstrumentError, match="can run one LinuxCNC; another simulated one did not end in time"):
             LinuxCNCProcess({}, BRIDGE, wait=0.2)
     finally:
         os.close(first)
@@ -46,7 +46,7 @@ def test_a_linuxcnc_that_may_run_a_machine_is_not_touched(
     theirs = linuxcnc_process.LINUXCNC_LOCK
     theirs.touch()
     monkeypatch.setattr(linuxcnc_process, "_processes", lambda: {4711: (name, "S")})
-    with pytest.raises(InstrumentError, match=rf"not a simulated one of ours: {name} \(4711\)"):
+    with pytest.raises(InstrumentError, match=rf"not simulated runs on this computer: {name} \(4711\)"):
         LinuxCNCProcess({}, BRIDGE, wait=0.2)
     assert theirs.exists()
 

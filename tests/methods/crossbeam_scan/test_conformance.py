@@ -1,0 +1,14 @@
+"""The method passes the conformance kit with each of its subjects."""
+
+from errormotion.methods.crossbeam_scan.conformance import subjects
+from errormotion.testing import MethodConformance
+
+SUBJECTS = subjects()
+
+
+class TestCrossbeamScan(MethodConformance):
+    subject = SUBJECTS[0]
+
+
+class TestCrossbeamScanSecond(MethodConformance):
+    subject = SUBJECTS[1]
