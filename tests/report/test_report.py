@@ -131,7 +131,7 @@ def test_the_iso_table_names_range_and_difference(page, drift):
 
 
 def test_a_value_that_holds_a_compensation_step_says_so(page):
-    assert "holds the step of a compensation that was switched in this interval" in page.text
+    assert "includes the step of a compensation that was switched in this interval" in page.text
 
 
 def test_a_switched_compensation_is_told_with_its_change(page):

@@ -131,7 +131,7 @@ def _named(bar: Bar) -> Table:
         for k in positions[:_NAMED]
     ]
     notes = [f"{len(positions) - _NAMED} more are in the dataset."] if len(positions) > _NAMED else []
-    caption = "Outliers among the points of the bar, which were left out."
+    caption = "Points of the bar that were left out as outliers."
     return Table(caption, ["point", "azimuth / °", "residual / µm"], rows, notes=notes)
 
 

@@ -53,10 +53,8 @@ def space(beam: Found, key: str) -> Figure | None:
     words = f"Beam and nominal beam. Left, in space, from one zero point: the deviation enlarged {times(factor)}"
     if cone is not None:
         words += f", the cone of the expanded uncertainty (k = 2) {times(cone_factor)}"
-    words += (
-        f"; the disc is perpendicular to the nominal beam and its rim {number(ring / ARCSEC)} arcsec from it. Right: "
-    )
-    words += "seen along the nominal beam, to scale" + ("." if cone is None else ", the ellipse as well.")
+    words += f"; the disc is perpendicular to the nominal beam, its rim {number(ring / ARCSEC)} arcsec from it. Right: "
+    words += "view along the nominal beam, to scale" + ("." if cone is None else ", the ellipse as well.")
     towards = ", ".join(
         f"{fixed(tip / ARCSEC, 0, signed=True)} arcsec towards {name}"
         for tip, name in zip(tips["measured"], names, strict=True)
@@ -174,7 +172,8 @@ def lines(beam: Found, key: str) -> Figure | None:
     check = " The lines of two planes always intersect: they are no check of each other." if steady.sum() == 2 else ""
     caption = (
         "Condition of each plane for the direction, along the beam, which is in the middle: every direction "
-        "on the line of a plane fulfils its condition. Bands: noise of its readings, k = 2; narrower for steep planes."
+        "on the line of a plane fulfils its condition. Bands: noise of its readings, k = 2; narrower for more inclined "
+        "planes."
     )
     return Figure(
         canvas.draw(paint, key, 3.3), caption + check, f"Lines of the planes about the beam: {'; '.join(words)}."

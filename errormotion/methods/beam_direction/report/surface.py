@@ -104,7 +104,8 @@ def _extrapolated(planes: Planes, calibration: InclinationCalibration) -> list[B
     names = listed([planes.names[k] for k in np.flatnonzero(bare)])
     lies = f"planes {names} lie" if bare.sum() > 1 else f"plane {names} lies"
     words = (
-        f"With the tilt to the beam, {lies} outside the calibrated settings: its correction is extrapolated."
+        f"With the tilt to the beam, {lies} outside the settings of the calibration: the correction there is "
+        "extrapolated."
     )
     return [Text(words, "warning")]
 

@@ -96,7 +96,9 @@ def _summary(source: Source) -> list[str]:
     if largest:
         words.append(f"The largest share in the variance of Z {_when(errors)}: {largest[0]}, {largest[1]}.")
     if errors.attrs.get("beams") == "nominal":
-        words.append("Nominal beams were used: the accuracy of the bar's position is limited to that of the drawing.")
+        words.append(
+            "Nominal beams were used, not detected ones: the position of the bar is only as accurate as the drawing."
+        )
     unseen = [name for name in ("EX", "EY", "EZ", "EA", "EB", "EC") if not np.isfinite(errors[name].values).any()]
     if unseen:
         names = iso_names("spindle")
