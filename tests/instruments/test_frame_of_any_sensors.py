@@ -57,7 +57,7 @@ def test_sensors_without_synchronisation_are_read_together() -> None:
         known = values[channel][np.isfinite(values[channel])]
         np.testing.assert_allclose(known, 1e-4 * channel, atol=1e-12)
     lost = sum(block.dropped for block in blocks)
-    unknown = sum(block.invalid["Z no value"] for block in blocks)
+    unknown = sum(block.invalid.get("Z no value", 0) for block in blocks)
     assert np.isnan(values[0]).sum() == lost
     assert np.isnan(values[4]).sum() == lost + unknown
     assert unknown == (60 - lost) // 3
