@@ -11,6 +11,7 @@ import xarray as xr
 
 from errormotion import plugins
 from errormotion.cli.output import table
+from errormotion.datasets.merit import is_planned, last_values
 from errormotion.plugins import FigureOfMerit
 
 FIELD_UNITS = {"m": (1e6, "um"), "rad": (648000 / np.pi, "arcsec")}
@@ -24,27 +25,10 @@ def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
 
     A plan states no errors and has none.
     """
-    if "planned" in str(errors.attrs.get("reference", "")):
+    if is_planned(errors):
         return []
     owner = plugins.owner_of_method(str(errors.attrs.get("method")))
     return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
-
-
-def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return every estimate at its last known time with its expanded uncertainty; none for a dataset without time."""
-    found = []
-    covariance = errors.em.covariance().values
-    for k, name in enumerate(errors.em.names):
-        error = errors[name]
-        values = np.asarray(error.values, dtype=float)
-        known = np.flatnonzero(np.isfinite(values))
-        if error.dims != ("time",) or known.size == 0:
-            continue
-        last = int(known[-1])
-        minutes = float(errors["time"].values[last]) / 60.0
-        u = math.sqrt(float(covariance[last, k, k]))
-        found.append(FigureOfMerit(f"{name} after {minutes:.1f} min", float(values[last]), 2 * u, error.attrs["units"]))
-    return found
 
 
 def as_printed(figure: FigureOfMerit) -> dict[str, Any]:

@@ -17,16 +17,21 @@ def is_planned(errors: xr.Dataset) -> bool:
     return "planned" in str(errors.attrs.get("reference", ""))
 
 
-def final_errors(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return every known freedom at its last known instant of a drift; empty for a dataset over other dimensions."""
-    if errors["EX"].dims != ("time",):
-        return []
+def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return every estimate at its last known time, with U (k = 2); empty for a dataset over other dimensions."""
     found = []
-    for k, name in enumerate(errors["dof"].values):
-        known = np.flatnonzero(np.isfinite(errors[str(name)].values))
-        if known.size:
-            minutes = float(errors["time"].values[known[-1]]) / 60.0
-            found.append(_freedom(errors, k, str(name), int(known[-1]), f"{name} after {minutes:.1f} min"))
+    covariance = errors.em.covariance().values
+    for k, name in enumerate(errors.em.names):
+        error = errors[name]
+        known = np.flatnonzero(np.isfinite(np.asarray(error.values, dtype=float)))
+        if error.dims != ("time",) or known.size == 0:
+            continue
+        last = int(known[-1])
+        minutes = float(errors["time"].values[last]) / 60.0
+        U = 2.0 * float(np.sqrt(covariance[last, k, k]))
+        found.append(
+            FigureOfMerit(f"{name} after {minutes:.1f} min", float(error.values[last]), U, error.attrs["units"])
+        )
     return found
 
 

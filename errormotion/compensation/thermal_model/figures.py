@@ -7,9 +7,9 @@ import math
 import numpy as np
 import xarray as xr
 
+from errormotion.datasets.merit import last_values
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.plugins import FigureOfMerit
-from errormotion.report.figures import last_values
 
 
 def figures(dataset: xr.Dataset) -> list[FigureOfMerit]:

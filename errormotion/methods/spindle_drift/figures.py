@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.datasets.merit import beam_errors, final_errors, is_planned
+from errormotion.datasets.merit import beam_errors, is_planned, last_values
 from errormotion.plugins import FigureOfMerit
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
     """
     if is_planned(errors):
         return []
-    return [*beam_errors(errors), *final_errors(errors), *_ranges(errors)]
+    return [*beam_errors(errors), *last_values(errors), *_ranges(errors)]
 
 
 def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
