@@ -298,3 +298,15 @@ def test_reference_names_every_command_and_option() -> None:
         options = [option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)]
         missing += [f"{name} {option}" for option in options if option.startswith("--") and f"`{option}" not in page]
     assert missing == []
+
+
+def test_validate_counts_the_mistakes_of_a_campaign_and_of_its_bench(answer: Answer, tmp_path: Path) -> None:
+    text = BENCH.read_text()
+    (tmp_path / "bench.toml").write_text(text.replace("X-Y-bed", "X-X-bed").replace("rate =", "raet ="))
+    (tmp_path / "campaign.toml").write_text(
+        'schema = "errormotion.campaign/1"\nname = "one"\nbench = "bench.toml"\ncolour = 1\n'
+        '[[test]]\nname = "drift"\nmethod = "spindle_drift"\n'
+    )
+    found = answer("validate", "campaign.toml", code=3)["violations"]
+    assert [line.partition(":")[0] for line in found] == ["colour", "bench.toml", "bench.toml"]
+    assert answer("validate", "bench.toml", code=3)["violations"][0].startswith("machine.chain: expected every axis")

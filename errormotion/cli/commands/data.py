@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,8 +170,24 @@ def _of_toml(file: Path) -> list[str]:
         else:
             load_bench(file)
     except ErrormotionError as error:
-        return str(error).removeprefix(f"{file}: ").split("\n  - ")
+        return _mistakes(str(error), file)
     return []
+
+
+def _mistakes(message: str, file: Path) -> list[str]:
+    """Return the single mistakes of a message; those of another file, such as the bench of a campaign, name it."""
+    found, source = [], str(file)
+    for line in message.splitlines():
+        if line.startswith("  - "):
+            text = line.removeprefix("  - ")
+            found.append(text if source == str(file) else f"{source}: {text}")
+        elif re.fullmatch(r".*: \d+ mistakes?", line):
+            source = line.rpartition(": ")[0]
+        elif found and line.startswith(" "):
+            found[-1] += f"\n{line}"
+        else:
+            found.append(line.removeprefix(f"{file}: "))
+    return found
 
 
 def _of_run(path: Path) -> list[str]:
