@@ -14,7 +14,13 @@ from pydantic import BaseModel, ConfigDict
 if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
 
-Status = Literal["hardware_verified", "replay_verified", "simulated_only"]
+Status = Literal["hardware_verified", "replay_verified", "peer_verified", "simulated_only"]
+"""How a plugin was verified, the strongest first.
+
+``hardware_verified``: with the real device. ``replay_verified``: with a recorded session of the real device.
+``peer_verified``: with an independent implementation of the protocol at the other end. ``simulated_only``: with the
+project's own simulator.
+"""
 
 ERRORS_SCHEMA = "errormotion.errors/1"
 """Schema of every error dataset, whichever method it comes from."""
@@ -30,7 +36,7 @@ class PluginSettings(BaseModel):
 class InstrumentInfo:
     """Description of an instrument.
 
-    ``status`` states how it was verified: ``hardware_verified``, ``replay_verified`` or ``simulated_only``.
+    ``status`` states how it was verified; see `Status`.
     ``simulator`` names the wire simulator behind ``sim://`` as ``module:Class``; None where there is none.
     """
 

@@ -5,12 +5,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from typer.testing import Result
 
 from errormotion import datasets, plugins
+from errormotion.plugins.contracts import Status
 
 Run = Callable[..., Result]
 Answer = Callable[..., Any]
@@ -51,7 +52,7 @@ def test_plugins_are_listed_with_what_they_are(run: Run, answer: Answer) -> None
     found = {plugin["id"]: plugin for plugin in answer("plugins", "list")["plugins"]}
     assert found["spindle_drift"]["group"] == "methods"
     assert found["optoncdt"]["kind"] == "point_lds"
-    assert found["optoncdt"]["status"] in ("hardware_verified", "replay_verified", "simulated_only")
+    assert found["optoncdt"]["status"] in get_args(Status)
     assert "Micro-Epsilon" in run("plugins", "list").stdout
 
 
