@@ -172,8 +172,8 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
 
 
 _TOUCHED = (
-    "{}: expected whole numbers along its own dimension; a mean or an interpolation of plain xarray changed them, which "
-    "does not carry the covariance along. Use ds.em.mean, ds.em.to_times or ds.em.to_positions"
+    "{}: expected whole numbers along its own dimension; a mean or an interpolation of plain xarray changed them and "
+    "did not carry the covariance along. Use ds.em.mean, ds.em.to_times or ds.em.to_positions"
 )
 
 
