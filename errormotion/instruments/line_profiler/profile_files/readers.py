@@ -73,7 +73,7 @@ def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
 
 
 def _csv_rows(path: Path, delimiter: str) -> Array:
-    """Return the cells of a CSV file, (row, column); NaN where empty. A delimiter that ends the lines adds no column."""
+    """Return the cells of a CSV file, (row, column); NaN where empty. A delimiter at the end adds no column."""
     rows: list[list[float]] = []
     lines: list[tuple[int, bool]] = []  # number of the line, and whether it ends with a delimiter
     number = 0
