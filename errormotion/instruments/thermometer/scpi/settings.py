@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal, Self, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -127,12 +127,12 @@ class ScpiSettings(ThermometerSettings):
         """Return the commands that set the format of readings: the reading and its channel."""
         return ("FORM:READ:ALAR OFF", "FORM:READ:CHAN ON", "FORM:READ:TIME OFF", "FORM:READ:UNIT OFF")
 
-    def _groups(self, of_each: tuple[T, ...]) -> Iterator[tuple[T, list[int]]]:
+    def _groups(self, of_each: Sequence[T]) -> Iterator[tuple[T, list[int]]]:
         """Yield each different value with its channels, in ascending order."""
         for value in dict.fromkeys(of_each):
             yield value, sorted(number for number, own in zip(self.numbers, of_each, strict=True) if own == value)
 
-    def _each(self, value: T | tuple[T, ...]) -> tuple[T, ...]:
+    def _each(self, value: Any) -> tuple[Any, ...]:
         """Return one value for each channel."""
         if not isinstance(value, tuple):
             return (value,) * len(self.channels)
