@@ -21,12 +21,12 @@ compiled = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 def wire(raws: list[int], first: int = 0, counter: bool = True) -> bytes:
     """What the sensor sends, by the plain codec."""
-    data = b""
+    values: list[bytes] = []
     for number, raw in enumerate(raws, first):
-        data += codec.encode_value(raw)
+        values.append(codec.encode_value(raw))
         if counter:
-            data += codec.encode_value(number & 0x3FFFF, first=False)
-    return data
+            values.append(codec.encode_value(number & 0x3FFFF, first=False))
+    return b"".join(values)
 
 
 def decode(pieces: list[bytes], counter: bool = True, from_zero: bool = True) -> tuple[np.ndarray, np.ndarray, bytes]:
