@@ -19,20 +19,24 @@ HIGHEST = MODELS["ILD2300"].highest
 compiled = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-def wire(raws: list[int], first: int = 0, counter: bool = True) -> bytes:
+def wire(raws: list[int], first: int = 0, counter: bool = True, *, counter_first: bool = False) -> bytes:
     """What the sensor sends, by the plain codec."""
     values: list[bytes] = []
     for number, raw in enumerate(raws, first):
-        values.append(codec.encode_value(raw))
-        if counter:
-            values.append(codec.encode_value(number & 0x3FFFF, first=False))
+        row = [raw, number & 0x3FFFF] if counter else [raw]
+        for position, value in enumerate(reversed(row) if counter_first else row):
+            values.append(codec.encode_value(value, first=position == 0))
     return b"".join(values)
 
 
-def decode(pieces: list[bytes], counter: bool = True, from_zero: bool = True) -> tuple[np.ndarray, np.ndarray, bytes]:
+def decode(
+    pieces: list[bytes], counter: bool = True, from_zero: bool = True, *, counter_first: bool = False
+) -> tuple[np.ndarray, np.ndarray, bytes]:
     """Values (range 1, so that they are relative), reasons and text."""
-    decoder = StreamDecoder(1.0, highest=HIGHEST, counter=counter, from_zero=from_zero)
-    chunks = [decoder(piece) for piece in pieces]
+    decoder = StreamDecoder(1.0, highest=HIGHEST, counter=counter, counter_first=counter_first, from_zero=from_zero)
+    another = [codec.encode_value(0), codec.encode_value(0, first=False)]  # confirms the last one
+    confirming = another[:1] if not counter else another if counter_first else []
+    chunks = [decoder(piece) for piece in [*pieces, *confirming]]
     return (
         np.concatenate([chunk.values for chunk in chunks]),
         np.concatenate([chunk.reasons for chunk in chunks]),
@@ -49,14 +53,19 @@ def test_values_by_the_documents(vector: Vector) -> None:
     raw, first = vector.expected["raw"], vector.expected["first"]
     assert codec.encode_value(raw, first=first) == vector.data
     assert codec.decode_value(vector.data) == raw
-    if "distance_mm" in vector.expected:
-        found = codec.distance(raw, vector.expected["range_mm"])
-        assert found == pytest.approx(vector.expected["distance_mm"], abs=5e-6)  # it was printed from a 32-bit float
     if "reason" in vector.expected:
         assert codec.reason(raw, HIGHEST) == vector.expected["reason"]
 
 
-@pytest.mark.parametrize("vector", vectors("optoncdt", "info"), ids=str)
+@pytest.mark.parametrize("vector", vectors("optoncdt", "distance"), ids=str)
+def test_distances_by_the_documents(vector: Vector) -> None:
+    raw = codec.decode_value(vector.data)
+    assert raw == vector.expected["raw"]
+    found = codec.distance(raw, vector.expected["range_mm"])
+    assert found == pytest.approx(vector.expected["distance_mm"], abs=5e-6)  # some were printed from a 32-bit float
+
+
+@pytest.mark.parametrize("vector", vectors("optoncdt", "getinfo"), ids=str)
 def test_identities_by_the_manuals(vector: Vector) -> None:
     facts = commands.parse_info(commands.parse_answer("GETINFO", vector.data))
     expected = dict(vector.expected)
@@ -152,10 +161,16 @@ def splits(draw: st.DrawFn, data: bytes) -> list[bytes]:
     return [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
 
 
-@given(st.data(), st.lists(st.integers(0, 65535) | st.sampled_from(ALL_CODES), max_size=40), st.booleans())
+ORDERS = st.sampled_from([(False, False), (True, False), (True, True)])
+"""With a counter, and whether it precedes the distance."""
+
+
+@given(st.data(), st.lists(st.integers(0, 65535) | st.sampled_from(ALL_CODES), max_size=40), ORDERS)
 @compiled
-def test_any_split_gives_the_same_samples(data: st.DataObject, raws: list[int], counter: bool) -> None:
-    values, reasons, text = decode(data.draw(splits(wire(raws, counter=counter))), counter)
+def test_any_split_gives_the_same_samples(data: st.DataObject, raws: list[int], order: tuple[bool, bool]) -> None:
+    counter, counter_first = order
+    pieces = data.draw(splits(wire(raws, counter=counter, counter_first=counter_first)))
+    values, reasons, text = decode(pieces, counter, counter_first=counter_first)
     np.testing.assert_allclose(values, expected(raws), rtol=1e-12, atol=1e-12)
     assert [codec.REASONS[code] for code in reasons] == [codec.reason(raw, HIGHEST) for raw in raws]
     assert text == b""
@@ -191,19 +206,20 @@ def test_answers_between_the_data_are_told_apart_and_harm_nothing(
     st.data(),
     st.lists(st.integers(643, 64876), min_size=30, max_size=60),
     st.lists(st.binary(min_size=1, max_size=5), min_size=1, max_size=4),
+    st.booleans(),
 )
 @compiled
 def test_garbage_makes_no_wrong_value_and_costs_few_samples(
-    data: st.DataObject, raws: list[int], garbage: list[bytes]
+    data: st.DataObject, raws: list[int], garbage: list[bytes], counter_first: bool
 ) -> None:
     """One stray burst spoils at most the sample it hits and two after it; what keeps a value has the right one."""
     base = 123456  # no burst of 5 bytes is a sample with the right counter, which takes 6
-    stream = wire(raws, base)
-    places = sorted(data.draw(st.lists(st.integers(1, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
+    stream = wire(raws, base, counter_first=counter_first)
+    places = sorted(data.draw(st.lists(st.integers(2, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
     for place, burst in reversed(list(zip(places, garbage, strict=True))):
         at = place * 6 + data.draw(st.integers(0, 5))
         stream = stream[:at] + burst + stream[at:]
-    values, reasons, _ = decode(data.draw(splits(stream)), from_zero=False)
+    values, reasons, _ = decode(data.draw(splits(stream)), from_zero=False, counter_first=counter_first)
     known = np.isfinite(values)
     np.testing.assert_allclose(values[known], np.array(expected(raws))[: values.size][known], rtol=1e-12)
     assert (~known).sum() <= 3 * len(garbage)

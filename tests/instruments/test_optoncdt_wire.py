@@ -90,7 +90,8 @@ def test_the_range_is_the_one_that_the_sensor_reports(millimetres: float) -> Non
         ("ILD2300", {"OUTADD_RS422": "SHUTTER INTENSITY"}),
         ("ILD2300", {"OUTSTATISTIC_RS422": "MIN MAX PEAK2PEAK"}),
         ("ILD2300", {"OUTDIST_RS422": "DIST1 DIST2"}),
-        ("ILD2300", {"AVERAGE": "MEDIAN 9", "OUTHOLD": "INFINITE"}),
+        ("ILD2300", {"AVERAGE": "MEDIAN 9", "OUTHOLD": "INFINITE", "OUTREDUCE": "10"}),
+        ("ILD2300", {"TRIGGER": "EDGE TERMON"}),
         ("ILD1420", {"OUTADD_RS422": "TIMESTAMP DIST_RAW", "OUTREDUCEDEVICE": "RS422"}),
         ("ILD1420", {"OUTHOLD": "100", "AVERAGE": "MOVING 16", "TRIGGER": "EDGE"}),
     ],
@@ -102,7 +103,7 @@ def test_what_an_earlier_user_left_on_is_cleared_and_restored(model: str, left_o
         before = dict(sensor.settings)
         with OptoNCDT(sensor.url, settings) as driver:
             assert sensor.layout() == ["DIST1", "COUNTER"]
-            assert {sensor.settings[name] for name in left_on} <= {"NONE", "COUNTER", "DIST1"}
+            assert {sensor.settings[name] for name in left_on} <= {"NONE", "NONE TERMON", "COUNTER", "DIST1", "1"}
             assert np.isfinite(readings(driver, 100)).all()
         assert sensor.settings == before
 

@@ -33,6 +33,8 @@ GRAMMAR = {
         "SYNC": "(?:NONE|SLAVE|MASTER|MASTER_ALT) (?:TERMON|TERMOFF)",
         "OUTSTATISTIC_RS422": f"NONE|{WORD.format('MIN|MAX|PEAK2PEAK')}",
         "OUTDIST_RS422": f"NONE|{WORD.format('DIST1|DIST2')}",
+        "TRIGGER": "(?:NONE|EDGE|PULSE|SOFTWARE) (?:TERMON|TERMOFF)",
+        "OUTREDUCE": r"\d{1,7}",
         "OUTADD_RS422": f"NONE|{WORD.format(ADDED)}",
     },
     "ILD1420": COMMON
@@ -56,6 +58,7 @@ DELIVERED = {
     "OUTDIST_RS422": "DIST1",
     "OUTADD_RS422": "NONE",
     "OUTREDUCEDEVICE": "NONE",
+    "OUTREDUCE": "1",
 }
 INFO = {  # 2300 p. 127, 1420 p. 97
     "ILD2300": "Name: ILD2300\r\nSerial: 10110002\r\nOption: 000\r\nArticle: 4120178\r\n"
@@ -99,7 +102,10 @@ class Sensor:
         self.model, self.millimetres, self.values, self.counter_first = model, millimetres, values, counter_first
         self.grammar = GRAMMAR[model] | ({"MEASRATE": rates} if rates else {})
         rate = "2.5" if model == "ILD2300" else "4"
-        self.settings = {**DELIVERED, "OUTPUT": "NONE", "MEASRATE": rate} | settings
+        self.settings = {**DELIVERED, "OUTPUT": "NONE", "MEASRATE": rate}
+        if model == "ILD2300":
+            self.settings["TRIGGER"] = "NONE TERMOFF"
+        self.settings |= settings
         self.received: list[str] = []
         self.late = 0.0
         self.late_for = ""

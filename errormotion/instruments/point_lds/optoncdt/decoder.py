@@ -46,6 +46,7 @@ class StreamDecoder:
         self._counter = counter
         self._counter_first = counter_first
         self._rest = b""
+        self._waiting = np.empty(0, dtype=np.uint32)  # values that those behind them have to confirm
         self._after_text = False
         self._next = 0
         self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
@@ -64,9 +65,12 @@ class StreamDecoder:
         text = np.empty(buffer.size, dtype=np.uint8)
         used, n_values, n_text, self._after_text = kernels.split(buffer, values, text, self._after_text)
         self._rest = buffer[used:].tobytes()
-        raws = np.empty(n_values + 1, dtype=np.int32)
-        numbers = np.empty(n_values + 1, dtype=np.int64)
-        count = kernels.assemble(values[:n_values], self._counter, self._counter_first, self._state, raws, numbers)
+        found = np.concatenate([self._waiting, values[:n_values]])
+        waiting = int(kernels.look_ahead(self._counter, self._counter_first))
+        self._waiting = found[max(found.size - waiting, 0) :]
+        raws = np.empty(found.size + 1, dtype=np.int32)
+        numbers = np.empty(found.size + 1, dtype=np.int64)
+        count = kernels.assemble(found, self._counter, self._counter_first, self._state, raws, numbers)
         return Chunk(*self._convert(raws[:count], numbers[:count]), text[:n_text].tobytes())
 
     def _convert(self, raws: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any]) -> tuple[Any, Any]:

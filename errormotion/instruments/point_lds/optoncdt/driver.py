@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
 
 Sync = Literal["NONE", "MASTER", "SLAVE"]
-ON_FOR = "operating time"  # (m): no manual at hand shows it
 BLOCK_SECONDS = 0.5
 QUEUE_SECONDS = 2.0
 SMALLEST_QUEUE = 4096
@@ -115,7 +113,6 @@ class OptoNCDT(Driver):
     def identify(self) -> Identity:
         """Request the identity of the sensor (GETINFO)."""
         facts = parse_info(self.command("GETINFO"))
-        facts.pop(ON_FOR, None)
         refused = {"refused commands": ", ".join(self._refused)} if self._refused else {}
         return Identity(
             manufacturer="Micro-Epsilon",
@@ -125,11 +122,6 @@ class OptoNCDT(Driver):
             simulated=self.transport.simulated,
             details={"address": self.address, **facts, **refused},
         )
-
-    def on_for(self) -> float:
-        """Return the operating time that the sensor reports, s; 0 where it reports none."""
-        stated = re.match(r"(\d{1,12}(?:\.\d{1,6})?)", parse_info(self.command("GETINFO")).get(ON_FOR, ""))
-        return float(stated[1]) if stated else 0.0
 
     def configure(self, settings: OptoSettings) -> None:
         """Compare settings with the line and the sensor, and send them.
@@ -148,7 +140,7 @@ class OptoNCDT(Driver):
         model, dialogue = MODELS[settings.model], self._open_dialogue
         dialogue.set(f"MEASRATE {model.rate_word(settings.rate)}")
         for command in model.cleared:
-            dialogue.set(command)
+            dialogue.set(command.format(termination=self._termination_of(command.split(" ", 1)[0])))
         self._refused = []
         for command in model.optional:
             try:
@@ -158,8 +150,12 @@ class OptoNCDT(Driver):
         dialogue.set(f"OUTADD_RS422 {'COUNTER' if settings.counter else 'NONE'}")
         self._layout = parse_layout(self.command("GETOUTINFO_RS422"), counter=settings.counter)
         if model.synchronises:
-            self._termination = "TERMON" if "TERMON" in dialogue.remember("SYNC") else "TERMOFF"
+            self._termination = self._termination_of("SYNC")
         self.settings, self._range, dialogue.timeout = settings, measured, settings.timeout
+
+    def _termination_of(self, name: str) -> str:
+        """Return the termination of the line that the sensor has for a command; TERMOFF where it states none."""
+        return "TERMON" if "TERMON" in self._open_dialogue.remember(name) else "TERMOFF"
 
     def command(self, text: str) -> list[str]:
         """Send a command and return the lines of the answer; works while data are streaming.

@@ -86,17 +86,28 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def look_ahead(counter: bool, counter_first: bool) -> int:
+    """Return the number of values behind a distance that have to be there before it is believed."""
+    if not counter:
+        return 1
+    return 2 if counter_first else 0
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def assemble(values: Array, counter: bool, counter_first: bool, state: Array, raws: Array, numbers: Array) -> int:
     """Pair distances with their counters and number the samples; return how many there are.
 
     A counter that jumps is believed when the next sound sample is further on in the same direction round the 18 bits:
     then samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both
-    garbled, and so is a distance behind a counter that had none.
+    garbled, and so is a distance behind a counter that had none. Stray bytes show in the value behind them: a distance
+    that ends its sample is garbled where the next value is suspect or not the first of its sample, and behind a counter
+    also where the value after that is suspect or the first of its sample: a burst of five bytes can pose as one value.
 
     Parameters
     ----------
     values : ndarray, uint32
-        From `split`.
+        From `split`. Where a distance ends its sample, the last values are only looked at, and have to come again:
+        see `look_ahead`.
     counter : bool
         Whether each sample is a distance and a counter, or a distance alone.
     counter_first : bool
@@ -110,8 +121,13 @@ def assemble(values: Array, counter: bool, counter_first: bool, state: Array, ra
         Receives the samples' numbers since the start of the stream.
     """
     count = 0
-    for value in values:
+    for i in range(values.size - look_ahead(counter, counter_first)):
+        value = values[i]
         suspect = value & SUSPECT != 0
+        if not counter or (counter_first and value & FOLLOWING):
+            suspect = suspect or values[i + 1] & (SUSPECT | FOLLOWING) != 0
+        if counter_first and value & FOLLOWING:
+            suspect = suspect or values[i + 2] & (SUSPECT | FOLLOWING) != FOLLOWING
         raw = np.int64(GARBLED_RAW) if suspect else np.int64(value & MASK)
         if not counter:
             if value & FOLLOWING:

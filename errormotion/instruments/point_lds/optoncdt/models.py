@@ -30,7 +30,8 @@ class Model:
     synchronises : bool
         Whether the sensor has the command SYNC.
     cleared : tuple of str
-        Commands that remove what an earlier user has left on and that would change the values or their sequence.
+        Commands that remove what an earlier user has left on and that would change the values or their sequence;
+        ``{termination}`` stands for the termination of the line that the sensor reports for this command.
     optional : tuple of str
         Commands of the same purpose whose grammar no page at hand shows for this family: a refusal is noted and does
         not end the session.
@@ -83,8 +84,14 @@ MODELS: Mapping[str, Model] = {
         baudrates=(9600, 115200, 230400, 460800, 691200, 921600, 1500000, 2000000, 2500000, 3000000, 3500000, 4000000),
         highest=64876,  # 2300 p. 94
         synchronises=True,  # 2300 p. 128
-        # 2300 p. 140, 139, 143, 142
-        cleared=("MASTERMV NONE", "AVERAGE NONE", "OUTSTATISTIC_RS422 NONE", "OUTDIST_RS422 DIST1"),
-        optional=("TRIGGER NONE", "OUTHOLD NONE", "LASERPOW FULL"),
+        # 2300 p. 140, 139, 143, 142, German edition p. 131
+        cleared=(
+            "MASTERMV NONE",
+            "AVERAGE NONE",
+            "OUTSTATISTIC_RS422 NONE",
+            "OUTDIST_RS422 DIST1",
+            "TRIGGER NONE {termination}",
+        ),
+        optional=("OUTREDUCE 1", "OUTHOLD NONE", "LASERPOW FULL"),
     ),
 }
