@@ -46,13 +46,17 @@ class Averaging:
             joined = frames if self._past is None else np.concatenate([self._past, frames])
             whole = len(joined) // n * n
             self._past = joined[whole:]
-            return np.rint(joined[:whole].reshape(-1, n, frames.shape[1]).mean(axis=1)).astype(np.int64)
+            return _whole(joined[:whole].reshape(-1, n, frames.shape[1]).mean(axis=1))
         past = np.repeat(frames[:1], n - 1, axis=0) if self._past is None else self._past
         joined = np.concatenate([past, frames])
         self._past = joined[len(joined) - (n - 1) :]
         windows = np.lib.stride_tricks.sliding_window_view(joined, n, axis=0)
         averages = windows.mean(axis=-1) if self._kind == 1 else np.median(windows, axis=-1)
-        return np.rint(averages).astype(np.int64)
+        return _whole(averages)
+
+
+def _whole(values: Array) -> Array:
+    return np.asarray(np.rint(values), dtype=np.int64)
 
 
 def with_functions(frames: Array, settings: Settings) -> tuple[Array, tuple[int, ...]]:
