@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,8 @@ BLOCK_SECONDS = 0.5
 DATA = "data"
 """Name of the data line, and of the parameter of the address that states its port."""
 MAX_OTHER_LINES = 16
+PAUSE_OF_REQUEST = 0.3
+"""Time after which a reading is requested again on a data line that was just opened, s."""
 RANGE_TOLERANCE = 1e-3
 """Of the range: two statements of it that differ less are the same."""
 
@@ -145,11 +148,7 @@ class CapaNCDT(Driver):
         channel = self._ready()
         if self._streaming:
             raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
-        self._refresh()
-        self._stale = True  # until the value has come
-        self._query(codec.ONE_READING)
-        block = self._one_block()
-        self._stale = False
+        block = self._requested_block()
         values, codes = scale(column(block, self.settings.channel)[-1:], channel.offset, channel.measuring_range)
         self.no_value = REASONS[int(codes[0])]
         self._data.report_delivered(1)
@@ -242,15 +241,33 @@ class CapaNCDT(Driver):
                 return answer
         raise ProtocolError(f"{self.address}: expected an answer to '${command}'; found {MAX_OTHER_LINES} other lines")
 
-    def _refresh(self) -> None:
-        """Make sure that the next values on the data line are new ones."""
-        if self._stale:
-            self._data.reopen()
-            self._stale = False
+    def _refresh(self) -> bool:
+        """Make sure that the next values on the data line are new ones; return whether it was opened again."""
+        if not self._stale:
+            return False
+        self._data.reopen()
+        self._query(f"{codec.TRIGGER}?")  # meanwhile the controller accepts the connection
+        self._stale = False
+        return True
 
-    def _one_block(self) -> Block:
+    def _requested_block(self) -> Block:
+        reopened = self._refresh()
+        self._stale = True  # until the value has come
+        self._query(codec.ONE_READING)
+        if reopened:
+            with suppress(InstrumentTimeoutError):  # the request was ahead of the new connection
+                block = self._one_block(min(PAUSE_OF_REQUEST, self.settings.timeout / 2))
+                self._stale = False
+                return block
+            self._query(codec.ONE_READING)
+            return self._one_block(self.settings.timeout)  # two may come: the line is opened again for the next one
+        block = self._one_block(self.settings.timeout)
+        self._stale = False
+        return block
+
+    def _one_block(self, limit: float) -> Block:
         decoder = BlockDecoder()
-        until = time.monotonic() + self.settings.timeout
+        until = time.monotonic() + limit
         while True:
             data = self._data.read(timeout=max(until - time.monotonic(), 0.0))
             if blocks := decoder.feed(data, last=True):
