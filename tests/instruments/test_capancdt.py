@@ -152,13 +152,15 @@ def test_a_silent_stream_and_a_wrong_channel_are_errors(controller: ScriptedCont
 
 
 def test_answers_to_other_commands_are_skipped(controller: ScriptedController) -> None:
-    controller.readings = [block(1, (MIDDLE, 0))]
+    controller.readings = [block(1, (MIDDLE, 0)), block(2, (MIDDLE, 0))]
     with sensor(controller) as capa:
-        controller.command.send(b"$STI?1000OK\r\n$TRG1OK\r\n")
-        assert capa.read() == pytest.approx(1e-3, abs=1e-9)
-        controller.command.send(b"noise\r\n" * 16)
-        with pytest.raises(ProtocolError, match="other lines"):
-            capa.read()
+        for other in (b"$STI?1000OK\r\n$TRG1OK\r\n", b"noise\r\n" * 40):
+            controller.command.send(other)
+            assert capa.read() == pytest.approx(1e-3, abs=1e-9)
+    controller.answers["TRG?"] = "\r\nother" * 20
+    controller.echo = False
+    with pytest.raises(ProtocolError, match="16 other lines"), sensor(controller):
+        pass
 
 
 def test_a_refused_command_names_it(controllers: list[ScriptedController]) -> None:

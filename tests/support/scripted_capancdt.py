@@ -35,6 +35,7 @@ class ScriptedController:
             "GMD": "",
             **answers,
         }
+        self.echo = True
         self.received: list[str] = []
         self.readings: list[bytes] = []
         self.blocks: list[bytes] = []
@@ -62,7 +63,8 @@ class ScriptedController:
         known = self.answers.get(command)
         if known is None and re.fullmatch(r"(AVT|AVN|STI)\d+", command):
             known = "," + command[3:] if command.startswith("STI") else ""
-        text = f"${command}$UNKNOWN COMMAND\r\n" if known is None else f"${command}{known}OK\r\n"
+        echo = f"${command}" if self.echo else ""
+        text = f"{echo}$UNKNOWN COMMAND\r\n" if known is None else f"{echo}{known}OK\r\n"
         self.command.send(text.encode("latin-1"))
         if command == "GMD" and self.readings and self.data.await_connection(1.0):
             self.data.send(self.readings.pop(0))

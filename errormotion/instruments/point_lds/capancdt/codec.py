@@ -58,26 +58,28 @@ def encode(command: str) -> bytes:
     return f"${command}\r\n".encode("ascii")
 
 
-def answer_to(command: str, line: bytes) -> str | None:
-    """Return what a line answers to a command, without the echo and the ``OK``; None where it is not its answer.
+def echoes(command: str, line: bytes) -> bool:
+    """Whether a line answers a command: it has its echo. Others are a welcome, or late answers to other commands."""
+    return f"${command}" in decode_text(line)
 
-    Lines without the echo of the command are no answer: the welcome of the controller, a late answer to another one.
+
+def answer_to(command: str, line: bytes) -> str:
+    """Return what a line answers to a command, without the echo and the ``OK``.
 
     Raises
     ------
     InstrumentError
         The controller refuses the command.
     ProtocolError
-        The answer has no ``OK``.
+        The line has no echo of the command, or no ``OK``.
     """
     text = decode_text(line)
     _, echo, rest = text.rpartition(f"${command}")
-    if not echo:
-        return None
     for error in ERRORS:
         if error in rest:
             raise InstrumentError(f"The controller refuses '${command}': {error[1:].lower()}")
-    if not rest.endswith("OK") and not (command == VERSION and rest):  # 6500 p. 40 prints this answer without OK
+    without_ok = command == VERSION and rest  # 6500 p. 40 prints this answer without OK
+    if not echo or not (rest.endswith("OK") or without_ok):
         raise ProtocolError(f"Expected an answer to '${command}' that ends in 'OK'; found {text[:80]!r}")
     return rest.removesuffix("OK")
 

@@ -233,18 +233,23 @@ class CapaNCDT(Driver):
 
     def _query(self, command: str) -> str:
         """Send a command and return its answer; lines that answer another one are skipped."""
-        line = self.transport
-        line.write(codec.encode(command))
-        for _ in range(MAX_OTHER_LINES):
-            answer = codec.answer_to(command, line.read_until(codec.LINE_END, limit=codec.MAX_LINE_BYTES))
-            if answer is not None:
-                return answer
-        raise ProtocolError(f"{self.address}: expected an answer to '${command}'; found {MAX_OTHER_LINES} other lines")
+        with self.exchange() as line:
+            line.write(codec.encode(command))
+            for _ in range(MAX_OTHER_LINES):
+                answer = line.read_until(codec.LINE_END, limit=codec.MAX_LINE_BYTES)
+                if codec.echoes(command, answer):
+                    break
+            else:
+                raise ProtocolError(
+                    f"{self.address}: expected an answer to '${command}'; found {MAX_OTHER_LINES} other lines"
+                )
+        return codec.answer_to(command, answer)  # a refusal is an answer as well
 
     def _refresh(self) -> bool:
         """Make sure that the next values on the data line are new ones; return whether it was opened again."""
         if not self._stale:
             return False
+        self._query(f"{codec.TRIGGER}?")  # earlier requests have been carried out by now
         self._data.reopen()
         self._query(f"{codec.TRIGGER}?")  # meanwhile the controller accepts the connection
         self._stale = False
