@@ -192,7 +192,8 @@ def variants(schema: str) -> tuple[RawSchema, ...]:
 
 def raw_schemas() -> tuple[RawSchema, ...]:
     """Return the raw schemas of all plugins."""
-    return tuple(table for cls in plugins.loaded("methods", "datasets") for table in getattr(cls, "raw_schemas", ()))
+    found = (table for _, tables in plugins.brought("raw_schemas", "methods", "datasets") for table in tables)
+    return tuple(table for table in found if isinstance(table, RawSchema))
 
 
 def known_schemas() -> set[str]:
