@@ -12,6 +12,7 @@ from scripted_capancdt import ScriptedController, block
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.point_lds.capancdt import CapaNCDT, CapaSettings
+from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFrame, FrameSettings
 
 MIDDLE = 0x7FFFFF
 
@@ -187,3 +188,20 @@ def test_two_uses_at_a_time_are_refused(controller: ScriptedController) -> None:
             with pytest.raises(InstrumentError, match="stream"):
                 use()
         stream.close()
+
+
+def test_five_of_them_make_a_frame(controllers: list[ScriptedController]) -> None:
+    sensors = {}
+    for number, name in enumerate(("X1", "X2", "Y1", "Y2", "Z")):
+        controllers.append(ScriptedController())
+        controllers[-1].always = block(1, (MIDDLE if number else 0, 5))
+        sensors[name] = {"driver": "capancdt", "address": controllers[-1].address, "measuring_range": 2e-3}
+    with FiveSensorFrame(settings=FrameSettings.model_validate({"rate": 50.0, "sensors": sensors})) as frame:
+        (found,) = itertools.islice(frame.stream(block=10), 1)
+        identity = frame.identify()
+    known = np.isfinite(found.values[1:])
+    np.testing.assert_allclose(found.values[1:][known], 1e-3, atol=1e-9)
+    assert known.sum() >= 4
+    assert np.isnan(found.values[0]).all()
+    assert found.invalid["X1 under range"] + found.dropped == 10
+    assert identity.manufacturer == "Micro-Epsilon"

@@ -17,7 +17,7 @@ CHANNEL = "ANO2303018,NAMDL6230,SNO0815,OFS0,RNG2000,UNTµm"
 class ScriptedController:
     """Answers commands from ``answers`` (without echo and ``OK``), refuses others; sends blocks on its data port.
 
-    Each GMD sends the next of ``readings``; TRG0 sends ``blocks``, TRG with another parameter stops nothing.
+    Each GMD sends the next of ``readings``, then ``always``; TRG0 sends ``blocks``.
     """
 
     def __init__(self, **answers: str) -> None:
@@ -38,6 +38,7 @@ class ScriptedController:
         self.echo = True
         self.received: list[str] = []
         self.readings: list[bytes] = []
+        self.always = b""
         self.blocks: list[bytes] = []
         self.welcomed = False
         self._buffer = b""
@@ -66,8 +67,9 @@ class ScriptedController:
         echo = f"${command}" if self.echo else ""
         text = f"{echo}$UNKNOWN COMMAND\r\n" if known is None else f"{echo}{known}OK\r\n"
         self.command.send(text.encode("latin-1"))
-        if command == "GMD" and self.readings and self.data.await_connection(1.0):
-            self.data.send(self.readings.pop(0))
+        reading = self.readings.pop(0) if command == "GMD" and self.readings else self.always
+        if command == "GMD" and reading and self.data.await_connection(1.0):
+            self.data.send(reading)
         if command == "TRG0" and self.data.await_connection(1.0):
             for block in self.blocks:
                 self.data.send(block)
