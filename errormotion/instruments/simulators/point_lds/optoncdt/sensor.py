@@ -42,7 +42,7 @@ class SimulatedOptoNCDT(SimulatedDevice):
     receives).
     """
 
-    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
+    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
     drops_answers = False
 
     def __init__(self, address: Address) -> None:
