@@ -1,4 +1,4 @@
-"""The device's end of a line that only sends, with several connections: the newest one receives."""
+"""The device's end of a line that only sends, with several connections: a stream goes to the newest one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ MOST_CONNECTIONS = 16
 
 
 class NewestConnectionServer(TcpServer):
-    """Listens on a free port of 127.0.0.1; data go to the connection that was opened last.
+    """Listens on a free port of 127.0.0.1; data go to the connection that was the newest at `select`.
 
-    Connections opened before it stay open and receive nothing more, as clients expect that open a connection for each
-    measurement.
+    Others stay open and receive nothing, as clients expect that open a connection for each measurement.
     """
 
     def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
@@ -37,12 +36,16 @@ class NewestConnectionServer(TcpServer):
                 line.setblocking(True)
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._lines.append(line)
-                self._line = line
                 self._connected.set()
                 self._wake_write.send(b"+")
             for line in self._lines[:-MOST_CONNECTIONS]:
                 _shut(line)
-            return self._line is not None
+            return bool(self._lines)
+
+    def select(self) -> None:
+        """Send to the newest connection from now on."""
+        with self._accepting:
+            self._line = self._lines[-1] if self._lines else None
 
     def drop_older(self) -> None:
         """End the connections before the newest one, so that a sender that waits for one of them goes on."""
@@ -57,7 +60,7 @@ class NewestConnectionServer(TcpServer):
                 _shut(line)
 
     def send(self, data: bytes | memoryview) -> bool:
-        """Send all bytes on the newest connection, waiting while the reader's buffers are full; False without one."""
+        """Send all bytes on the selected connection, waiting while its buffers are full; False without one."""
         with self.lock:
             line = self._line
             try:
@@ -90,9 +93,9 @@ class NewestConnectionServer(TcpServer):
         with self._accepting:
             self._lines.remove(line)
             if line is self._line:
-                self._line = self._lines[-1] if self._lines else None
-                if self._line is None:
-                    self._connected.clear()
+                self._line = None
+            if not self._lines:
+                self._connected.clear()
         with self.lock:  # a sender that used it has ended
             line.close()
 

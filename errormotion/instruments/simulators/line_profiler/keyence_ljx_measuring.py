@@ -58,7 +58,7 @@ class Measuring:
     ) -> None:
         self.memory = Memory()
         self.feed = feed
-        self.streaming = False
+        self._streaming = False
         self.laser = True
         self._name, self._line, self._fault, self._rng = name, line, fault, rng
         self._trigger_start, self._notice_delay, self._on_break = trigger_start, notice_delay, on_break
@@ -75,6 +75,11 @@ class Measuring:
     def trigger_count(self) -> int:
         """What the trigger counter shows."""
         return self._trigger(self._position + self._here)
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the stream runs; from the order to stop on it does not, although data may be under way."""
+        return self._streaming and not self._stopping.is_set()
 
     @property
     def measuring(self) -> bool:
@@ -100,8 +105,9 @@ class Measuring:
         """
         if self.measuring:  # a batch runs: from the next profile on
             self._sent = self._before = 0
+            self._line.select()
             self._stopping.clear()
-            self.streaming = True
+            self._streaming = True
             return True
         backlog = self._backlog(position)
         self._sent = 0
@@ -160,7 +166,7 @@ class Measuring:
 
     def reset(self) -> None:
         """End measurement and stream without a notice, and clear the memory."""
-        self.streaming = False
+        self._streaming = False
         self._ended.set()
         self.feed.end()
         self.join()
@@ -177,6 +183,8 @@ class Measuring:
         self, layout: ProfileLayout, limit: int, backlog: Array | None, *, measure: bool, streaming: bool
     ) -> bool:
         self.join()
+        if streaming and not self.streaming:
+            self._line.select()
         try:
             if measure:
                 self.feed.begin()
@@ -185,7 +193,7 @@ class Measuring:
         self._before = self._sent
         self._ended.clear()
         self._stopping.clear()
-        self.streaming = streaming
+        self._streaming = streaming
         self._thread = threading.Thread(
             target=self._run, args=(layout, limit, backlog, measure), name=f"sim-{self._name}-profiles", daemon=True
         )
@@ -218,7 +226,7 @@ class Measuring:
             if self._measure(layout, limit):
                 if limit and self.memory.newest is not None:
                     self.memory.newest.committed = True
-                if limit and self.streaming:
+                if limit and self._streaming:
                     self._send(wire.notice(wire.BATCH_ENDED))
                 if self._stopping.is_set() or not limit:
                     self._end_stream()
@@ -233,7 +241,7 @@ class Measuring:
                 self._ended.wait(POLL_INTERVAL)
             if self._ended.is_set():
                 break
-            if limit and self._stopping.is_set() and self.streaming:
+            if limit and self._stopping.is_set() and self._streaming:
                 self._end_stream()
             if lines is None:
                 continue
@@ -251,7 +259,7 @@ class Measuring:
             beyond = (numbers >= fault.at) & (numbers < last)
             lines = Lines(lines.encoder, np.where(beyond[:, None], np.nan, lines.heights), lines.times)
         rows = self._record(layout, lines)
-        if not self.streaming:
+        if not self._streaming:
             return True
         if fault.kind:
             data = b"".join(self._spoilt(row, int(number)) for row, number in zip(rows, numbers, strict=True))
@@ -291,8 +299,8 @@ class Measuring:
         return np.concatenate(parts) if parts else None
 
     def _end_stream(self) -> None:
-        if self.streaming:
-            self.streaming = False
+        if self._streaming:
+            self._streaming = False
             time.sleep(self._notice_delay)
             self._send(wire.notice(wire.STOPPED))
 
