@@ -74,7 +74,7 @@ class Measuring:
     @property
     def trigger_count(self) -> int:
         """What the trigger counter shows."""
-        return self._trigger(self._position + self._here)
+        return int(self._trigger(self._position + self._here))
 
     @property
     def streaming(self) -> bool:
