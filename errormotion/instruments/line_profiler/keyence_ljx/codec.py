@@ -47,12 +47,17 @@ PROGRAMS = 16
 LENGTH = 1e-8  # m: unit of the Z unit, of X start and of the X pitch
 TEMPERATURE = 0.01  # degC
 
-RETURN_CODES: Mapping[int, str] = {  # (m), except 0x42
-    0x42: "program number out of range",
+RETURN_CODES: Mapping[int, str] = {
+    0x21: "another model of controller",
+    0x31: "unknown command",
+    0x32: "wrong length of the command",
+    0x41: "not possible in this mode or state of the controller",
+    0x42: "parameter out of range, such as the number of a program",
     0x80: "not possible in this mode",
-    0x81: "not possible while its settings are being written",
+    0x81: "not possible with the present setting of batch measurement, or no such start position",
     0xA0: "no connection for the stream",
-    0xA1: "the stream is running already, or was not prepared",
+    0xA1: "the stream is running already",
+    0xA2: "another command code was expected, or the stream was not prepared",
     0xA3: "another start code was expected",
     0xA4: "the profiles to be sent have been deleted",
 }
