@@ -162,7 +162,7 @@ class PointStream:
             return True
         if self._mode == BY_DISTANCE:
             there = np.array(to_system(spherical, RHR))
-            far = self._last is None or float(np.linalg.norm(there - self._last)) >= parameters[0]
+            far = self._last is None or float(np.linalg.norm(there - self._last)) >= float(parameters[0])
         else:
             there = np.array(to_system(spherical, self._device.wire.system))
             steps = np.array(parameters[0])
@@ -176,7 +176,7 @@ class PointStream:
         if region == 0:
             centre, radius = blocks[NUMBERS["SetSphereRegionParams"]].values
             apart = np.subtract(to_system(spherical, RHR), to_system(centre, RHR))
-            return float(np.linalg.norm(apart)) <= radius
+            return float(np.linalg.norm(apart)) <= float(radius)
         corners = [to_system(corner, system) for corner in blocks[NUMBERS["SetBoxRegionParams"]].values]
         there = to_system(spherical, system)
         return all(min(a, b) <= x <= max(a, b) for x, a, b in zip(there, *corners, strict=True))
