@@ -41,7 +41,7 @@ class LeicaEmScon(EmSconSession):
         id="leica_emscon",
         kind="laser_tracker",
         summary="Leica laser trackers (LT, AT901, AT4xx) behind an emScon server, TCP",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
 
