@@ -14,7 +14,47 @@ from errormotion.instruments.simulators.point_lds.keyence_lk_grammar import CONT
 from errormotion.instruments.transports import parse_address
 
 #: Settings that a program of LSST requests of an LK-G5000, with the first output.
-SETTINGS = ["LM,01", "HA,M,01", "HA,R,02", "HB,M,01", "HB,B,01", "HC,N,01", "HC,L,01", "HE,01", "HF,01", "HG,01", "HI,01", "HJ,01", "OA,H,01", "OA,T,01", "OA,C,01", "OA,M,01", "OB,01", "OC,01", "OD,01", "OE,M,01", "OF,01", "OG,01", "OH,01", "OI,01", "OJ,01", "OK,01", "CA", "CB", "CD", "CE", "CF", "CG,01", "CH", "EE", "EF", "EG", "EH,I", "EH,M", "EH,G"]
+SETTINGS = [
+    "LM,01",
+    "HA,M,01",
+    "HA,R,01",
+    "HB,M,01",
+    "HB,B,01",
+    "HC,N,01",
+    "HC,L,01",
+    "HE,01",
+    "HF,01",
+    "HG,01",
+    "HI,01",
+    "HJ,01",
+    "OA,H,01",
+    "OA,T,01",
+    "OA,C,01",
+    "OA,M,01",
+    "OB,01",
+    "OC,01",
+    "OD,01",
+    "OE,M,01",
+    "OF,01",
+    "OG,01",
+    "OH,01",
+    "OI,01",
+    "OJ,01",
+    "OK,01",
+    "CA",
+    "CB",
+    "CD",
+    "CE",
+    "CF",
+    "CG,01",
+    "CH",
+    "EE",
+    "EF",
+    "EG",
+    "EH,I",
+    "EH,M",
+    "EH,G",
+]
 
 
 class Line:

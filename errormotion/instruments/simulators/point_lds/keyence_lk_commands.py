@@ -271,10 +271,8 @@ class Commands:
         setting, rest = found
         if not setting.per_output:
             return setting, "", rest
-        number = self._word(rest[:1], self.controller.digits)
-        if not 1 <= int(number) <= self.controller.outputs:
-            raise MistakeError(Mistake.RANGE)
-        return setting, number, rest[1:]
+        number = self._number(rest[:1])
+        return setting, f"{number:0{self.controller.digits}d}", rest[1:]
 
     def _read(self, words: list[str]) -> str:
         setting, number, rest = self._setting(words)
