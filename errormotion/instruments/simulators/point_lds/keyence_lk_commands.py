@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from errormotion.instruments.simulators.point_lds import keyence_lk_grammar as grammar
 from errormotion.instruments.simulators.point_lds.keyence_lk_grammar import Controller, Mistake, Setting
@@ -10,6 +11,12 @@ from errormotion.instruments.simulators.point_lds.keyence_lk_grammar import Cont
 GENERAL, COMMUNICATION = "R0", "Q0"
 MOST_STORED = 65536
 """Values of a data storage; fewer than in the device, which holds 1.2 million."""
+
+
+Command = Callable[[list[str]], str]
+"""Returns the answer to a command from the words behind it."""
+Outputs = Callable[[list[str]], list[int]]
+"""Returns the outputs that words name."""
 
 
 class MistakeError(Exception):
@@ -52,7 +59,7 @@ class Commands:
         self._stored: list[str] = []
         self._written: dict[tuple[str, str, str], list[str]] = {}
         several = controller.digits == 2
-        self._commands: Mapping[str, Callable[[list[str]], str]] = self._of_g5000() if several else self._of_g3000()
+        self._commands: Mapping[str, Command] = self._of_g5000() if several else self._of_g3000()
 
     def obey(self, text: str) -> str:
         """Return the answer to a command, without its end."""
@@ -78,38 +85,37 @@ class Commands:
 
     # ------------------------------------------------------------------ tables
 
-    def _of_g5000(self) -> dict[str, Callable[[list[str]], str]]:
-        commands: dict[str, Callable[[list[str]], str]] = {
+    def _of_g5000(self) -> dict[str, Command]:
+        commands: dict[str, Command] = {
             "MS": lambda words: self._values("MS", words, [self._number(words)]),
             "MM": lambda words: self._values("MM", words, self._flagged(words)),
             "MA": lambda words: self._values("MA", words, self._all(words)),
+            "TS": lambda words: self._time("TS", words[:1], [self._number(words[1:])]),
+            "TM": lambda words: self._time("TM", words[:1], self._flagged(words[1:])),
+            "TA": lambda words: self._time("TA", words[:1], self._all(words[1:])),
         }
         for letter, action in (("V", self._set_zero), ("W", self._clear_zero), ("R", self._reset)):
-            commands[f"{letter}S"] = lambda words, w=letter, do=action: do(f"{w}S", [self._number(words)])
-            commands[f"{letter}M"] = lambda words, w=letter, do=action: do(f"{w}M", self._flagged(words))
-            commands[f"{letter}A"] = lambda words, w=letter, do=action: do(f"{w}A", self._all(words))
-        commands["TS"] = lambda words: self._time("TS", words[:1], [self._number(words[1:])])
-        commands["TM"] = lambda words: self._time("TM", words[:1], self._flagged(words[1:]))
-        commands["TA"] = lambda words: self._time("TA", words[:1], self._all(words[1:]))
+            commands[f"{letter}S"] = partial(self._act, action, f"{letter}S", lambda words: [self._number(words)])
+            commands[f"{letter}M"] = partial(self._act, action, f"{letter}M", self._flagged)
+            commands[f"{letter}A"] = partial(self._act, action, f"{letter}A", self._all)
         return commands | self._of_both()
 
-    def _of_g3000(self) -> dict[str, Callable[[list[str]], str]]:
-        commands: dict[str, Callable[[list[str]], str]] = {}
-        for digit in "012":
-            chosen = [1, 2] if digit == "0" else [int(digit)]
-            commands[f"M{digit}"] = lambda words, d=digit, c=chosen: self._values(
-                f"M{d}", words, self._none_but(words, c)
-            )
-            commands[f"V{digit}"] = lambda words, d=digit, c=chosen: self._set_zero(f"V{d}", self._none_but(words, c))
-            commands[f"W{digit}"] = lambda words, d=digit, c=chosen: self._clear_zero(f"W{d}", self._none_but(words, c))
-        for switch in "01":
-            commands[f"T{switch}"] = lambda words, s=switch: self._time(f"T{s}", [s], self._one_or_both(words))
-        commands["VR"] = lambda words: self._reset("VR", self._one_or_both(words))
-        commands["DO"] = lambda words: self._statistics(self._number(words))
-        commands["DQ"] = lambda words: self._done("DQ", words)
+    def _of_g3000(self) -> dict[str, Command]:
+        commands: dict[str, Command] = {
+            "T0": lambda words: self._time("T0", ["0"], self._one_or_both(words)),
+            "T1": lambda words: self._time("T1", ["1"], self._one_or_both(words)),
+            "VR": partial(self._act, self._reset, "VR", self._one_or_both),
+            "DO": lambda words: self._statistics(self._number(words)),
+            "DQ": lambda words: self._done("DQ", words),
+        }
+        for digit, chosen in (("0", [1, 2]), ("1", [1]), ("2", [2])):
+            none_behind = partial(self._none_but, result=chosen)
+            commands[f"M{digit}"] = partial(self._measure, f"M{digit}", none_behind)
+            commands[f"V{digit}"] = partial(self._act, self._set_zero, f"V{digit}", none_behind)
+            commands[f"W{digit}"] = partial(self._act, self._clear_zero, f"W{digit}", none_behind)
         return commands | self._of_both()
 
-    def _of_both(self) -> dict[str, Callable[[list[str]], str]]:
+    def _of_both(self) -> dict[str, Command]:
         return {
             "KL": self._lock,
             "PW": self._change_program,
@@ -175,6 +181,12 @@ class Commands:
         return word
 
     # ------------------------------------------------------------------ measurement
+
+    def _measure(self, header: str, outputs: Outputs, words: list[str]) -> str:
+        return self._values(header, words, outputs(words))
+
+    def _act(self, action: Callable[[str, list[int]], str], header: str, outputs: Outputs, words: list[str]) -> str:
+        return action(header, outputs(words))
 
     def _values(self, header: str, words: list[str], outputs: list[int]) -> str:
         return ",".join([header, *words, *map(self._shown, outputs)])
