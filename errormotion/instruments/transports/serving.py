@@ -73,7 +73,13 @@ class Server(ABC):
 
 
 class TcpServer(Server):
-    """Listens on a free port of 127.0.0.1; one connection at a time."""
+    """Listens on a free port of 127.0.0.1; one connection at a time.
+
+    Attributes
+    ----------
+    connections : int
+        Connections accepted so far.
+    """
 
     def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
         super().__init__(name, on_data)
@@ -81,6 +87,7 @@ class TcpServer(Server):
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._line: socket.socket | None = None
         self._connected = threading.Event()
+        self.connections = 0
         self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
@@ -125,6 +132,7 @@ class TcpServer(Server):
                 line, _ = self._listener.accept()
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._line = line
+                self.connections += 1
                 self._connected.set()
                 continue
             try:
