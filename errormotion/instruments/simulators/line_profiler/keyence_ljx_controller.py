@@ -87,6 +87,7 @@ class Controller:
     def answer(self, request: bytes, obey: Callable[[int, bytes], Answer]) -> bytes:
         """Return the answer to one request; ``obey`` is `obey`, or wraps it."""
         opcode = request[16] if len(request) > 16 else 0
+        code: int
         if request[4:8] != wire.PREFIX:
             code, data = (Code.OTHER_MODEL if request[5:8] == wire.PREFIX[1:] else Code.WRONG_LENGTH), b""
         elif len(request) < 20 or struct.unpack_from("<I", request, 12)[0] != len(request) - 16:
