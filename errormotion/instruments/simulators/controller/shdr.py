@@ -2,7 +2,7 @@
 
 After a connection it sends commands, the present value of everything, then what changes. A line is
 ``time|key|value|key|value...``; conditions, messages, series, data sets and assets have lines of their own. It answers
-``* PING`` with ``* PONG`` and the heartbeat in ms. After a first ``* PING`` it closes a connection that stays silent for
+``* PING`` with ``* PONG`` and the heartbeat in ms. After a first ``* PING`` it closes a connection that is silent for
 two heartbeats. It ignores every other line.
 
 Source: the descriptions of the adapter protocol, versions 1.4 and 2.0, of mtconnect/cppagent, and the recorded adapter
@@ -93,7 +93,7 @@ class SimulatedAdapter:
         self._prefix = f"{address.params['device']}:" if "device" in address.params else ""
         self._assets = bool(address.number("assets", 0))
         self._lines = 0
-        self._pinged = float("inf")
+        self._pinged = (0, 0.0)  # connection and time of the last one
         self._received = b""
         self._ended = threading.Event()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -135,10 +135,10 @@ class SimulatedAdapter:
                 continue
             if self._server.connections != connection:
                 connection, shown = self._server.connections, {}
-                self._pinged = float("inf")
                 self._send_all(f"* {command}" for command in (*_COMMANDS, f"device: {self._device}"))
                 self._send_all(self._asset())
-            if time.monotonic() - self._pinged > 2 * self._heartbeat / 1e3:
+            pinged, last = self._pinged
+            if pinged == connection and time.monotonic() - last > 2 * self._heartbeat / 1e3:
                 self._server.disconnect()
                 continue
             self._send_all(self._changes(shown))
@@ -196,7 +196,7 @@ class SimulatedAdapter:
         self._received = self._received[-LONGEST_LINE:]
         for line in lines:
             if line.strip() == b"* PING" and self._heartbeat:
-                self._pinged = time.monotonic()
+                self._pinged = (self._server.connections, time.monotonic())
                 self._send(f"* PONG {self._heartbeat}")
 
 

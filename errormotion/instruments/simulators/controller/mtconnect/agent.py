@@ -20,7 +20,7 @@ from errormotion.instruments.simulators.controller.mtconnect.documents import Fr
 from errormotion.instruments.simulators.controller.mtconnect.machine import UNAVAILABLE, clock_text, reading, readings
 from errormotion.instruments.simulators.controller.mtconnect.observations import Buffer, Observation, empty_value
 from errormotion.instruments.simulators.controller.mtconnect.paths import PathError
-from errormotion.instruments.simulators.controller.mtconnect.requests import Request, check_range, read_request
+from errormotion.instruments.simulators.controller.mtconnect.requests import COUNT, Request, check_range, read_request
 from errormotion.instruments.simulators.controller.mtconnect.styles import STYLES, series
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import parse_fault, stray_bytes
@@ -259,10 +259,11 @@ class SimulatedAgent:
         if request.end is not None:
             check_range("to", request.end, buffer.first if start is None else start, buffer.next + 1)
         backwards = self._frame.schema >= (1, 5) and request.end is None
-        check_range("count", request.count, -most if backwards else 0, most, zero=False)
+        count = min(COUNT, buffer.size) if request.count is None else request.count
+        check_range("count", count, -most if backwards else 0, most, zero=False)
         if start is None:
-            start = buffer.first if request.count > 0 else buffer.next - 1
-        return buffer.select(start, request.count, items, request.end)
+            start = buffer.first if count > 0 else buffer.next - 1
+        return buffer.select(start, count, items, request.end)
 
 
 def _chosen(address: Address, name: str, default: str, known: set[str]) -> str:

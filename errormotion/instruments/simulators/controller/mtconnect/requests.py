@@ -40,7 +40,8 @@ class Request:
         Which data items.
     begin, end, at : int or None
         Sequence numbers.
-    count : int
+    count : int or None
+        Not stated: 100, or the size of a smaller buffer.
     interval, heartbeat : float
         Of a stream, s; no stream where ``interval`` is negative.
     asset : str
@@ -53,7 +54,7 @@ class Request:
     begin: int | None = None
     end: int | None = None
     at: int | None = None
-    count: int = COUNT
+    count: int | None = None
     interval: float = -1.0
     heartbeat: float = HEARTBEAT
     asset: str = ""
@@ -81,7 +82,7 @@ def read_request(path: str, query: Mapping[str, str], schema: tuple[int, int], d
         begin=numbers.get("from"),
         end=numbers.get("to"),
         at=numbers.get("at"),
-        count=numbers.get("count", COUNT),
+        count=numbers.get("count"),
         interval=-1.0 if interval is None else interval / 1e3,
         heartbeat=HEARTBEAT if heartbeat is None else heartbeat / 1e3,
         asset=asset,
