@@ -12,7 +12,7 @@ from errormotion.instruments.thermometer.can_temperature import CanTemperature
 
 def test_late_answers_are_not_taken_for_later_ones() -> None:
     """Every value is the number of its request; one answer comes after the time limit."""
-    late, asked, after = 0.25, 0, []
+    late, asked, after = 1.0, 0, []
 
     def answers(number: int, index: int, subindex: int) -> Iterator[tuple[float, bytes]]:
         nonlocal asked
@@ -24,7 +24,7 @@ def test_late_answers_are_not_taken_for_later_ones() -> None:
             delay = late if asked == 4 else 0.0
         yield delay, reply(index, subindex, value)
 
-    settings = ONE.model_copy(update={"timeout": 0.15})
+    settings = ONE.model_copy(update={"timeout": 0.6})
     with a_server(answers) as address, CanTemperature(address, settings) as thermometer:
         while asked < 3:
             assert thermometer.read() == {"air": float(asked)}

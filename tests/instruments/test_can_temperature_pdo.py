@@ -24,6 +24,7 @@ from canopen_nodes import (
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.can_temperature import CanSettings, CanTemperature
 from errormotion.instruments.thermometer.cia404 import CELSIUS
+from errormotion.testing import InstrumentConformance, InstrumentSubject
 
 ADDRESS = "sim://cframe/can?seed=3&node=5"
 QUICK = CanSettings(timeout=0.7, retry=0.05)
@@ -172,3 +173,15 @@ def test_pdos_need_a_node_that_is_operational() -> None:
             thermometer.read()
     with CanTemperature(address, settings.model_copy(update={"start": True})) as thermometer:
         assert all(math.isfinite(value) for value in thermometer.read().values())
+
+
+class TestNodeThatSends(InstrumentConformance):
+    """The conformance kit on values by PDO; nobody on the bus."""
+
+    subject = InstrumentSubject(
+        CanTemperature,
+        "sim://cframe/node?seed=3&open=0&shorted=1&pdo=timer&event_timer=10",
+        settings={"timeout": 0.7, "transfer": "pdo"},
+        name="node_that_sends",
+        dead_address="can://virtual/nobody?node=5",
+    )
