@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
 from errormotion.datasets.text.csv_text import Table
-from errormotion.datasets.text.log_reader import Mistakes
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -310,7 +310,7 @@ def _places(
         place = tuple(places[:, k])
         if place in seen:
             label = ", ".join(f"{dim} '{texts[keys[dim]]}'" for dim in record)
-            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}")
+            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}", "duplicate")
         seen.setdefault(place, line)
     for axis, dim in enumerate(record):
         size = len(found.labels[dim]) if dim in keys else int(places[axis].max(initial=-1)) + 1

@@ -73,7 +73,7 @@ def open_transport(
         case "sim":
             from errormotion.instruments.transports.simulated import SimulatedTransport
 
-            transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout)
+            transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout, baudrate=baudrate)
         case _:
             raise InstrumentError(
                 f"This instrument has no connection of type {address.scheme}: expected "

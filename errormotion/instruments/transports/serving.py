@@ -52,6 +52,11 @@ class Server(ABC):
         self._wake_read.close()
         self._wake_write.close()
 
+    @property
+    def connection(self) -> object:
+        """The present connection: another object after the next one was opened."""
+        return self
+
     @abstractmethod
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
@@ -78,6 +83,11 @@ class TcpServer(Server):
         self._connected = threading.Event()
         self.connections = 0  # accepted so far
         self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+
+    @property
+    def connection(self) -> object:
+        """The present connection; None without one."""
+        return self._line
 
     def await_connection(self, timeout: float) -> bool:
         """Wait for a connection; False where there is none within ``timeout`` s.
@@ -146,14 +156,29 @@ class PtyServer(Server):
     """A pseudo terminal: the driver opens its far end as a serial line."""
 
     def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
-        import tty  # only where there are terminals
+        import termios  # only where there are terminals
+        import tty
 
         super().__init__(name, on_data)
         self._near, self._far = os.openpty()  # the far end stays open here, else its first close ends the line
         tty.setraw(self._far)
+        flags = termios.tcgetattr(self._far)
+        flags[4] = flags[5] = termios.B0  # no driver has set it
+        termios.tcsetattr(self._far, termios.TCSANOW, flags)
         os.set_blocking(self._near, False)
         self._cut = False
         self.url = f"serial://{os.ttyname(self._far)}"
+
+    @property
+    def baudrate(self) -> int:
+        """Baud rate to which a driver has set the line; 0 before."""
+        import termios
+
+        code = termios.tcgetattr(self._far)[5]
+        rates = {
+            getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
+        }
+        return rates.get(code, 0)
 
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""

@@ -61,6 +61,7 @@ class SimulatedKeyenceLK(SimulatedDevice):
         "error",
         "drop",
         "disconnect",
+        "late",
     )
 
     def __init__(self, address: Address) -> None:

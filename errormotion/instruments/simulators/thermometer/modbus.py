@@ -34,7 +34,7 @@ class SimulatedModbus(SimulatedDevice):
     """
 
     faults: tuple[str, ...] = (
-        *("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "exception", "unit", "short"),
+        *("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late", "exception", "unit", "short"),
         "unplugged",
     )
 

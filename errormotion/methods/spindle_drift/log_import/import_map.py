@@ -7,7 +7,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from errormotion.datasets.text.log_format import TIMESTAMP, Column, Format, LogTable
+from errormotion.datasets.text.dates import TIMESTAMP, is_date
+from errormotion.datasets.text.log_format import Column, Format, LogTable
+from errormotion.datasets.text.log_format import TimeColumn as DateColumns
 from errormotion.datasets.units import Angle, Length, convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.schema import CHANNELS
@@ -27,7 +29,7 @@ def _convertible(target: str) -> AfterValidator:
 
 
 def _time_unit(unit: str) -> str:
-    if unit == TIMESTAMP:
+    if is_date(unit):
         return unit
     try:
         convert(1.0, unit, "s")
@@ -39,8 +41,18 @@ def _time_unit(unit: str) -> str:
 class TimeColumn(LogTable):
     """Column of the time."""
 
-    column: Column
-    unit: Annotated[str, AfterValidator(_time_unit)] = Field(description="a unit such as 's', or 'iso8601'")
+    column: DateColumns
+    unit: Annotated[str, AfterValidator(_time_unit)] = Field(
+        description="a unit such as 's', 'iso8601', or the order of a date such as 'dd.mm.yyyy'"
+    )
+
+    @model_validator(mode="after")
+    def _two_columns_are_dates(self) -> Self:
+        if isinstance(self.column, list) and not is_date(self.unit):
+            raise ValueError(
+                "column: two columns are date and time of day; expected the unit 'iso8601' or 'dd.mm.yyyy'"
+            )
+        return self
 
 
 class Channel(LogTable):
