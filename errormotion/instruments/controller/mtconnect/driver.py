@@ -96,7 +96,7 @@ class MTConnect(Driver):
         self.restarts = 0
         self._instance: int | None = None
         self._next: int | None = None
-
+        self._held = 0  # observations that the agent keeps
         self._started_at: float | None = None
         self._restarted = False  # while no client was connected
         self._device = Device("", "")
@@ -240,7 +240,8 @@ class MTConnect(Driver):
     # ------------------------------------------------------------------ sequence numbers
 
     def _from(self) -> dict[str, str]:
-        return {"from": str(self._next), "count": str(self.settings.count)}
+        count = min(self.settings.count, self._held or self.settings.count)  # an agent refuses more than it holds
+        return {"from": str(self._next), "count": str(count)}
 
     def _continued(self, document: Document) -> Observed | None:
         """Return the observations of an answer; None where the sequence numbers must be determined again."""
@@ -343,6 +344,7 @@ class MTConnect(Driver):
         except ProtocolError as error:
             status = f" (HTTP status {answer.status})" if answer.status != 200 else ""
             raise ProtocolError(f"{self.address}/{request}{status}: {error}") from None
+        self._held = document.header.buffer
         if refused:
             self._refuse(document, request)
         return document
