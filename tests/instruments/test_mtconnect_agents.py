@@ -13,6 +13,7 @@ from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.mtconnect import MTConnect, MTConnectSettings
+from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.transports.http.serving import HttpServer
 
 HEADER = '<Header creationTime="2025-03-01T12:00:00Z" instanceId="17" version="2.0" sender="shop"'
@@ -220,3 +221,22 @@ def test_a_device_that_the_address_does_not_name_is_refused() -> None:
     probe = b"<MTConnectDevices>%s/><Devices>%s</Devices></MTConnectDevices>" % (HEADER.encode(), two)
     with agent(probe) as there, pytest.raises(InstrumentError, match="the devices A, B; name one in the address"):
         MTConnect(there.url).open()
+
+
+# ---------------------------------------------------------------------- styles of the simulated agent
+
+
+@pytest.mark.parametrize("style", ["own", "okuma", "mazak", "vmc"])
+@pytest.mark.parametrize("more", ["", "&series=1", "&next=0", "&offset=10,20,30"])
+def test_machine_coordinates_are_read_at_agents_of_each_style(style: str, more: str) -> None:
+    address = f"sim://cframe/mtconnect?seed=3&style={style}{more}"
+    with MTConnect(address) as driver, VirtualController("sim://cframe/controller?seed=3") as control:
+        control.move_to((0.1, 0.05, 0.2), 0.05)
+        state, true = driver.state(), control.state()
+        assert driver.sample().observations
+        assert driver.sample().observations == ()
+    assert state["position"] == pytest.approx(true["position"], abs=1e-6)
+    assert "position" not in state["unavailable"]
+    assert "feed" not in state["unavailable"]
+    assert set(driver.unclear) <= {"spindle_speed"}
+    assert ("spindle_speed" in state["unavailable"]) == bool(driver.unclear)
