@@ -168,7 +168,7 @@ class Model:
         self._component("CncSpindleList", SPINDLE, _SPINDLE, _SPINDLES)
         channel = self._component("CncChannelList", CHANNEL, _CHANNEL, _CHANNELS)
         value = ua.Variant(1, ua.VariantType.UInt32)
-        node = ua.NodeId(f"{channel.Identifier}.Id", ua.Int16(self._own))
+        node = self._id(f"CncInterface.CncChannelList.{CHANNEL}.Id")
         kind = number(Ids.UInt32)
         self._space.variable(node, self._name("Id"), channel, kind, value, reference=Ids.HasProperty)
 
@@ -222,7 +222,7 @@ class Model:
             data_type, kind = number(getattr(Ids, item.data)), ua.VariantType[item.data]
 
         def read() -> ua.DataValue:
-            return self._machine.value(self._reading(item), kind)
+            return self._machine.value(node, self._reading(item), kind)
 
         name = self._name(item.name)
         self._space.variable(node, name, parent, data_type, read, definition=definition, rank=item.rank)
@@ -239,20 +239,21 @@ class Model:
         def whole() -> ua.DataValue:
             values = [machine.reading(name) for name in names]
             if values[0] is None:
-                return machine.value(None, ua.VariantType.ExtensionObject)
+                return machine.value(node, None, ua.VariantType.ExtensionObject)
             body = struct.pack("<3d", *(float("nan") if value is None else value for value in values))
-            structure = ua.ExtensionObject(self._type(_POSITION_ENCODING), body)
-            return machine.value(structure, ua.VariantType.ExtensionObject)
+            structure = ua.ExtensionObject(self._type(_POSITION_ENCODING), ua.ByteString(body))
+            return machine.value(node, structure, ua.VariantType.ExtensionObject)
 
         definition = self._type(_POSITION_TYPE)
         data_type = self._type(_POSITION_DATA)
         self._space.variable(node, self._name(item.name), parent, data_type, whole, definition=definition)
         for part, name in zip(("ActPos", "CmdPos", "RemDist"), names, strict=True):
+            single = self._id(f"{path}.{part}")
 
-            def read(name: str = name) -> ua.DataValue:
-                return machine.value(machine.reading(name), kind)
+            def read(single: ua.NodeId = single, name: str = name) -> ua.DataValue:
+                return machine.value(single, machine.reading(name), kind)
 
-            self._space.variable(self._id(f"{path}.{part}"), self._name(part), node, number(Ids.Double), read)
+            self._space.variable(single, self._name(part), node, number(Ids.Double), read)
         if item.unit:
             self._unit(node, path, item.unit, self._unit_names)
 
@@ -290,7 +291,7 @@ class Model:
     # ------------------------------------------------------------------ names
 
     def _id(self, path: str) -> ua.NodeId:
-        return ua.NodeId(path, ua.Int16(self._own))
+        return ua.NodeId(ua.String(path), ua.Int16(self._own))
 
     def _type(self, identifier: int) -> ua.NodeId:
         return number(identifier, self._model)

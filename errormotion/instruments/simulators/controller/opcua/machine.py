@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from datetime import timedelta
 from typing import Any
 
 from asyncua import ua
+from asyncua.ua.status_codes import StatusCodes
 
 from errormotion.instruments.simulators.controller.mtconnect.machine import EPOCH
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
@@ -26,17 +27,23 @@ class Machine:
     world : VirtualWorld
     unavailable : callable
         Whether the machine is out of reach: then all values have a bad status.
+
+    Attributes
+    ----------
+    time : ua.DateTime
+        Of the instant, on the clock of the world.
     """
 
     def __init__(self, world: VirtualWorld, unavailable: Callable[[], bool]) -> None:
         self._world = world
         self._unavailable = unavailable
+        self._shown: dict[object, tuple[Any, ua.DateTime]] = {}  # of a node: its value, and when it became that
         self.refresh()
 
     def refresh(self) -> None:
         """Read the machine."""
         shown = self._world.commanded()
-        self._time: datetime = EPOCH + timedelta(seconds=shown["time"])
+        self.time = ua.DateTime.fromisoformat((EPOCH + timedelta(seconds=shown["time"])).isoformat())
         self._readings = readings(shown)
         self._good = not self._unavailable()
 
@@ -44,12 +51,29 @@ class Machine:
         """Return a reading; None where the machine has none of this name or it is not known."""
         return self._readings.get(name)
 
-    def value(self, value: Any, kind: ua.VariantType) -> ua.DataValue:
-        """Return the value of a node; None and a machine out of reach become a bad status."""
+    def value(self, node: object, value: Any, kind: ua.VariantType) -> ua.DataValue:
+        """Return the value of a node; None and a machine out of reach become a bad status.
+
+        The time of the source is that of the last change of value or status, as far as requests have seen it
+        (OPC 10000-4, 7.11.3).
+        """
+        status = StatusCodes.Good
         if not self._good or value is None:
-            status = ua.StatusCodes.BadNoData if self._good else ua.StatusCodes.BadNotConnected
-            return ua.DataValue(ua.Variant(), ua.StatusCode(ua.UInt32(status)), SourceTimestamp=self._time)
-        return ua.DataValue(ua.Variant(value, kind), SourceTimestamp=self._time)
+            value = None
+            status = StatusCodes.BadNoData if self._good else StatusCodes.BadNotConnected
+        state = (value, status)
+        if node not in self._shown or self._shown[node][0] != state:
+            self._shown[node] = state, self.time
+        return ua.DataValue(
+            ua.Variant() if value is None else ua.Variant(value, kind),
+            ua.StatusCode(ua.UInt32(status)),
+            SourceTimestamp=self._shown[node][1],
+            ServerTimestamp=self.time,
+        )
+
+    def clock(self) -> ua.DataValue:
+        """Return the time of the machine as the value of a node."""
+        return ua.DataValue(ua.Variant(self.time, ua.VariantType.DateTime), ServerTimestamp=self.time)
 
 
 def readings(shown: Shown) -> dict[str, Any]:

@@ -6,18 +6,19 @@ import asyncio
 import logging
 import threading
 from collections.abc import Coroutine
-from datetime import UTC, datetime
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any, TypeVar
 
 import numpy as np
 from asyncua import ua
+from asyncua.ua.attribute_ids import AttributeIds
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.controller.opcua import cnc, sinumerik
 from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
 from errormotion.instruments.simulators.controller.opcua.machine import Machine
-from errormotion.instruments.simulators.controller.opcua.space import UA, Attributes, Ids, SmallServer, Space, clock
+from errormotion.instruments.simulators.controller.opcua.space import UA, Attributes, Ids, SmallServer, Space
 from errormotion.instruments.simulators.controller.opcua.space import number as numeric
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import parse_fault
@@ -122,7 +123,7 @@ class SimulatedServer:
         await server.init()
         release = version("errormotion")
         await server.set_build_info(
-            "urn:errormotion", "errormotion", "simulated control", release, "0", datetime.now(UTC)
+            "urn:errormotion", "errormotion", "simulated control", release, "0", self._machine.time
         )
         await server.set_application_uri(f"urn:errormotion:{self.world.name}:{self._seed}")
         space = Space(inner)
@@ -131,7 +132,7 @@ class SimulatedServer:
         await server.start()
         self._server = server
         self._port = server.port
-        space.live(numeric(Ids.Server_ServerStatus_CurrentTime), clock)
+        await self._add_clock(server, space)
         self._refreshing = asyncio.create_task(self._refresh(inner))
 
     async def _fill(self, server: FaultyServer, space: Space) -> Any:
@@ -152,6 +153,21 @@ class SimulatedServer:
         cnc.Model(space, self._machine, own, model, UA if self._units == "ua" else model).add(texts)
         return None
 
+    async def _add_clock(self, server: FaultyServer, space: Space) -> None:
+        """Have the server show the time of the world as its own."""
+        started = self._machine.time
+        ids = (Ids.Server_ServerStatus, Ids.Server_ServerStatus_StartTime, Ids.Server_ServerStatus_CurrentTime)
+        whole, start, now = (numeric(each) for each in ids)
+        shown = await server.get_node(whole).read_value()
+
+        def status() -> ua.DataValue:
+            present = replace(shown, StartTime=started, CurrentTime=self._machine.time)
+            return ua.DataValue(ua.Variant(present, ua.VariantType.ExtensionObject))
+
+        space.live(whole, status)
+        space.live(start, lambda: ua.DataValue(ua.Variant(started, ua.VariantType.DateTime)))
+        space.live(now, self._machine.clock)
+
     async def _refresh(self, inner: SmallServer) -> None:
         """Report the values of nodes that clients have subscribed to."""
         while True:
@@ -160,11 +176,11 @@ class SimulatedServer:
                 continue
             self._machine.refresh()
             for node in list(inner.aspace.keys()):
-                held = inner.aspace[node].attributes.get(ua.AttributeIds.Value)
+                held = inner.aspace[node].attributes.get(AttributeIds.Value)
                 if held is None or held.value_callback is None:
                     continue
                 for handle, report in list(held.datachange_callbacks.items()):
-                    await report(handle, held.value_callback(node, ua.AttributeIds.Value))
+                    await report(handle, held.value_callback(node, AttributeIds.Value))
 
     def _restart(self) -> None:
         """Go and come back: sessions and subscriptions are forgotten."""

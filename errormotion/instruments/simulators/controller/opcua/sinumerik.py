@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from asyncua import ua
+from asyncua.ua.status_codes import StatusCodes
 
 from errormotion.instruments.simulators.controller.opcua.machine import AXES, Machine
 from errormotion.instruments.simulators.controller.opcua.space import Ids, Reader, Space, number
@@ -110,11 +111,11 @@ def value(machine: Machine, node: ua.NodeId) -> ua.DataValue | None:
     if found[5]:
         last = first + int(found[5]) - 1 if found[4] else int(found[5])
     if unit != 1 or not 1 <= first <= last <= variable.rows:
-        return ua.DataValue(ua.Variant(), ua.StatusCode(ua.UInt32(ua.StatusCodes.BadAttributeIdInvalid)))
+        return ua.DataValue(ua.Variant(), ua.StatusCode(ua.UInt32(StatusCodes.BadAttributeIdInvalid)))
     rows = [variable.read(machine, row) for row in range(first - 1, last)]
     if not found[5]:
-        return machine.value(rows[0], variable.kind)
-    return machine.value(None if None in rows else rows, variable.kind)
+        return machine.value(identifier, rows[0], variable.kind)
+    return machine.value(identifier, None if None in rows else rows, variable.kind)
 
 
 def _folder(space: Space, name: str, path: str, parent: ua.NodeId) -> ua.NodeId:
@@ -123,8 +124,8 @@ def _folder(space: Space, name: str, path: str, parent: ua.NodeId) -> ua.NodeId:
 
 
 def _id(path: str) -> ua.NodeId:
-    return ua.NodeId(path, ua.Int16(INDEX))
+    return ua.NodeId(ua.String(path), ua.Int16(INDEX))
 
 
 def _row(machine: Machine, variable: Variable, row: int) -> Reader:
-    return lambda: machine.value(variable.read(machine, row), variable.kind)
+    return lambda: machine.value((variable, row), variable.read(machine, row), variable.kind)

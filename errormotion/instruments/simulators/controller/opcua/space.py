@@ -7,17 +7,18 @@ server needs; OPC 10000-7 leaves the type system to larger profiles.
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 from asyncua import ua
 from asyncua.server.address_space import AddressSpace, AttributeService
 from asyncua.server.internal_server import InternalServer
+from asyncua.ua.attribute_ids import AttributeIds
+from asyncua.ua.object_ids import ObjectIds
 
 from errormotion.errors import InstrumentError
 
 Reader = Callable[[], ua.DataValue]
-Ids = ua.ObjectIds
+Ids = ObjectIds
 UA = 0
 """Index of the namespace of OPC UA."""
 
@@ -183,7 +184,7 @@ class Space:
 
     def live(self, node: ua.NodeId, read: Reader) -> None:
         """Have the value of a variable read anew at each request."""
-        self._held.set_attribute_value_callback(node, ua.AttributeIds.Value, lambda _node, _attribute: read())
+        self._held.set_attribute_value_callback(node, AttributeIds.Value, lambda _node, _attribute: read())
 
 
 _TYPE_FOLDERS = {number(folder) for folder in _FOLDER_OF.values()}
@@ -213,21 +214,21 @@ def _add_server(space: Space) -> None:
     space.object(server, name("Server"), number(Ids.ObjectsFolder), number(Ids.ServerType), Ids.Organizes)
     text, unsigned, empty = number(Ids.String), number(Ids.UInt32), ua.Variant()
     none = ua.Variant([], ua.VariantType.String)
-    for node, title in ((Ids.Server_ServerArray, "ServerArray"), (Ids.Server_NamespaceArray, "NamespaceArray")):
-        space.variable(number(node), name(title), server, text, none, reference=Ids.HasProperty, rank=1)
+    for identifier, title in ((Ids.Server_ServerArray, "ServerArray"), (Ids.Server_NamespaceArray, "NamespaceArray")):
+        space.variable(number(identifier), name(title), server, text, none, reference=Ids.HasProperty, rank=1)
     level, byte = number(Ids.Server_ServiceLevel), number(Ids.Byte)
     space.variable(level, name("ServiceLevel"), server, byte, empty, reference=Ids.HasProperty)
 
     status, kind = number(Ids.Server_ServerStatus), number(Ids.ServerStatusType)
     structure = number(Ids.ServerStatusDataType)
     space.variable(status, name("ServerStatus"), server, structure, empty, definition=kind)
-    for node, title, data_type in (
+    for identifier, title, data_type in (
         (Ids.Server_ServerStatus_StartTime, "StartTime", Ids.UtcTime),
         (Ids.Server_ServerStatus_CurrentTime, "CurrentTime", Ids.UtcTime),
         (Ids.Server_ServerStatus_State, "State", Ids.ServerState),
         (Ids.Server_ServerStatus_SecondsTillShutdown, "SecondsTillShutdown", Ids.UInt32),
     ):
-        space.variable(number(node), name(title), status, number(data_type), empty)
+        space.variable(number(identifier), name(title), status, number(data_type), empty)
     build, kind = number(Ids.Server_ServerStatus_BuildInfo), number(Ids.BuildInfoType)
     space.variable(build, name("BuildInfo"), status, number(Ids.BuildInfo), empty, definition=kind)
     for title in _BUILD:
@@ -243,11 +244,6 @@ def _add_server(space: Space) -> None:
     for title in _LIMITS:
         node = number(getattr(Ids, f"Server_ServerCapabilities_OperationLimits_{title}"))
         space.variable(node, name(title), number(limits), unsigned, empty, reference=Ids.HasProperty)
-
-
-def clock() -> ua.DataValue:
-    """Return the present time as the value of a variable."""
-    return ua.DataValue(ua.Variant(datetime.now(UTC), ua.VariantType.DateTime))
 
 
 class Attributes(AttributeService):
@@ -278,8 +274,8 @@ class Attributes(AttributeService):
         self._refresh()
         return [self._read(each.NodeId, each.AttributeId) for each in params.NodesToRead]
 
-    def _read(self, node: ua.NodeId, attribute: ua.AttributeIds) -> ua.DataValue:
-        if self._further is not None and attribute == ua.AttributeIds.Value and node not in self._space:
+    def _read(self, node: ua.NodeId, attribute: AttributeIds) -> ua.DataValue:
+        if self._further is not None and attribute == AttributeIds.Value and node not in self._space:
             found = self._further(node)
             if found is not None:
                 return found
