@@ -42,7 +42,7 @@ class OpcUa(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-        return InstrumentSubject(cls, "sim://cframe/opcua")
+        return InstrumentSubject(cls, "sim://cframe/opcua", {"timeout": 1.5})
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
@@ -78,8 +78,8 @@ class OpcUa(Driver):
             ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
             clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
             ``mdi``, ``automatic``, the server's own word, or empty), ``program``, ``running``, ``estop`` (None where
-            no node reports it), ``homed``, ``enabled`` (None: not read), ``alarms`` (empty: not read), and
-            ``unavailable``: names of what is unknown. Unknown numbers are NaN.
+            no node reports it), ``homed`` (all axes are; None where no node reports it), ``enabled`` (None: not read),
+            ``alarms`` (empty: not read), and ``unavailable``: names of what is unknown. Unknown numbers are NaN.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class OpcUa(Driver):
             "mode": model.MODES.get(text["mode"], "") if "mode" in self._in_model else text["mode"],
             "program": text["program"],
             "running": text["execution"] in self.settings.running,
-            "homed": None,
+            "homed": _all_of([values[key].get("value") for key in keys if key.startswith(model.HOMED)]),
             "enabled": None,
             "estop": text["estop"] in self.settings.stopped if text["estop"] else None,
             "alarms": [],
@@ -117,7 +117,7 @@ class OpcUa(Driver):
         state["unavailable"] = [
             *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
             *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
-            *(key for key in TEXTS if not text[key]),
+            *(key for key in TEXTS if values.get(key, {}).get("value") is None),
         ]
         return state
 
@@ -195,6 +195,13 @@ def _seconds(time: Any) -> float:
         return datetime.fromisoformat(time).timestamp()
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _all_of(answers: Sequence[Any]) -> bool | None:
+    """Return whether all answers are true; None where one is not known, or there is none."""
+    if not answers or not all(isinstance(answer, bool) for answer in answers):
+        return None
+    return all(answers)
 
 
 def _text(answer: Mapping[str, Any] | None) -> str:
