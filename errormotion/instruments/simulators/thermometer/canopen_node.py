@@ -10,6 +10,7 @@ limits), that a TPDO by event without event timer is not sent, the emergency cod
 from __future__ import annotations
 
 import math
+import time
 from functools import partial
 from typing import Any
 
@@ -66,7 +67,8 @@ class SimulatedCanopen:
     in ms, 50, ``off``: switched off, ``none``: no TPDO), ``state`` after power-on (``operational``: it starts by
     itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
 
-    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range`` as of all devices, counted over SDO answers and PDOs;
+    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
+    and PDOs;
     ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
     answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see `simulators.thermometers`; it boots
     when it is back).
@@ -82,6 +84,7 @@ class SimulatedCanopen:
         "garbage",
         "drop",
         "out_of_range",
+        "late",
         "abort",
         "bus_off",
         "stopped",
@@ -98,6 +101,7 @@ class SimulatedCanopen:
         pdo = _choices(address, "pdo", "event", ("event", "sync", "timer", "off", "none"))[0]
         state = _choices(address, "state", "operational", ("operational", "pre-operational"))[0]
         self._answers = 0
+        self._held: tuple[int, bytes, float] | None = None  # the frame that is late, and when it is sent at the latest
         node, seed = address.whole("node", 1, 127), int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *(address.path or "thermometer").encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -225,7 +229,19 @@ class SimulatedCanopen:
             self._slave.receive(can_id, data, remote)
 
     def _due(self, now: float) -> float:
-        return now + 1.0 if self._absent() else self._slave.due(now)
+        if self._absent():
+            self._held = None
+            return now + 1.0
+        if self._held is not None and now >= self._held[2]:
+            self._release()
+        due = self._slave.due(now)
+        return due if self._held is None else min(due, self._held[2])
+
+    def _release(self) -> None:
+        """Send the frame that was held back."""
+        held, self._held = self._held, None
+        if held is not None and self._server is not None:
+            self._server.send(held[0], held[1])
 
     def _absent(self) -> bool:
         """Whether the node is without power; it boots where it is back."""
@@ -255,7 +271,10 @@ class SimulatedCanopen:
             return
         elif self.fault.hits("garbage", number):
             server.send(can_id, self._rng.integers(0, 256, self._rng.integers(1, 8), dtype=np.uint8).tobytes())
+        elif self.fault.kind == "late" and number == self.fault.at:
+            self._held = can_id, data, time.monotonic() + self.fault.delay
         else:
+            self._release()
             server.send(can_id, data)
 
 
