@@ -81,7 +81,6 @@ class TcpServer(Server):
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._line: socket.socket | None = None
         self._connected = threading.Event()
-        self.connections = 0  # accepted so far
         self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
@@ -126,7 +125,6 @@ class TcpServer(Server):
                 line, _ = self._listener.accept()
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._line = line
-                self.connections += 1
                 self._connected.set()
                 continue
             try:
