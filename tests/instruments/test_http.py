@@ -8,6 +8,7 @@ import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.http import client
 from errormotion.instruments.transports.http.client import HttpTransport
 from errormotion.instruments.transports.http.serving import HttpServer
 
@@ -100,7 +101,9 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
         ([], InstrumentTimeoutError, "sent no data"),
         ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
         ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
-        ([CHUNKED + b"zz\r\n"], ProtocolError, "cut off"),
+        ([CHUNKED + b"zz\r\n"], ProtocolError, "damaged: expected a chunk size"),
+        ([CHUNKED + b"5\r\nxxxxx\r\n", b""], ProtocolError, "cut off between two chunks"),
+        ([CHUNKED + b"5\r\nxxx", b""], ProtocolError, "cut off within a chunk"),
         ([CHUNKED + b"-1\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-1'"),
         ([CHUNKED + b"-5\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-5'"),
         ([CHUNKED + b"0x5\r\nxxxxx\r\n0\r\n\r\n"], ProtocolError, "chunk size"),
@@ -146,9 +149,12 @@ def slowly(head: bytes, piece: bytes, count: int) -> Iterator[bytes]:
     ],
 )
 @pytest.mark.parametrize("streamed", [False, True])
-def test_an_answer_that_drips_ends_at_its_deadline(site: Site, head: bytes, piece: bytes, streamed: bool) -> None:
-    http = HttpTransport(site.url, timeout=0.05)
-    site.pages["/slow"] = slowly(head, piece, 150)  # 3 s; the deadline is 0.5 s
+def test_an_answer_that_drips_ends_at_its_deadline(
+    site: Site, head: bytes, piece: bytes, streamed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
+    site.pages["/slow"] = slowly(head, piece, 150)  # 3 s; the deadline is 0.45 s
     started = time.monotonic()
     with pytest.raises(InstrumentTimeoutError, match="not complete within the time limit"):
         list(http.parts("/slow")) if streamed else http.get("/slow")
@@ -156,8 +162,9 @@ def test_an_answer_that_drips_ends_at_its_deadline(site: Site, head: bytes, piec
     http.close()
 
 
-def test_a_part_that_drips_ends_at_its_deadline(site: Site) -> None:
-    http = HttpTransport(site.url, timeout=0.05)
+def test_a_part_that_drips_ends_at_its_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
     site.pages["/sample"] = slowly(MULTIPART + b"\r\n" + part(b"1") + b"--x\r\nContent-length: 999\r\n\r\n", b"x", 150)
     stream = http.parts("/sample")
     assert next(stream) == b"1"
@@ -166,8 +173,9 @@ def test_a_part_that_drips_ends_at_its_deadline(site: Site) -> None:
     http.close()
 
 
-def test_a_stream_that_pauses_between_its_parts_has_no_deadline(site: Site) -> None:
-    http = HttpTransport(site.url, timeout=0.05)
+def test_a_stream_that_pauses_between_its_parts_has_no_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
     site.pages["/sample"] = slowly(MULTIPART + b"\r\n", part(b"1"), 40)  # 0.8 s
     stream = http.parts("/sample")
     assert [next(stream) for _ in range(40)] == [b"1"] * 40

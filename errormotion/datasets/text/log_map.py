@@ -19,7 +19,9 @@ class MappedColumn(LogTable):
         description="unit of the cells, such as 'um'; for dates 'iso8601' or their order, such as 'dd.mm.yyyy'; "
         "empty for pure numbers",
     )
-    scale: float = Field(1.0, description="factor to the cells; -1 where they count in the opposite direction")
+    scale: float = Field(
+        1.0, allow_inf_nan=False, description="factor to the cells; -1 where they count in the opposite direction"
+    )
     offset: str = Field("", description="added after scaling, with its unit, such as '2 mm'")
 
     @model_validator(mode="after")
@@ -56,7 +58,9 @@ class LogMap(LogTable):
     labels: dict[str, Column] = Field(
         default_factory=dict, description="columns that hold the numbers or names along a dimension"
     )
-    columns: dict[str, MappedColumn] = Field(description="columns by variable, or by variable and component")
+    columns: dict[str, MappedColumn] = Field(
+        min_length=1, description="columns by variable, or by variable and component"
+    )
     values: dict[str, MappedValue] = Field(default_factory=dict, description="values by variable")
 
     @model_validator(mode="before")

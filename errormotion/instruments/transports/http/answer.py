@@ -20,6 +20,11 @@ _MOST_INTERIM_ANSWERS = 5  # 1xx, before the final one
 _STATUS_LINE = re.compile(r"HTTP/1\.([01]) ([1-5][0-9][0-9])(?: .*)?")
 _CHUNK_SIZE = re.compile(rb"([0-9A-Fa-f]{1,8})[ \t]*(?:;.*)?")
 
+
+class CutOffError(ProtocolError):
+    """The connection ended within a body in chunks."""
+
+
 Read = Callable[[float], bytes]
 """``read(timeout)`` returns bytes as soon as there are any, no bytes at the end of the connection."""
 
@@ -169,25 +174,29 @@ class Head:
             return b""
         data = self._source.some(min(most, int(self._left))) if self._left < math.inf else self._source.some(most)
         if self._chunked and not data:
-            raise ProtocolError(f"{self._url}: the answer is cut off within a chunk")
+            raise CutOffError(f"{self._url}: the answer is cut off within a chunk")
         self._left -= len(data)
         return data
 
     def _next_chunk(self) -> bool:
         """Read the size of the next chunk; False after the last."""
-        if not self._first_chunk and self._source.line() != b"":
-            raise ProtocolError(f"{self._url}: the answer is cut off or damaged at the end of a chunk")
+        if not self._first_chunk and self._chunk_line() != b"":
+            raise ProtocolError(f"{self._url}: the answer is damaged at the end of a chunk")
         self._first_chunk = False
-        line = self._source.line() or b""
+        line = self._chunk_line()
         if not (found := _CHUNK_SIZE.fullmatch(line)):
-            raise ProtocolError(
-                f"{self._url}: the answer is cut off or damaged: expected a chunk size; found {line[:40]!r}"
-            )
+            raise ProtocolError(f"{self._url}: the answer is damaged: expected a chunk size; found {line[:40]!r}")
         self._left = int(found[1], 16)
         if not self._left:
             self._fields()  # the trailer
             self._chunked = False
         return self._left > 0
+
+    def _chunk_line(self) -> bytes:
+        line = self._source.line()
+        if line is None:
+            raise CutOffError(f"{self._url}: the answer is cut off between two chunks")
+        return line
 
     def _length(self) -> float:
         if self.status in (204, 304) or self._chunked:
@@ -251,10 +260,8 @@ class Lines:
                 raise ProtocolError(
                     f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}"
                 )
-            data = self._answer.some(MOST_PART_LINE_BYTES)
-            if not data:
+            if not self._more(MOST_PART_LINE_BYTES):
                 return None  # what is left of a line belongs to nothing
-            self._buffer += data
         line = bytes(self._buffer[:end]).rstrip(b"\r")
         del self._buffer[: end + 1]
         return line
@@ -262,10 +269,17 @@ class Lines:
     def block(self, size: int) -> bytes | None:
         """Return exactly ``size`` bytes; None where the body ends before."""
         while len(self._buffer) < size:
-            data = self._answer.some(max(MOST_PART_LINE_BYTES, size - len(self._buffer)))
-            if not data:
+            if not self._more(max(MOST_PART_LINE_BYTES, size - len(self._buffer))):
                 return None
-            self._buffer += data
         data = bytes(self._buffer[:size])
         del self._buffer[:size]
         return data
+
+    def _more(self, most: int) -> bool:
+        """Wait for bytes; False at the end of the body, or of the connection: an agent may end within a stream."""
+        try:
+            data = self._answer.some(most)
+        except CutOffError:
+            return False
+        self._buffer += data
+        return bool(data)

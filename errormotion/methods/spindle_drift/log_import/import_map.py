@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from errormotion.datasets.text.dates import TIMESTAMP, is_date
@@ -69,12 +69,12 @@ class Channel(LogTable):
 
     @model_validator(mode="after")
     def _has_a_unit_direction(self) -> Self:
-        if not np.isfinite(self.direction).all() or not 0.99 <= np.linalg.norm(self.direction) <= 1.01:
-            length = float(np.linalg.norm(self.direction))
+        if not 0.99 <= math.hypot(*self.direction) <= 1.01:
+            length = math.hypot(*self.direction)
             raise ValueError(f"direction: expected a vector of length 1; found {self.direction} of length {length:.4g}")
         if (self.origin_uncertainty is None) != (self.direction_uncertainty is None):
             raise ValueError("expected origin_uncertainty and direction_uncertainty together, or neither")
-        if self.scale == 0 or not np.isfinite(self.scale):
+        if self.scale == 0 or not math.isfinite(self.scale):
             raise ValueError(f"scale: expected a number other than 0; found {self.scale}")
         return self
 
