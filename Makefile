@@ -17,7 +17,7 @@ demo: .venv/.core  ## measure a virtual machine: beam detection, spindle drift, 
 test: .venv/.compiled  ## run the tests without the slow ones (ARGS="-n 0 tests/kinematics -k fit" runs some, one after another)
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slow" $(ARGS)
 
-test-all: .venv/.compiled  ## run all tests
+test-all: .venv/.compiled-large  ## run all tests
 	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 lint: .venv/.dev  ## style, types, and which package imports which
@@ -55,4 +55,8 @@ lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 # What is compiled at first use is compiled once, before the workers of the tests start.
 .venv/.compiled: .venv/.dev $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)
 	$(BIN)/python tools/precompile
+	@touch $@
+
+.venv/.compiled-large: .venv/.compiled
+	$(BIN)/python tools/precompile --large
 	@touch $@

@@ -58,3 +58,7 @@ class RunError(ErrormotionError):
 
 class PluginError(ErrormotionError):
     """A plugin is unknown or broken."""
+
+
+class PluginWarning(UserWarning):
+    """A part of a plugin does not load and is ignored."""

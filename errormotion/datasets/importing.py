@@ -51,8 +51,8 @@ def _reader(map_file: Path) -> LogReader:
     if variants(schema):
         return read_log
     own: dict[str, LogReader] = {}
-    for cls in plugins.loaded("methods", "datasets"):
-        own |= getattr(cls, "log_readers", {})
+    for _, readers in plugins.brought("log_readers", "methods", "datasets"):
+        own |= readers
     if schema in own:
         return own[schema]
     known = {*own, *(table.id for table in raw_schemas())}

@@ -21,8 +21,8 @@ def load_object(path: str) -> Any:
         raise PluginError(f"expected 'module:name', found '{path}'")
     try:
         return getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise PluginError(f"'{path}' does not load: {error}") from error
+    except Exception as error:  # whatever a foreign module raises while it is imported
+        raise PluginError(f"'{path}' does not load: {type(error).__name__}: {error}") from error
 
 
 class lazy:  # noqa: N801 - reads like `property` and `cached_property`

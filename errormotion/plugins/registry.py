@@ -7,6 +7,7 @@ used, and a broken plugin stays in the list together with its error.
 from __future__ import annotations
 
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from functools import cache
 from importlib.metadata import Distribution, EntryPoint, distributions
 from typing import Any, Literal
 
-from errormotion.errors import PluginError
+from errormotion.errors import PluginError, PluginWarning
 from errormotion.plugins import kind_registry
 from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInfo
 
@@ -153,6 +154,32 @@ def loaded(*groups: Group) -> Iterator[Any]:
                 yield plugin.cls
 
 
+def brought(name: str, *groups: Group) -> Iterator[tuple[Any, Any]]:
+    """Yield each plugin class of some groups that has an attribute of this name, with the attribute.
+
+    A plugin whose attribute cannot be loaded is left out with a warning, so that it affects no other plugin.
+    """
+    for cls in loaded(*groups):
+        value = _attribute(cls, name)
+        if value is not None:
+            yield cls, value
+
+
+def _attribute(cls: Any, name: str) -> Any:
+    """Return an attribute of a plugin class; None where it has none, or, with a warning, where it does not load."""
+    try:
+        return getattr(cls, name, None)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
+        _warn(f"The plugin '{cls.info.id}': `{name}` is ignored: {error}")
+        return None
+
+
+@cache
+def _warn(message: str) -> None:
+    """Warn once."""
+    warnings.warn(message, PluginWarning, stacklevel=4)
+
+
 def owner_of_schema(schema: str) -> Any:
     """Return the plugin class whose datasets have this schema; None where no plugin claims it.
 
@@ -187,11 +214,12 @@ def _schemas_of(cls: Any) -> set[str]:
     own = set(getattr(cls.info, "schemas", ()))
     if hasattr(cls, "needs"):
         own.add(cls.needs.raw_schema)
-    return own | {table.id for table in getattr(cls, "raw_schemas", ())}
+    return own | {getattr(table, "id", "") for table in _attribute(cls, "raw_schemas") or ()}
 
 
 def refresh() -> None:
     """Forget what was found: entry points are read again at the next call."""
     _found.cache_clear()
     _loaded.cache_clear()
+    _warn.cache_clear()
     kind_registry.refresh()

@@ -5,7 +5,8 @@ import sys
 import pytest
 
 from errormotion import plugins
-from errormotion.errors import PluginError
+from errormotion.datasets import schemas
+from errormotion.errors import PluginError, PluginWarning
 
 GOOD = """
 from errormotion.plugins import InstrumentInfo, PluginSettings
@@ -132,3 +133,29 @@ def test_what_was_installed_meanwhile_is_seen_after_a_refresh(install, tmp_path)
     assert "late" not in by_id()
     plugins.refresh()
     assert by_id()["late"].error == ""
+
+
+DATASET = """
+from errormotion.plugins import DatasetInfo, lazy
+
+class Kind:
+    info = DatasetInfo("broken", "A kind of dataset with a part that does not load", ("lab.broken/1",))
+    raw_schemas = {tables}
+    log_readers = lazy("wreck_readers:READERS")
+"""
+
+
+@pytest.mark.parametrize("tables", ['lazy("no_such_module:TABLES")', 'lazy("wreck:UNKNOWN")', "lazy('nothing')"])
+def test_tables_of_a_plugin_that_do_not_load_are_ignored_with_a_warning(install, tables):
+    install("wreck", "[errormotion.datasets]\nbroken = wreck:Kind\n", DATASET.format(tables=tables))
+    with pytest.warns(PluginWarning, match="The plugin 'broken': `raw_schemas` is ignored"):
+        known = schemas.known_schemas()
+    assert {"errormotion.errors/1", "errormotion.raw.spindle_drift/1", "lab.broken/1"} <= known
+    assert plugins.owner_of_schema("lab.unknown/1") is None
+    assert plugins.owner_of_schema("errormotion.raw.spindle_drift/1").info.id == "spindle_drift"
+
+
+def test_tables_that_are_no_schemas_are_ignored(install):
+    install("wreck", "[errormotion.datasets]\nbroken = wreck:Kind\n", DATASET.format(tables="(1, 'text')"))
+    assert {"errormotion.errors/1", "errormotion.raw.spindle_drift/1"} <= schemas.known_schemas()
+    assert plugins.owner_of_schema("lab.unknown/1") is None

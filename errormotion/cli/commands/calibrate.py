@@ -47,6 +47,6 @@ def _calibration_of(data: Path, schema: str) -> Calibration:
     owner = plugins.owner_of_schema(schema)
     found: Calibration | None = getattr(owner, "calibrations", {}).get(schema)
     if found is None:
-        known = {name for cls in plugins.loaded("methods", "datasets") for name in getattr(cls, "calibrations", {})}
+        known = {name for _, made in plugins.brought("calibrations", "methods", "datasets") for name in made}
         raise DatasetError(f"{data}: expected schema {' or '.join(sorted(known))}; found {schema}")
     return found

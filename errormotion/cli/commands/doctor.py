@@ -120,7 +120,7 @@ def _checks_of_plugins() -> list[tuple[str, Callable[[], str]]]:
     """Return the checks that plugins bring: the attribute ``doctor``, name to function."""
     from errormotion import plugins
 
-    return [check for cls in plugins.loaded("instruments", "methods") for check in getattr(cls, "doctor", {}).items()]
+    return [check for _, checks in plugins.brought("doctor", "instruments", "methods") for check in checks.items()]
 
 
 def _serial() -> str:

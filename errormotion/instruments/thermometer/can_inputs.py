@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.thermometer.cia404 import DIGITS, STATUS, UNIT, Number, scale_of, to_celsius
+from errormotion.instruments.thermometer.cia404 import DIGITS, STATUS, UNIT, Number, Scale, scale_of
 from errormotion.instruments.transports.can.node import CanNode
 from errormotion.instruments.transports.can.pdo import TransmitPdo
 from errormotion.instruments.transports.can.sdo import NO_OBJECT, NO_SUBINDEX, SdoRefusal
@@ -23,16 +23,14 @@ class Input:
     number : Number
     subindex : int
         0 where the object has no subindices.
-    scale, offset : float
-        degC = scale x number + offset.
+    scale : Scale
     status : tuple of int, or None
         Index and subindex of its status; None where it has none.
     """
 
     number: Number
     subindex: int
-    scale: float
-    offset: float
+    scale: Scale
     status: tuple[int, int] | None
 
 
@@ -85,20 +83,19 @@ def find_pdos(node: CanNode, inputs: Sequence[Input]) -> list[TransmitPdo]:
 def _find(node: CanNode, subindex: int, numbers: Sequence[Number], unit: int | None, digits: int | None) -> Input:
     number, at = _value(node, subindex, numbers)
     where = f"{node.url}: node {node.node}, input {subindex}"
-    scale = 1.0
+    decimals = 0
     if number.whole:
-        stated = _entry(node, DIGITS, subindex) if digits is None else digits
+        stated = _entry(node, DIGITS, subindex, 1) if digits is None else digits
         if stated is None:
             what = (
                 f"its values 0x{number.index:04X} are whole numbers, and it states no decimal digits (0x{DIGITS:04X})"
             )
             raise InstrumentError(f"{where}: {what}; state them in the setting 'digits'")
-        scale = scale_of(stated)
-    code = _entry(node, UNIT, subindex) if unit is None else unit
+        decimals = stated
+    code = _entry(node, UNIT, subindex, 4) if unit is None else unit
     if code is None:
-        raise InstrumentError(f"{where} states no unit (0x{UNIT:04X}); state it in the setting 'unit': degC or K")
-    factor, offset = to_celsius(code)
-    return Input(number, at, factor * scale, offset, _status(node, subindex))
+        raise InstrumentError(f"{where} states no unit (0x{UNIT:04X}); state it in the setting 'unit': degC, K or degF")
+    return Input(number, at, scale_of(code, decimals), _status(node, subindex))
 
 
 def _value(node: CanNode, subindex: int, numbers: Sequence[Number]) -> tuple[Number, int]:
@@ -125,13 +122,13 @@ def _status(node: CanNode, subindex: int) -> tuple[int, int] | None:
     return None
 
 
-def _entry(node: CanNode, index: int, subindex: int) -> int | None:
+def _entry(node: CanNode, index: int, subindex: int, size: int) -> int | None:
     """Return an entry of an input, or the one without subindices; None where the node has neither."""
     for at in (subindex, 0):
         if at == 0 and _has(node, index, 1):  # the number of entries
             return None
         try:
-            return node.unsigned(index, at)
+            return node.unsigned(index, at, size)
         except SdoRefusal as refusal:
             if refusal.code not in _MISSING:
                 raise

@@ -14,6 +14,7 @@ from errormotion.instruments.thermometer.can_inputs import Input, find_inputs, f
 from errormotion.instruments.thermometer.cia404 import (
     CELSIUS,
     DEVICE_TYPE,
+    FAHRENHEIT,
     IDENTITY,
     KELVIN,
     MOST_DIGITS,
@@ -30,7 +31,7 @@ from errormotion.plugins import Identity, InstrumentInfo
 
 #: SDO abort codes of an input that has no value just now: hardware error, device state, no data.
 NO_VALUE = frozenset((0x06060000, 0x08000020, 0x08000021, 0x08000022, 0x08000024))
-_UNITS = {"degC": CELSIUS, "K": KELVIN}
+_UNITS = {"degC": CELSIUS, "K": KELVIN, "degF": FAHRENHEIT}
 _LATENESS = 1.5
 """Largest interval between two PDOs of a timer, in its own intervals."""
 
@@ -42,7 +43,7 @@ class CanSettings(ThermometerSettings):
         default=(), description="subindex of each channel; default: from 1 on, in their order"
     )
     node: int = Field(default=1, description="node number, where the URL has none", ge=1, le=127)
-    unit: Literal["as stated", "degC", "K"] = Field(
+    unit: Literal["as stated", "degC", "K", "degF"] = Field(
         default="as stated", description="unit of the values; 'as stated': what object 0x6131 states"
     )
     number: Literal["as found", "float", "integer 32", "integer 16"] = Field(
@@ -170,14 +171,14 @@ class CanTemperature(Thermometer):
             value = wanted.number.decode(self._entry(wanted.number.index, wanted.subindex, frames))
             status = 0
             if wanted.status is not None:
-                status = int.from_bytes(self._entry(*wanted.status, frames)[:2], "little")
+                status = int.from_bytes(self._entry(*wanted.status, frames)[:1], "little")
         except SdoRefusal as refusal:
             if refusal.code in NO_VALUE:
                 return math.nan, NO_ANSWER
             raise
         except ProtocolError as error:
             raise ProtocolError(f"{self.address}: node {self.node.node}, {error}") from None
-        return wanted.scale * value + wanted.offset, flag_of(status, value)
+        return wanted.scale.celsius(value), flag_of(status, value)
 
     def _entry(self, index: int, subindex: int, frames: Mapping[int, bytes]) -> bytes:
         """Return an entry as the node has sent it, or from its object dictionary."""

@@ -21,11 +21,14 @@ DIGITS = 0x6132
 STATUS = 0x6150
 PROFILE = 404
 CELSIUS, KELVIN = 0x002D0000, 0x00050000
+FAHRENHEIT = 0x00AC0000  # an assumption: from memory of CiA 303-2
 FAULTY_SENSOR, OVER, UNDER = 1, 2, 4
 """Bits of the status: sensor faulty or missing, above its range, below it; beyond the range the first one may be set
 too."""
 MOST_DIGITS = 9
-ZERO_CELSIUS = 273.15  # K
+LONGEST_NUMBER = 4  # bytes
+_ZEROS = {CELSIUS: (0.0, 1.0), KELVIN: (273.15, 1.0), FAHRENHEIT: (32.0, 5 / 9)}
+"""0 degC in a unit, and K per unit."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,14 @@ class Number:
         return struct.calcsize(self.form)
 
     def decode(self, data: bytes) -> float:
-        """Return the number; ProtocolError for another number of bytes."""
-        if len(data) != self.size:
+        """Return the number; ProtocolError for another number of bytes.
+
+        A node that does not state the size of its entries sends 4 bytes for a number of 2.
+        """
+        if len(data) not in (self.size, LONGEST_NUMBER):
             what = f"{'a whole number' if self.whole else 'a float'} of {self.size} bytes"
             raise ProtocolError(f"0x{self.index:04X}: expected {what}; found {data.hex(' ') or 'none'}")
-        (value,) = struct.unpack(self.form, data)
+        (value,) = struct.unpack_from(self.form, data)
         return float(value)
 
 
@@ -68,30 +74,48 @@ NUMBERS = {
 """In the order in which a node is asked for them."""
 
 
-def scale_of(digits: int) -> float:
-    """Return the factor of a whole number with decimal digits; ProtocolError for an impossible number of them."""
-    if not 0 <= digits <= MOST_DIGITS:
-        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MOST_DIGITS} decimal digits; found {digits}")
-    return 10.0**-digits
+@dataclass(frozen=True)
+class Scale:
+    """How a number becomes degC: (number x 10^exponent - zero) x factor.
+
+    Attributes
+    ----------
+    exponent : int
+    zero : float
+        0 degC in the unit.
+    factor : float
+        K per unit.
+    """
+
+    exponent: int
+    zero: float = 0.0
+    factor: float = 1.0
+
+    def celsius(self, number: float) -> float:
+        """Return the temperature, degC."""
+        shifted = number * 10.0**self.exponent if self.exponent >= 0 else number / 10.0**-self.exponent
+        return (shifted - self.zero) * self.factor
 
 
-def to_celsius(unit: int) -> tuple[float, float]:
-    """Return scale and offset with which values in a unit become degC.
+def scale_of(unit: int, digits: int = 0) -> Scale:
+    """Return how numbers in a unit become degC; ``digits`` is the number of decimal digits of a whole number.
 
     Raises
     ------
     InstrumentError
         Not a unit of temperature.
+    ProtocolError
+        An impossible number of digits.
     """
-    prefix = (unit >> 24 ^ 0x80) - 0x80  # power of ten, signed
-    if unit & 0x00FFFFFF == CELSIUS:
-        return 10.0**prefix, 0.0
-    if unit & 0x00FFFFFF == KELVIN:
-        return 10.0**prefix, -ZERO_CELSIUS
-    raise InstrumentError(
-        f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}) or K (0x{KELVIN:08X}), with a prefix. "
-        "If the code is wrong, state the unit in the setting 'unit'; an input of another kind needs the maker's tool"
-    )
+    if not 0 <= digits <= MOST_DIGITS:
+        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MOST_DIGITS} decimal digits; found {digits}")
+    exponent = (unit >> 24 ^ 0x80) - 0x80 - digits  # the prefix is signed
+    if unit & 0x00FFFFFF not in _ZEROS:
+        raise InstrumentError(
+            f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}), K (0x{KELVIN:08X}) or degF "
+            f"(0x{FAHRENHEIT:08X}), with a prefix. If the code is wrong, state the unit in the setting 'unit'"
+        )
+    return Scale(exponent, *_ZEROS[unit & 0x00FFFFFF])
 
 
 def flag_of(status: int, value: float) -> str:

@@ -14,8 +14,6 @@ from errormotion.methods.multilateration.network.model import Stations, readings
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.twin import VirtualMachine
 
-pytestmark = pytest.mark.timeout(300)  # the compiled loops are compiled here, once for each checkout
-
 NOISE = 1e-6
 STATIONS = np.array([(-0.5, -0.4, -0.1), (0.5, -0.4, 0.4), (0.5, 0.4, -0.1), (-0.5, 0.4, 0.6), (0.0, -0.6, 0.3)])
 SMALL = """

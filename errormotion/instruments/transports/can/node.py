@@ -132,15 +132,18 @@ class CanNode(Transport):
         except ProtocolError as error:
             raise ProtocolError(f"{self._where}, {what}: {error}") from None
 
-    def unsigned(self, index: int, subindex: int = 0) -> int:
-        """Return an entry that is an unsigned number of 1 to 4 bytes; errors as of `upload`."""
+    def unsigned(self, index: int, subindex: int = 0, size: int = 4) -> int:
+        """Return an entry that is an unsigned number of 1 to ``size`` bytes; errors as of `upload`.
+
+        A node that does not state the size of its entries sends 4 bytes; those beyond ``size`` have no meaning.
+        """
         data = self.upload(index, subindex)
         if not 1 <= len(data) <= 4:
             found = f"{len(data)} bytes"
             raise ProtocolError(
                 f"{self._where}, 0x{index:04X}:{subindex}: expected a number of 1 to 4 bytes; found {found}"
             )
-        return int.from_bytes(data, "little")
+        return int.from_bytes(data[:size], "little")
 
     # ------------------------------------------------------------------ network management, PDOs
 
@@ -156,8 +159,8 @@ class CanNode(Transport):
                 identifier = decode_identifier(self.unsigned(COMMUNICATION + number, COB_ID))
                 if identifier is None:
                     continue
-                transmission = self.unsigned(COMMUNICATION + number, TRANSMISSION)
-                entries = self.unsigned(MAPPING + number)
+                transmission = self.unsigned(COMMUNICATION + number, TRANSMISSION, 1)
+                entries = self.unsigned(MAPPING + number, size=1)
                 if entries > MOST_ENTRIES:
                     continue
                 mapped = decode_mapping([self.unsigned(MAPPING + number, 1 + i) for i in range(entries)])
@@ -231,7 +234,7 @@ class CanNode(Transport):
 
     def _event_timer(self, number: int) -> float:
         try:
-            return self.unsigned(COMMUNICATION + number, EVENT_TIMER) / 1e3
+            return self.unsigned(COMMUNICATION + number, EVENT_TIMER, 2) / 1e3
         except SdoRefusal:
             return 0.0
 

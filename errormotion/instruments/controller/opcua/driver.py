@@ -1,0 +1,211 @@
+"""Driver of controls with an OPC UA server: the state of the machine, read-only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, ClassVar
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.controller.opcua import model
+from errormotion.instruments.controller.opcua.settings import NUMBERS, TEXTS, OpcUaSettings
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.opcua import Credentials, open_opcua, request
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
+
+
+class OpcUa(Driver):
+    """A machine whose control has an OPC UA server; read-only.
+
+    Parameters
+    ----------
+    address : str
+        ``opc.tcp://host:4840``, ``sim://cframe/opcua``, ``replay://file``.
+    settings : OpcUaSettings, optional
+    record : Path, optional
+        Recording of the session.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="opcua",
+        kind="controller",
+        summary="Any control with an OPC UA server, read-only: positions, spindle, feed, mode, program",
+        status="peer_verified",
+        simulator="errormotion.instruments.simulators.controller.opcua:SimulatedServer",
+    )
+    Settings: ClassVar[type[OpcUaSettings]] = OpcUaSettings
+    settings: OpcUaSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe/opcua")
+
+    def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
+        super().__init__(address, settings, record=record)
+        self._nodes: dict[str, str] = {}
+        self._units: dict[str, str] = {}
+        self._factors: dict[str, float] = {}
+        self._identity: dict[str, str] = {}
+        self._in_model: frozenset[str] = frozenset()
+        self._started_at: float | None = None
+
+    def identify(self) -> Identity:
+        """Return the identity of the control as the server states it."""
+        return Identity(
+            manufacturer=self._identity.get("manufacturer", "unknown"),
+            model=self._identity.get("model", "OPC UA server"),
+            serial_number="unknown",
+            firmware=self._identity.get("firmware", "unknown"),
+            simulated=self.transport.simulated,
+            details={"address": self.address, "quantities": ", ".join(sorted(self._nodes))},
+        )
+
+    def read(self) -> dict[str, Any]:
+        """Return the state now, without values that are None."""
+        return {name: value for name, value in self.state().items() if value is not None}
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of the machine as the server reports it.
+
+        Returns
+        -------
+        dict
+            ``time`` (s on the server's clock since the driver was first opened), ``position`` and
+            ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
+            clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
+            ``mdi``, ``automatic``, the server's own word, or empty), ``program``, ``running``, ``estop`` (None where
+            no node reports it), ``homed``, ``enabled`` (None: not read), ``alarms`` (empty: not read), and
+            ``unavailable``: names of what is unknown. Unknown numbers are NaN.
+
+        Raises
+        ------
+        ProtocolError
+            An answer without the values that were requested.
+        InstrumentTimeoutError
+            No answer within the time limit.
+        InstrumentError
+            The connection is lost, or the server refuses.
+        """
+        keys = list(self._nodes)
+        clock, *answers = self._read([model.NODE_TIME, *self._nodes.values()])
+        values = dict(zip(keys, answers, strict=True))
+        now = _seconds(clock.get("value"))
+        if self._started_at is None and math.isfinite(now):
+            self._started_at = now
+        start = math.nan if self._started_at is None else self._started_at
+        number = {key: self._number(key, values.get(key)) for key in NUMBERS}
+        text = {key: _text(values.get(key)) for key in TEXTS}
+        moved = [_seconds(values[f"position.{axis}"]["time"]) for axis in "XYZ" if f"position.{axis}" in values]
+        state: dict[str, Any] = {
+            "time": now - start,
+            "position": [number[f"position.{axis}"] for axis in "XYZ"],
+            "commanded_position": [number[f"commanded_position.{axis}"] for axis in "XYZ"],
+            "position_time": max(moved, default=math.nan) - start,
+            **{key: number[key] for key in ("spindle_speed", "spindle_load", "feed")},
+            "mode": model.MODES.get(text["mode"], "") if "mode" in self._in_model else text["mode"],
+            "program": text["program"],
+            "running": text["execution"] in self.settings.running,
+            "homed": None,
+            "enabled": None,
+            "estop": text["estop"] in self.settings.stopped if text["estop"] else None,
+            "alarms": [],
+        }
+        state["unavailable"] = [
+            *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
+            *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
+            *(key for key in TEXTS if not text[key]),
+        ]
+        return state
+
+    # ------------------------------------------------------------------ values
+
+    def _number(self, key: str, answer: Mapping[str, Any] | None) -> float:
+        value = None if answer is None else answer.get("value")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return math.nan
+        return float(value) * self._factors[key]
+
+    # ------------------------------------------------------------------ requests
+
+    def _read(self, nodes: Sequence[str]) -> list[Mapping[str, Any]]:
+        answers = request(self.transport, {"read": list(nodes)})
+        whole = isinstance(answers, list) and len(answers) == len(nodes)
+        if not whole or not all(isinstance(each, dict) and {"value", "time"} <= each.keys() for each in answers):
+            raise ProtocolError(f"{self.address}: expected the values of {len(nodes)} nodes; found {str(answers)[:80]}")
+        return list(answers)
+
+    def _browse(self, node: str) -> list[Mapping[str, Any]]:
+        found = request(self.transport, {"browse": node})
+        if not isinstance(found, list) or not all(
+            isinstance(each, dict) and {"id", "name", "namespace"} <= each.keys() for each in found
+        ):
+            raise ProtocolError(f"{self.address}: expected the children of {node}; found {str(found)[:80]}")
+        return found
+
+    def _connect(self) -> Transport:
+        settings = self.settings
+        return open_opcua(
+            self.address,
+            Credentials(settings.security, settings.user, _first_line(settings.password_file)),
+            timeout=settings.timeout,
+            simulator=self.info.simulator,
+            record=self._record,
+        )
+
+    def _start_session(self) -> None:
+        server = request(self.transport, {"server": True})
+        namespaces = server.get("namespaces", []) if isinstance(server, dict) else []
+        root = model.interface(namespaces, self._browse)
+        found: dict[str, str] = {}
+        if root:
+            found, self._units = model.quantities(root, self._browse, self.settings)
+            parts = model.children(self._browse, root)
+            named = [name for name in model.IDENTITY if name in parts]
+            values = self._read([parts[name] for name in named]) if named else []
+            self._identity = {model.IDENTITY[name]: _text(value) for name, value in zip(named, values, strict=True)}
+        self._in_model = frozenset(found.keys() - self.settings.nodes.keys())
+        self._nodes = found | self.settings.nodes
+        if not self._nodes:
+            raise InstrumentError(
+                f"The server at {self.address} has no object CncInterface (OPC 40502): name its nodes in the settings, "
+                "as in nodes.spindle_speed = 'ns=2;s=/Channel/Spindle/actSpeed[u1,1]'"
+            )
+        self._factors = {key: self._factor(key) for key in NUMBERS if key in self._nodes}
+        for key, value in zip(self._nodes, self._read(list(self._nodes.values())), strict=True):
+            if key in self.settings.nodes and value["value"] is None and value.get("status") != "Good":
+                raise InstrumentError(f"nodes.{key} = '{self._nodes[key]}': the server answers {value.get('status')}")
+
+    def _factor(self, key: str) -> float:
+        """Return the factor from the unit of a node to that of the state."""
+        if key.partition(".")[0] in self.settings.units:
+            return model.factor(key, None, self.settings)
+        unit = model.children(self._browse, self._nodes[key]).get(model.UNIT, "")
+        if not unit and key not in self.settings.nodes:
+            unit = self._units.get(key, "")
+        return model.factor(key, self._read([unit])[0]["value"] if unit else None, self.settings)
+
+
+def _seconds(time: Any) -> float:
+    """Return a time as s since 1970; NaN where there is none."""
+    try:
+        return datetime.fromisoformat(time).timestamp()
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _text(answer: Mapping[str, Any] | None) -> str:
+    value = None if answer is None else answer.get("value")
+    return "" if value is None else str(value)
+
+
+def _first_line(path: str) -> str:
+    if not path:
+        return ""
+    try:
+        return Path(path).read_text(encoding="utf-8").splitlines()[0]
+    except (OSError, IndexError, UnicodeDecodeError) as error:
+        raise InstrumentError(f"password_file '{path}': expected a file with the password; {error}") from None
