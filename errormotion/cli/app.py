@@ -277,6 +277,43 @@ def validate(
 
 @app.command()
 @guarded
+def compare(
+    results: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Error datasets, run folders, or folders of runs (the newest result of each test)."),
+    ] = None,
+    name: Annotated[list[str] | None, typer.Option(help="A further one with a name of its own: NAME=PATH.")] = None,
+    at: Annotated[
+        str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of the first dataset.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[
+        float | None, typer.Option(help="Common reference state, s after the start of the first dataset.")
+    ] = None,
+    same_start: Annotated[
+        bool, typer.Option("--same-start", help="Take time 0 of all datasets as one instant where none is stated.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare results of one machine: whether they agree, and what explains it where they do not."""
+    from errormotion.cli.commands import compare as command
+
+    point = None
+    if at is not None:
+        try:
+            x, y, z = (float(part) / 1e3 for part in at.split(","))
+        except ValueError:
+            typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
+            raise typer.Exit(USAGE) from None
+        point = (x, y, z)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
+
+
+@app.command()
+@guarded
 def doctor(json_: Json = False) -> None:
     """Check that this computer has what errormotion needs."""
     from errormotion.cli.commands import doctor as command

@@ -36,12 +36,15 @@ class Consensus:
         For each dataset: how much the sum of squares falls without it, a chi-square of its own number of values.
     p : list of float
         For each dataset: probability of such a fall, corrected for the number of datasets (Holm).
+    rest : list of ChiSquare
+        For each dataset: of the residuals of the others without it.
     """
 
     estimate: Estimate
     fit: ChiSquare
     without: list[ChiSquare]
     p: list[float]
+    rest: list[ChiSquare]
 
     @property
     def birge(self) -> float:
@@ -55,13 +58,14 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
     Values that are exactly zero by definition (a reference state) take no part; they stay zero in the result.
     """
     estimate, fit = _solved(estimates)
-    without = []
+    without, left = [], []
     for i in range(len(estimates)):
         rest = [each for k, each in enumerate(estimates) if k != i]
         less = _solved(rest)[1] if rest else ChiSquare(0.0, 0)
         degrees = fit.degrees - less.degrees
+        left.append(less)
         without.append(ChiSquare(max(fit.value - less.value, 0.0), degrees))
-    return Consensus(estimate, fit, without, _holm([each.p for each in without]))
+    return Consensus(estimate, fit, without, _holm([each.p for each in without]), left)
 
 
 def _solved(estimates: Sequence[Estimate]) -> tuple[Estimate, ChiSquare]:

@@ -16,3 +16,4 @@ class ComparisonDataset:
         schemas=("errormotion.comparison/1",),
     )
     violations = lazy("errormotion.compare.result:violations")
+    chapters = lazy("errormotion.compare.report:chapters")

@@ -43,6 +43,10 @@ TABLE: dict[str, tuple[tuple[str, ...], str]] = {
     "robust_uncertainty": (("...", "dof"), "its standard uncertainty; m, rad"),
     "between": (("dof",), "standard deviation between datasets (tau); m, rad"),
     "misfit_p": (("dataset",), "probability that a dataset departs so far from the others, after Holm"),
+    "rest_p": (
+        ("dataset",),
+        "probability of the residuals of the others without this dataset; NaN below two",
+    ),
     "cause": (("pair", "rank"), "causes that could explain the difference, the most likely one first"),
     "cause_p": (("pair", "rank"), "probability of a larger rest if it is the only cause"),
     "log_likelihood_ratio": (("pair", "rank"), "of the cause, against agreement"),
@@ -80,6 +84,7 @@ def build(
         "robust_uncertainty": robust[1],
         "between": robust[2],
         "misfit_p": np.array(agreed.p),
+        "rest_p": np.array([each.p for each in agreed.rest]),
         **_causes(causes),
     }
     single = not ground.dim
@@ -161,7 +166,7 @@ def violations(ds: xr.Dataset) -> list[str]:
         if name in ds.dims and name not in ds.coords:
             found.append(f"{name}: missing; expected its labels")
     if not found:
-        for name in ("p", "curve_p", "misfit_p"):
+        for name in ("p", "curve_p", "misfit_p", "rest_p"):
             values = ds.variables[name].values
             if values.dtype.kind != "f" or ((values < 0) | (values > 1)).any():
                 found.append(f"{name}: expected probabilities from 0 to 1")
