@@ -368,6 +368,14 @@ def test_a_node_that_was_without_power_boots():
         assert number(node, 0x1000, 0, "I") == 0x00020194
 
 
+def test_a_late_answer_precedes_the_next_one() -> None:
+    with raw(fault="late") as ask:
+        assert ask("40 00 10 00 00 00 00 00", wait=QUIET) is None
+        assert ask("40 01 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"  # of the request before
+    with raw(fault="late", late_by=0.1) as ask:
+        assert ask("40 00 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"
+
+
 @pytest.mark.parametrize("wrong", [{"values": "double"}, {"status": "some"}, {"unit": "degC"}, {"digits": 4}])
 def test_unknown_variants_are_refused(wrong):
     with pytest.raises(InstrumentError, match=next(iter(wrong))), simulated(**wrong):

@@ -10,6 +10,7 @@ limits), that a TPDO by event without event timer is not sent, the emergency cod
 from __future__ import annotations
 
 import math
+import time
 from functools import partial
 from typing import Any
 
@@ -66,8 +67,8 @@ class SimulatedCanopen:
     in ms, 50, ``off``: switched off, ``none``: no TPDO), ``state`` after power-on (``operational``: it starts by
     itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
 
-    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range`` as of all devices, counted over SDO answers and PDOs;
-    ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
+    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
+    and PDOs; ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
     answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see `simulators.thermometers`; it boots
     when it is back).
 
@@ -82,6 +83,7 @@ class SimulatedCanopen:
         "garbage",
         "drop",
         "out_of_range",
+        "late",
         "abort",
         "bus_off",
         "stopped",
@@ -98,6 +100,7 @@ class SimulatedCanopen:
         pdo = _choices(address, "pdo", "event", ("event", "sync", "timer", "off", "none"))[0]
         state = _choices(address, "state", "operational", ("operational", "pre-operational"))[0]
         self._answers = 0
+        self._held: tuple[float, int, bytes] | None = None  # time, s, and frame of the answer that is late
         node, seed = address.whole("node", 1, 127), int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *(address.path or "thermometer").encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -225,7 +228,16 @@ class SimulatedCanopen:
             self._slave.receive(can_id, data, remote)
 
     def _due(self, now: float) -> float:
-        return now + 1.0 if self._absent() else self._slave.due(now)
+        if self._absent():
+            return now + 1.0
+        if self._held and now >= self._held[0]:
+            self._send_held()
+        return min(self._slave.due(now), self._held[0] if self._held else math.inf)
+
+    def _send_held(self) -> None:
+        held, self._held = self._held, None
+        if held and self._server is not None:
+            self._server.send(*held[1:])
 
     def _absent(self) -> bool:
         """Whether the node is without power; it boots where it is back."""
@@ -249,7 +261,10 @@ class SimulatedCanopen:
                 server.send_bus_off()
             return
         self._answers += 1
-        if self.fault.kind == "stopped" and number >= self.fault.at:
+        self._send_held()
+        if self.fault.kind == "late" and number == self.fault.at:
+            self._held = (time.monotonic() + self.fault.delay, can_id, data)
+        elif self.fault.kind == "stopped" and number >= self.fault.at:
             self._slave.enter(STOPPED)
         elif (self.fault.kind == "silence" and number >= self.fault.at) or self.fault.hits("drop", number):
             return
