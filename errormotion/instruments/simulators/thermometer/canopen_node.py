@@ -68,9 +68,9 @@ class SimulatedCanopen:
     itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
 
     Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
-    and PDOs; ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
-    answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see `simulators.thermometers`; it boots
-    when it is back).
+    and PDOs; ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds
+    nothing is answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see
+    `simulators.thermometers`; it boots when it is back).
 
     Attributes
     ----------
