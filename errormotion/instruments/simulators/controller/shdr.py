@@ -106,7 +106,7 @@ class SimulatedAdapter:
             self._device = devices.root[0][-1].get("name", "")
             machine = [item for item in devices.items.values() if item.device is devices.root[0][-1]]
             self._items = {self._prefix + item.key: item for item in machine}
-            self._server = TcpServer(address.path or "shdr", self._on_data)
+            self._server = TcpServer(address.path or "shdr", self._on_data, self._on_connection)
         except BaseException:
             self.world.detach(self)
             raise
@@ -191,6 +191,10 @@ class SimulatedAdapter:
         with self._server.lock:
             for piece in fault.pieces(data):
                 self._server.send(piece)
+
+    def _on_connection(self) -> None:
+        """Forget an unfinished line of the previous connection."""
+        self._received = b""
 
     def _on_data(self, data: bytes) -> None:
         *lines, self._received = (self._received + data).split(b"\n")
