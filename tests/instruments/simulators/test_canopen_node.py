@@ -355,7 +355,7 @@ def test_mapping_is_written_in_the_order_of_the_standard():
 def test_an_emergency_announces_a_broken_sensor():
     with network(open="0") as (_, node, seen):
         node.nmt.state = "RESET COMMUNICATION"
-        assert until(seen, lambda i, data: (i, data) == (0x080 + NODE, bytes.fromhex("00 ff 21 00 00 00 00 00")))
+        assert until(seen, lambda i, data: (i, data) == (0x080 + NODE, bytes.fromhex("30 50 21 00 00 00 00 00")))
 
 
 def test_a_node_that_was_without_power_boots():
