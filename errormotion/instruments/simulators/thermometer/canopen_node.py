@@ -3,13 +3,16 @@
 Written from the public manuals of such devices, not from the driver: esd CAN-CBX-THERMO C.3034.21 rev. 1.2 (p. 50, 54,
 90-97) and CAN-CBX-Pt100 C.3032.21 rev. 1.1 (p. 49, 91), HYDAC's CiA 404 protocol description (objects of the device
 profile), WIKA D-20-9 (contents, object 0x2330), SIKO AP10 (p. 49, TPDO parameters), Bonfiglioli ACU (p. 69, order of
-mapping), ABB FCAN-01 (p. 126-129, SDO). Assumed, as no document shows it: what a broken input reads (a Pt100 input's
-limits), that a TPDO by event without event timer is not sent, the emergency code of a broken sensor.
+mapping), ABB FCAN-01 (p. 126-129, SDO), JUMO 902910 CANtrans T (p. 16, emergency 5030h of a broken sensor).
+
+Assumed, as no document shows it: what a broken input reads (a Pt100 input's limits), that a TPDO by event without event
+timer is not sent.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from functools import partial
 from typing import Any
 
@@ -50,7 +53,7 @@ ZERO = int.from_bytes(b"zero", "little")  # signature of the autozero
 MOST_DIGITS = 3
 VALUES = {"float": (0x6130, "f32"), "int16": (0x7130, "i16"), "int32": (0x9130, "i32")}
 FIRST_SDO_ANSWER = 0x580  # COB-ID without the node
-BROKEN_SENSOR = (0xFF00, 0x21)  # emergency code, device specific; error register: generic and device profile
+BROKEN_SENSOR = (0x5030, 0x21)  # emergency code (JUMO); error register: generic and device profile
 
 
 class SimulatedCanopen:
@@ -66,10 +69,10 @@ class SimulatedCanopen:
     in ms, 50, ``off``: switched off, ``none``: no TPDO), ``state`` after power-on (``operational``: it starts by
     itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
 
-    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range`` as of all devices, counted over SDO answers and PDOs;
-    ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
-    answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see `simulators.thermometers`; it boots
-    when it is back).
+    Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
+    and PDOs (``late`` is an SDO answer); ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for
+    ``unplugged_for`` seconds nothing is answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see
+    `simulators.thermometers`; it boots when it is back).
 
     Attributes
     ----------
@@ -82,6 +85,7 @@ class SimulatedCanopen:
         "garbage",
         "drop",
         "out_of_range",
+        "late",
         "abort",
         "bus_off",
         "stopped",
@@ -98,6 +102,8 @@ class SimulatedCanopen:
         pdo = _choices(address, "pdo", "event", ("event", "sync", "timer", "off", "none"))[0]
         state = _choices(address, "state", "operational", ("operational", "pre-operational"))[0]
         self._answers = 0
+        self._was_late = False
+        self._held: tuple[float, int, bytes] | None = None  # time, s, and frame of the answer that is late
         node, seed = address.whole("node", 1, 127), int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *(address.path or "thermometer").encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -225,7 +231,16 @@ class SimulatedCanopen:
             self._slave.receive(can_id, data, remote)
 
     def _due(self, now: float) -> float:
-        return now + 1.0 if self._absent() else self._slave.due(now)
+        if self._absent():
+            return now + 1.0
+        if self._held and now >= self._held[0]:
+            self._send_held()
+        return min(self._slave.due(now), self._held[0] if self._held else math.inf)
+
+    def _send_held(self) -> None:
+        held, self._held = self._held, None
+        if held and self._server is not None:
+            self._server.send(*held[1:])
 
     def _absent(self) -> bool:
         """Whether the node is without power; it boots where it is back."""
@@ -249,6 +264,11 @@ class SimulatedCanopen:
                 server.send_bus_off()
             return
         self._answers += 1
+        if can_id >= FIRST_SDO_ANSWER:
+            self._send_held()
+            if self.fault.kind == "late" and number >= self.fault.at and not self._was_late:
+                self._was_late, self._held = True, (time.monotonic() + self.fault.delay, can_id, data)
+                return
         if self.fault.kind == "stopped" and number >= self.fault.at:
             self._slave.enter(STOPPED)
         elif (self.fault.kind == "silence" and number >= self.fault.at) or self.fault.hits("drop", number):
