@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
     not have sends no values until then. The line ``data`` (in ``urls``) has the measured values, from the moment on
     at which a client is connected to it.
 
-    Further parameters of the address: ``beams`` (of all sensors, joined by commas: 1 to 4 channels), ``ranges``
+    Further parameters of the address: ``beams`` (of channels 1 to 4, joined by commas; empty: no sensor), ``ranges``
     (measuring ranges in um, joined by commas; default that of the machine's frame, 2000), ``serial``, ``left``
     (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
     ``password`` (empty), ``frames`` (of a block at most, 256).
@@ -72,7 +73,6 @@ class SimulatedCapaNCDT(SimulatedDevice):
         self._sent = 0  # frames since the connection
         self._counter = FIRST_COUNT
         self._values: Array = np.zeros(CHANNELS, dtype=np.int64)
-        self._taken: int | None = None
         self._averaging = Averaging(0, 2)
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self._mute = self.fault.kind == "silence" and self.fault.from_the_start
@@ -89,18 +89,18 @@ class SimulatedCapaNCDT(SimulatedDevice):
         self._watch.start()
 
     def _set_up(self, address: Address) -> None:
-        beams = [each for each in address.params.get("beams", self.name).split(",") if each]
-        frame = self.world.machine.frame.range * 1e6
+        beams = address.params.get("beams", self.name).split(",")
+        channels = [channel for channel, beam in enumerate(beams, 1) if beam]
         texts = [each for each in address.params.get("ranges", "").split(",") if each]
-        ranges = [float(text) for text in texts] or [frame]
-        if not 1 <= len(beams) <= CHANNELS or len(ranges) not in (1, len(beams)) or min(ranges) <= 0:
+        ranges = [float(text) for text in texts] or [self.world.machine.frame.range * 1e6]
+        if not channels or len(beams) > CHANNELS or len(ranges) not in (1, len(channels)) or not min(ranges) > 0:
             raise InstrumentError(f"expected 1 to {CHANNELS} 'beams', and one of 'ranges' (um) for all or for each")
-        ranges = ranges * len(beams) if len(ranges) == 1 else ranges
+        ranges = ranges * len(channels) if len(ranges) == 1 else ranges
         self.serial = int(address.number("serial", 1000 + abs(self.world.seed)))
-        self.sensors = tuple(
-            Sensor(beam, length, 100 * self.serial + number)
-            for number, (beam, length) in enumerate(zip(beams, ranges, strict=True), 1)
-        )
+        self.sensors: Mapping[int, Sensor] = {
+            channel: Sensor(beams[channel - 1], length, 100 * self.serial + channel)
+            for channel, length in zip(channels, ranges, strict=True)
+        }
         self.settings = Settings(password=address.params.get("password", ""))
         self._time_limit = address.number("time_limit", TIME_LIMIT)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))
@@ -216,14 +216,15 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     def _start_streams(self) -> None:
         world = self.world
-        known = all(sensor.beam in world.machine.frame.channels for sensor in self.sensors)
+        known = all(sensor.beam in world.machine.frame.channels for sensor in self.sensors.values())
         if not (known or world.stand.target is not None) or world.following:
             return
         rate = 1e6 / self.settings.sample_time
         self._averaging = self._new_averaging()
         self._sent = 0
         pending: list[Array] = []
-        self._streams = tuple(_Channel(self, pending, number, each, rate) for number, each in enumerate(self.sensors))
+        sensors = tuple(self.sensors.values())
+        self._streams = tuple(_Channel(self, pending, each, rate, last=each is sensors[-1]) for each in sensors)
         with world._change:  # all channels start at the same sample
             for stream in self._streams:
                 world.start_stream(stream)
@@ -236,7 +237,9 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     def pass_on(self, stream: _Channel, distances: list[Array]) -> None:
         """Send the frames that the samples of all channels make."""
-        columns = [raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors, strict=True)]
+        columns = [
+            raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors.values(), strict=True)
+        ]
         frames = np.stack(columns, axis=1)
         with self._data.lock:
             if stream not in self._streams or self._ended.is_set():
@@ -260,7 +263,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
             frames[active & ((fault.length == 0) | (numbers < fault.at + fault.length))] = FULL_SCALE
         if fault.kind in ("silence", "disconnect"):
             frames = frames[~active]
-        values, channels = with_functions(self._averaging(frames), self.settings)
+        values, channels = with_functions(self._averaging(frames), tuple(self.sensors), self.settings)
         if len(values):
             self._values[[channel - 1 for channel in channels]] = values[-1]
         heard = all(self._data.send(piece) for piece in fault.pieces(self._bytes(values, channels, first)))
@@ -295,7 +298,7 @@ class _Channel:
     sync = "NONE"
 
     def __init__(
-        self, controller: SimulatedCapaNCDT, pending: list[Array], number: int, sensor: Sensor, rate: float
+        self, controller: SimulatedCapaNCDT, pending: list[Array], sensor: Sensor, rate: float, *, last: bool
     ) -> None:
         self.channel = sensor.beam
         self.measuring_range = sensor.range * 1e-6
@@ -305,7 +308,7 @@ class _Channel:
         self.ended = False
         self._controller = controller
         self._pending = pending
-        self._last = number == len(controller.sensors) - 1
+        self._last = last
 
     def push(self, distances: Array) -> None:
         """Send the next samples, with those of the last channel; may wait for the reader."""
