@@ -25,6 +25,7 @@ class Client:
     def __init__(self, device: SimulatedCapaNCDT) -> None:
         self.device = device
         self.commands = connect(device.url)
+        self.greeting = self.line()
         self.data: socket.socket | None = None
         self.rest = b""
 
@@ -112,13 +113,19 @@ def test_a_mathematical_function_is_shown_in_the_status_of_its_channel() -> None
         assert client.ask("CHS") == "1,0,1,1OK"
 
 
+def test_a_new_connection_is_greeted() -> None:
+    with simulated("&greeting=hello") as client:
+        assert client.greeting == "hello"
+        assert client.ask("STI?") == "256OK"
+
+
 def test_every_character_is_echoed_before_the_command_is_ended() -> None:
     with simulated() as client:
         for character in "$VER":
             client.send(character)
             assert client.commands.recv(1) == character.encode()
         client.send("\r")
-        assert client.line() == "DT6220;V1.2a;8010079"
+        assert client.line() == "DT6220;V1.2a;8010079OK"
 
 
 def test_a_command_that_is_not_ended_times_out_and_is_forgotten() -> None:
@@ -289,5 +296,5 @@ def test_a_late_answer_precedes_the_next_one() -> None:
     with simulated("&fault=late&fault_at=0") as client:
         client.send("$VER\r")
         client.send("$GDP\r")
-        assert client.line() == "$VER$GDPDT6220;V1.2a;8010079"
+        assert client.line() == "$VER$GDPDT6220;V1.2a;8010079OK"
         assert client.line() == f"{client.device.port}OK"

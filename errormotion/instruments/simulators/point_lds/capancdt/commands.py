@@ -219,7 +219,7 @@ def _status(controller: Controller, text: str) -> str:
 
 def _version(_: Controller, text: str) -> str:
     _nothing(text)
-    return f"{NAME};{VERSION};{FIRMWARE}"
+    return f"{NAME};{VERSION};{FIRMWARE}{OK}"
 
 
 def _set_function(controller: Controller, text: str) -> str:

@@ -33,11 +33,10 @@ Array = np.ndarray[Any, Any]
 
 LINE_END = b"\r\n"
 ENDS = b"\r\n"
+GREETING = "DT6220"
 LONGEST_COMMAND = 255
 TIME_LIMIT = 10.0
 """Time after the last character within which a command has to be ended, s."""
-CONNECTION_POLL = 0.02
-"""Interval at which a connection to the data port is looked for, s."""
 ANSWER_DELAY = 0.02
 """Time for which an answer waits for values that are being sent, s."""
 FIRST_COUNT = 100_000
@@ -54,7 +53,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
     Further parameters of the address: ``beams`` (of channels 1 to 4, joined by commas; empty: no sensor), ``ranges``
     (measuring ranges in um, joined by commas; default that of the machine's frame, 2000), ``serial``, ``left``
     (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
-    ``password`` (empty), ``frames`` (of a block at most, 256).
+    ``password`` (empty), ``frames`` (of a block at most, 256), ``greeting`` (line that a client of the commands gets).
 
     Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (FFFFFF),
     ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
@@ -67,7 +66,6 @@ class SimulatedCapaNCDT(SimulatedDevice):
     def __init__(self, address: Address) -> None:
         self._mute = False
         self._timer: threading.Timer | None = None
-        self._ended = threading.Event()
         self._streams: tuple[_Channel, ...] = ()
         self._once = 0  # single frames that are due
         self._sent = 0  # frames since the connection
@@ -78,15 +76,13 @@ class SimulatedCapaNCDT(SimulatedDevice):
         self._mute = self.fault.kind == "silence" and self.fault.from_the_start
         try:
             self._set_up(address)
-            self._data = TcpServer(f"{self.name}-data", _ignore)
+            self._data = TcpServer(f"{self.name}-data", _ignore, self._data_connected)
         except (InstrumentError, ValueError) as error:
             super().close()
             raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
         self._data.start()
         self.urls = {"data": self._data.url}
         self.port = int(self._data.url.rsplit(":", 1)[1])
-        self._watch = threading.Thread(target=self._serve, name=f"sim-{self.name}-data", daemon=True)
-        self._watch.start()
 
     def _set_up(self, address: Address) -> None:
         beams = address.params.get("beams", self.name).split(",")
@@ -103,6 +99,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
         }
         self.settings = Settings(password=address.params.get("password", ""))
         self._time_limit = address.number("time_limit", TIME_LIMIT)
+        self._greeting = address.params.get("greeting", GREETING)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))
         self.port = 0
         for command in address.params.get("left", "").split(";"):
@@ -111,11 +108,8 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     def close(self) -> None:
         """End the device."""
-        self._ended.set()
         self._cancel_timer()
         self._end_streams()
-        self._data.disconnect()
-        self._watch.join()
         self._data.close()
         super().close()
 
@@ -125,6 +119,13 @@ class SimulatedCapaNCDT(SimulatedDevice):
             stream.taken = samples
 
     # ------------------------------------------------------------------ commands
+
+    def connection_opened(self) -> None:
+        """Forget an unfinished command, and greet the client."""
+        super().connection_opened()
+        self._cancel_timer()
+        if self._greeting:
+            self._send(self._greeting.encode("latin-1") + LINE_END)
 
     def _on_data(self, data: bytes) -> None:
         self._cancel_timer()
@@ -160,7 +161,8 @@ class SimulatedCapaNCDT(SimulatedDevice):
         if before != (self.settings.trigger, self.settings.sample_time):
             for stream in self._streams:
                 stream.taken = stream.taken or 0  # the clock goes on where the reader is
-            self._end_streams()  # they start again with the new settings
+            self._end_streams()
+        self._start_if_due()
 
     def _reply(self, data: bytes) -> None:
         number, self._answers = self._answers, self._answers + 1
@@ -202,17 +204,16 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     # ------------------------------------------------------------------ values
 
-    def _serve(self) -> None:
-        """Start the streams whenever a client is connected and values are due."""
-        while not self._ended.is_set():
-            connected = self._data.await_connection(CONNECTION_POLL)
-            if not connected:
-                self._end_streams()
-                self._once = 0
-            elif not self._streams and (self._once or not self.settings.trigger) and not self._mute:
-                self._start_streams()
-            if connected:
-                self._ended.wait(CONNECTION_POLL)
+    def _data_connected(self) -> None:
+        self._end_streams()  # of the client before
+        self._once = self._sent = 0
+        self._start_if_due()
+
+    def _start_if_due(self) -> None:
+        """Start the streams where a client is connected and values are due."""
+        due = self._once or not self.settings.trigger
+        if due and not self._streams and not self._mute and self._data.connection is not None:
+            self._start_streams()
 
     def _start_streams(self) -> None:
         world = self.world
@@ -221,7 +222,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
             return
         rate = 1e6 / self.settings.sample_time
         self._averaging = self._new_averaging()
-        self._sent = 0
+        self._sent = 0  # faults count from here
         pending: list[Array] = []
         sensors = tuple(self.sensors.values())
         self._streams = tuple(_Channel(self, pending, each, rate, last=each is sensors[-1]) for each in sensors)
@@ -242,7 +243,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
         ]
         frames = np.stack(columns, axis=1)
         with self._data.lock:
-            if stream not in self._streams or self._ended.is_set():
+            if stream not in self._streams:
                 return
             if self.settings.trigger:
                 frames, self._once = frames[: self._once], 0
