@@ -12,9 +12,9 @@ controllers with the same commands):
   ``STS`` (6400 p. 41), ``VER``, which has no ``OK``, and ``SMF``, whose answer has a comma before it (6200 p. 66),
   ``GMF`` and ``CMF`` (6200 p. 68), ``IPS`` (6400 p. 41), ``GDP``, ``SDP``, ``CHI``, ``COI``, ``LGI`` and ``LGO`` (6500
   p. 44 of the German edition).
-* Blocks: a header of 32 bytes and frames of one 32-bit value a channel, little-endian (6200 p. 55); the value is 24
-  bits of the measuring range, and may be larger or negative behind a math function (6200 p. 56). By default values are sent
-  all the time; while a command is answered none is sent (6200 p. 56, 59).
+* Blocks: a header of 32 bytes and frames of one 32-bit value a channel, little-endian (6200 p. 55); the value has 24
+  bits of the measuring range, and may be larger or negative behind a math function (6200 p. 56). By default values are
+  sent all the time; while a command is answered none is sent (6200 p. 56, 59).
 
 From clients of others, which work with real controllers: the answer completes the echo, so that ``$STI1200`` is
 followed by ``,960OK``, and errors follow the echo as ``$UNKNOWN COMMAND`` and ``$WRONG PARAMETER``

@@ -56,10 +56,11 @@ class SimulatedCapaNCDT(SimulatedDevice):
     ``password`` (empty), ``frames`` (of a block at most, 256).
 
     Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (FFFFFF),
-    ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port). They count frames.
+    ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
+    counts answers.
     """
 
-    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
+    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
     drops_answers = False
 
     def __init__(self, address: Address) -> None:
@@ -74,7 +75,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
         self._taken: int | None = None
         self._averaging = Averaging(0, 2)
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
-        self._mute = self.fault.from_the_start
+        self._mute = self.fault.kind == "silence" and self.fault.from_the_start
         try:
             self._set_up(address)
             self._data = TcpServer(f"{self.name}-data", _ignore)
@@ -152,12 +153,22 @@ class SimulatedCapaNCDT(SimulatedDevice):
             text = answer(self, command.decode("latin-1"))
             if kind != (self.settings.averaging, self.settings.averaging_number):
                 self._averaging = self._new_averaging()
-            self._send(text.encode("latin-1") + LINE_END)
+            self._reply(text.encode("latin-1") + LINE_END)
         finally:
             if held:
                 self._data.lock.release()
         if before != (self.settings.trigger, self.settings.sample_time):
+            for stream in self._streams:
+                stream.taken = stream.taken or 0  # the clock goes on where the reader is
             self._end_streams()  # they start again with the new settings
+
+    def _reply(self, data: bytes) -> None:
+        number, self._answers = self._answers, self._answers + 1
+        if self.fault.kind == "late" and number == self.fault.at:
+            self._hold(data)
+            return
+        self._release()
+        self._send(data)
 
     def _new_averaging(self) -> Averaging:
         return Averaging(self.settings.averaging, self.settings.averaging_number)
@@ -174,7 +185,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
                 timer.join()
 
     def _send(self, data: bytes) -> None:
-        if self.fault.kind == "silence" and self._mute:
+        if self._mute:
             return
         with self._server.lock:
             for piece in self.fault.pieces(data):
