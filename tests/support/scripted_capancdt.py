@@ -17,8 +17,8 @@ CHANNEL = "ANO2303018,NAMDL6230,SNO0815,OFS0,RNG2000,UNTµm"
 class ScriptedController:
     """Answers commands from ``answers`` (without echo and ``OK``), refuses others; sends blocks on its data port.
 
-    Each GMD sends the next of ``readings``, then ``always``; TRG0 sends ``blocks``. The next command that is in ``late``
-    is carried out and answered when another one comes, ahead of it.
+    Each GMD sends the next of ``readings``, then ``always``; TRG0 sends ``blocks``. The next command that is in
+    ``late`` is carried out and answered when another one comes, ahead of it.
     """
 
     def __init__(self, **answers: str) -> None:
