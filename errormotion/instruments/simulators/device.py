@@ -52,7 +52,9 @@ class SimulatedDevice:
         if clock := address.number("clock", 0.0):
             self.world.tick(clock)
         try:
-            self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
+            self._server = make_server(
+                address.params.get("wire", "tcp"), self.name, self._on_data, self.connection_opened
+            )
         except BaseException:
             self.world.detach(self)
             raise
@@ -75,6 +77,10 @@ class SimulatedDevice:
 
     def report_delivered(self, samples: int) -> None:
         """Record the number of samples of the running stream that the reader has received."""
+
+    def connection_opened(self) -> None:
+        """Forget an unfinished request of the previous connection."""
+        self._buffer = b""
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request, given without its line end."""

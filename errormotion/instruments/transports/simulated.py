@@ -18,9 +18,9 @@ RECEIVE_BUFFER = 65536
 class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
-    ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of the further
-    ones, by name.
+    ``simulator(address)`` starts the device, see `load_simulator`; the object has ``url`` (a ``tcp://`` or ``serial://``
+    address on this machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of
+    the further ones, by name.
     """
 
     simulated = True
