@@ -39,6 +39,8 @@ TIME_LIMIT = 10.0
 """Time after the last character within which a command has to be ended, s."""
 ANSWER_DELAY = 0.02
 """Time for which an answer waits for values that are being sent, s."""
+ACCEPT_TIME = 0.5
+"""Time within which a client of the data port is accepted, s."""
 FIRST_COUNT = 100_000
 """Counter of the first value: the controller has been on for a while."""
 
@@ -147,21 +149,25 @@ class SimulatedCapaNCDT(SimulatedDevice):
             self._timer.start()
 
     def _obey(self, command: bytes) -> None:
-        before = (self.settings.trigger, self.settings.sample_time)
-        kind = (self.settings.averaging, self.settings.averaging_number)
+        settings = self.settings
+        before, kind = (settings.trigger, settings.sample_time), (settings.averaging, settings.averaging_number)
+        ended: tuple[_Channel, ...] = ()
+        if command == b"GMD" and settings.trigger:
+            self._data.await_present_client(ACCEPT_TIME)  # one that is connecting gets the value
         held = self._data.lock.acquire(timeout=ANSWER_DELAY)  # no value is sent meanwhile, unless its reader stalls
         try:
             text = answer(self, command.decode("latin-1"))
-            if kind != (self.settings.averaging, self.settings.averaging_number):
+            if kind != (settings.averaging, settings.averaging_number):
                 self._averaging = self._new_averaging()
+            if before != (settings.trigger, settings.sample_time):
+                ended, self._streams = self._streams, ()  # none of their values follows the answer
             self._reply(text.encode("latin-1") + LINE_END)
         finally:
             if held:
                 self._data.lock.release()
-        if before != (self.settings.trigger, self.settings.sample_time):
-            for stream in self._streams:
-                stream.taken = stream.taken or 0  # the clock goes on where the reader is
-            self._end_streams()
+        for stream in ended:
+            stream.taken = stream.taken or 0  # the clock goes on where the reader is
+            self._end(stream)
         self._start_if_due()
 
     def _reply(self, data: bytes) -> None:
@@ -233,8 +239,11 @@ class SimulatedCapaNCDT(SimulatedDevice):
     def _end_streams(self) -> None:
         streams, self._streams = self._streams, ()
         for stream in streams:
-            stream.ended = True
-            self.world.end_stream(stream)
+            self._end(stream)
+
+    def _end(self, stream: _Channel) -> None:
+        stream.ended = True
+        self.world.end_stream(stream)
 
     def pass_on(self, stream: _Channel, distances: list[Array]) -> None:
         """Send the frames that the samples of all channels make."""
