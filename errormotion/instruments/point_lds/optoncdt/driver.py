@@ -297,7 +297,7 @@ class OptoNCDT(Driver):
 
     def _start_session(self) -> None:
         self._range, self._refused = None, []
-        self._dialogue = Dialogue(self.transport, self.settings.timeout)
+        self._dialogue = Dialogue(self.exchange, self.settings.timeout)
         self._dialogue.remember("OUTPUT")  # refused where an earlier user has left half a line
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
         try:
@@ -310,6 +310,11 @@ class OptoNCDT(Driver):
     def _end_session(self) -> None:
         self.stop()
         self._dialogue.restore()
+
+    def resynchronise(self) -> None:
+        """Discard late answers after a failed exchange; see `Driver.resynchronise`."""
+        super().resynchronise()
+        self._dialogue.synchronise(self.transport)
 
     def _abandon(self) -> None:
         reader, self._reader = self._reader, None
