@@ -344,6 +344,21 @@ def test_without_a_number_it_goes_on_until_it_is_stopped_and_the_server_is_busy(
     assert client.ask(2) == (OK, struct.pack("<i", 2))
 
 
+def test_a_client_that_leaves_ends_its_measurement(made: Made) -> None:
+    device, client = tracker(made, "pace=1")
+    client.ask(SET_MODE, "i", 1)
+    client.ask(SET_TIME_MODE, "4i", 10, 0, 0, 0)
+    assert client.ask(START)[0] == OK
+    client.until(MULTI)
+    client.line.sendall(b"\x0c\x00")  # the start of a request
+    client.line.close()
+    place = parse_address(device.url)
+    with socket.create_connection((place.host, place.port), timeout=TIMEOUT) as line:
+        other = Client(line)
+        assert other.ask(SET_UNITS, "5i", 1, 0, 0, 0, 0)[0] == OK
+        assert other.ask(2) == (OK, struct.pack("<i", 2))
+
+
 @pytest.mark.parametrize(("server", "newest"), [("3.6", 7), ("3.8", 0)])
 def test_region_types_are_those_of_the_header(made: Made, server: str, newest: int) -> None:
     _, client = tracker(made, f"server={server}")

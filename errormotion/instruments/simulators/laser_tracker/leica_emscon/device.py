@@ -99,6 +99,12 @@ class SimulatedEmScon(SimulatedDevice):
         if self.points is not None:
             self.points.report_delivered(samples)
 
+    def connection_opened(self) -> None:
+        """Forget the incomplete request, and end the measurement, of the connection before."""
+        super().connection_opened()
+        if self.points is not None:
+            self.points.request_end()
+
     # ------------------------------------------------------------------ requests
 
     def _on_data(self, data: bytes) -> None:

@@ -69,6 +69,7 @@ class PointStream:
     def request_end(self) -> None:
         """Let the thread end."""
         self._stop.set()
+        self.running = False
 
     def end(self) -> None:
         """End the thread; idempotent."""
