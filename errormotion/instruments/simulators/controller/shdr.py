@@ -93,6 +93,7 @@ class SimulatedAdapter:
         self._prefix = f"{address.params['device']}:" if "device" in address.params else ""
         self._assets = bool(address.number("assets", 0))
         self._lines = 0
+        self._connections = 0
         self._pinged = (0, 0.0)  # connection and time of the last one
         self._received = b""
         self._ended = threading.Event()
@@ -106,7 +107,7 @@ class SimulatedAdapter:
             self._device = devices.root[0][-1].get("name", "")
             machine = [item for item in devices.items.values() if item.device is devices.root[0][-1]]
             self._items = {self._prefix + item.key: item for item in machine}
-            self._server = TcpServer(address.path or "shdr", self._on_data)
+            self._server = TcpServer(address.path or "shdr", self._on_data, self._on_connection)
         except BaseException:
             self.world.detach(self)
             raise
@@ -128,13 +129,16 @@ class SimulatedAdapter:
 
     # ------------------------------------------------------------------ lines
 
+    def _on_connection(self) -> None:
+        self._connections += 1
+
     def _run(self) -> None:
         connection, shown = 0, dict[str, Value]()
         while not self._ended.wait(POLL_INTERVAL):
             if not self._server.await_connection(0.0):
                 continue
-            if self._server.connections != connection:
-                connection, shown = self._server.connections, {}
+            if self._connections != connection:
+                connection, shown = self._connections, {}
                 self._send_all(f"* {command}" for command in (*_COMMANDS, f"device: {self._device}"))
                 self._send_all(self._asset())
             pinged, last = self._pinged
@@ -196,7 +200,7 @@ class SimulatedAdapter:
         self._received = self._received[-LONGEST_LINE:]
         for line in lines:
             if line.strip() == b"* PING" and self._heartbeat:
-                self._pinged = (self._server.connections, time.monotonic())
+                self._pinged = (self._connections, time.monotonic())
                 self._send(f"* PONG {self._heartbeat}")
 
 

@@ -9,7 +9,7 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures impo
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import Wire
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import Block
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import Tracker
-from errormotion.instruments.simulators.virtual_world import World
+from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 
 class Points(Protocol):
@@ -26,7 +26,7 @@ class Server(Protocol):
     """The server: its state, and what it sends unasked."""
 
     name: str
-    world: World
+    world: VirtualWorld
     fault: Fault
     tracker: Tracker
     wire: Wire
