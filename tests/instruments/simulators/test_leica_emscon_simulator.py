@@ -179,6 +179,16 @@ def test_what_is_no_command_is_refused(made: Made) -> None:
         client.packet()
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
+@pytest.mark.parametrize("system", [0, 4, 7])
+def test_numbers_that_are_none_are_wrong_parameters(made: Made, value: float, system: int) -> None:
+    _, client = tracker(made)
+    assert client.ask(SET_CS, "i", system)[0] == OK
+    assert client.ask(GO, "3di", value, 1.0, value, 0)[0] == WRONG
+    assert client.ask(43, "di", value, 500)[0] == WRONG
+    assert client.ask(SET_AIR, "3d", value, 1013.0, 50.0)[0] == WRONG
+
+
 def test_requests_in_pieces_and_several_at_once(made: Made) -> None:
     _, client = tracker(made)
     request = struct.pack("<iIi", 12, 0, GET_UNITS)
