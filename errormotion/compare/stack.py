@@ -45,7 +45,8 @@ class Estimate:
 
     def covariance(self) -> Array:
         """Return the total covariance at every point, (n, d, d)."""
-        return self.own + np.einsum("sni,snj->nij", self.influence, self.influence)
+        total: Array = self.own + np.einsum("sni,snj->nij", self.influence, self.influence)
+        return total
 
     def scaled(self, weight: float) -> Estimate:
         """Return the estimate times a number."""
