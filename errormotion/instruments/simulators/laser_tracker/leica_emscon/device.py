@@ -40,7 +40,7 @@ class SimulatedEmScon(SimulatedDevice):
     (points, measurements and motions), ``refuse`` and ``error`` (answers; ``code`` is their status).
     """
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect", "busy", "beam_broken", "refuse", "error")
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "busy", "beam_broken", "refuse", "error")
     drops_answers = False  # `drop` and `disconnect` are about points of a stream
 
     def __init__(self, address: Address) -> None:
