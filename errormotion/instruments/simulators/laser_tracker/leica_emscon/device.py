@@ -174,6 +174,13 @@ class SimulatedEmScon(SimulatedDevice):
         return name.startswith("Get") or name in ("StopMeasurement", "ClearCommandQueue", "ExitApplication")
 
     @property
+    def stream(self) -> PointStream:
+        """The continuous measurement."""
+        if self.points is None:
+            raise InstrumentError("The simulated tracker is not set up")
+        return self.points
+
+    @property
     def measuring(self) -> bool:
         """Whether a continuous measurement is running."""
         return self.points is not None and self.points.running
