@@ -113,8 +113,8 @@ class ModbusLine(Transport):
     def _await_late_answer(self, function: int, register: int, count: int) -> None:
         """Discard unread bytes; after a timeout, make sure that no late answer is taken for the next one.
 
-        An RTU frame has no number. What arrives within a further time limit is discarded; for what is later still,
-        another number of registers is read, so that the two answers differ in length.
+        An RTU frame has no number. What arrives within a further time limit is discarded. If nothing arrives, another
+        number of registers is read, so that its answer and one that is later still differ in length.
         """
         since, self._unanswered_at = self._unanswered_at, None
         if since is None or self.framing == "tcp":
@@ -122,7 +122,8 @@ class ModbusLine(Transport):
             return
         try:
             try:
-                await_quiet(self._line, self.timeout, since)
+                if await_quiet(self._line, self.timeout, since):
+                    return
             except ProtocolError:
                 raise
             except InstrumentError:  # the connection was dropped: the answer is lost with it

@@ -182,8 +182,8 @@ class Commands(StateCommands):
     def _do_StartMeasurement(self) -> bytes | int:
         if not self._device.initialised:
             return Status.NOT_INITIALISED
-        if self._mode in (BY_TIME, BY_DISTANCE, GRID) and self._device.points is not None:
-            self._device.points.start_soon(self._mode)
+        if self._mode in (BY_TIME, BY_DISTANCE, GRID):
+            self._device.stream.start_soon(self._mode)
             return self._ok("StartMeasurement") + self._said(Event.BUSY)
         before = self._device.use_beam()
         if self._device.tracker.broken:
@@ -205,8 +205,7 @@ class Commands(StateCommands):
         return before + self._ok("GoAndMeasure") + self._single()
 
     def _do_StopMeasurement(self) -> bytes:
-        if self._device.points is not None:
-            self._device.points.end()
+        self._device.stream.end()
         return self._ok("StopMeasurement") + self._said(Event.READY)
 
     def _single(self) -> bytes:

@@ -1,43 +1,45 @@
-"""What commands and streams see of the server."""
+"""What the commands and the point stream need of the simulated server."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from errormotion.instruments.simulators.faults import Fault
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import Triple
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import Wire
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import Block
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import Tracker
-from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
+
+if TYPE_CHECKING:
+    from errormotion.instruments.simulators.faults import Fault
+    from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 
-class Points(Protocol):
-    """Points of a continuous measurement."""
+class Stream(Protocol):
+    """A continuous measurement."""
 
     def start_soon(self, mode: int) -> None:
         """Start as soon as the answer is out."""
 
     def end(self) -> None:
-        """End the measurement."""
+        """End it; idempotent."""
 
 
 class Server(Protocol):
-    """The server: its state, and what it sends unasked."""
+    """The simulated server: its state, and what it sends unasked."""
 
     name: str
     world: VirtualWorld
     fault: Fault
-    tracker: Tracker
     wire: Wire
     blocks: dict[int, Block]
+    tracker: Tracker
     version: tuple[int, int, int]
     initialised: bool
     always_extended: bool
 
     @property
-    def points(self) -> Points | None:
-        """Points of the running measurement; None before the server is complete."""
+    def stream(self) -> Stream:
+        """The continuous measurement."""
 
     @property
     def measuring(self) -> bool:
@@ -57,10 +59,10 @@ class Server(Protocol):
         """Take up the reflector; return what the server states then."""
 
     def spread(self, seen: Triple) -> list[Any]:
-        """Return the standard deviations of a position in the client's system, their total and the covariances."""
+        """Return the standard deviations of a position, their total, and covariances."""
 
     def silent(self) -> bool:
-        """Whether the server has fallen silent."""
+        """Whether the fault ``silence`` holds."""
 
     def send(self, packet: bytes) -> bool:
         """Send a packet between the answers; False without a connection."""
