@@ -18,7 +18,7 @@ from errormotion.testing.kit import require
 from errormotion.testing.sessions import numbers
 
 LATE = "late"
-LATE_ANSWER = 12
+LATE_ANSWER = 20
 """Number of the answer that is late: by then most instruments are open."""
 READINGS = 24
 READINGS_AFTER_ERROR = 4

@@ -7,17 +7,15 @@ import threading
 import time
 from collections.abc import Iterator
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import packets
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import RHR, Triple, to_system
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event
-
-if TYPE_CHECKING:
-    from errormotion.instruments.simulators.laser_tracker.leica_emscon.device import SimulatedEmScon
 
 POINTS_A_PACKET = 20
 CLOCK = 1000
@@ -34,10 +32,10 @@ class PointStream:
 
     Parameters
     ----------
-    device : SimulatedEmScon
+    device : Server
     """
 
-    def __init__(self, device: SimulatedEmScon) -> None:
+    def __init__(self, device: Server) -> None:
         self._device = device
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -69,6 +67,7 @@ class PointStream:
     def request_end(self) -> None:
         """Let the thread end."""
         self._stop.set()
+        self.running = False
 
     def end(self) -> None:
         """End the thread; idempotent."""

@@ -7,18 +7,16 @@ all packets.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import packets
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.information import REFLECTORS, SERIAL
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import SYSTEMS, Units
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import DOUBLES, PARAMETERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event, Status, out_of_range, wrong
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import METEO_REFRACTION
-
-if TYPE_CHECKING:
-    from errormotion.instruments.simulators.laser_tracker.leica_emscon.device import SimulatedEmScon
 
 METEO, TRANSFORMATION, ORIENTATION, KEEP, UNSOLICITED, POSITION, TRY, LEVEL, CAMERA = range(9)
 """Positions in the system settings."""
@@ -32,10 +30,10 @@ class StateCommands:
 
     Parameters
     ----------
-    device : SimulatedEmScon
+    device : Server
     """
 
-    def __init__(self, device: SimulatedEmScon) -> None:
+    def __init__(self, device: Server) -> None:
         self._device = device
         self.system = [0, 0, 0, 0, 1, 1, 0, 1, 0]
         self._reflector = 1
