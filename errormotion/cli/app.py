@@ -181,6 +181,42 @@ def monitor(
 
 @app.command()
 @guarded
+def simulate(
+    plugin: Annotated[str, typer.Argument(help="The id of an instrument plugin.")],
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port of the device, the next one for its next line; default: a free one."),
+    ] = None,
+    host: Annotated[
+        str | None, typer.Option(help="Address at which it listens; default: 127.0.0.1, this computer only.")
+    ] = None,
+    fault: Annotated[str | None, typer.Option(help="A fault of the device, such as silence, split or late.")] = None,
+    bench: Annotated[Path | None, typer.Option(help="A bench file: its machine, and its device.")] = None,
+    machine: Annotated[str | None, typer.Option(help="The virtual machine: cframe (default) or gantry.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Which individual of the machine.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One parameter of the simulated device.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Start the simulated device of an instrument by itself, until Ctrl-C."""
+    from errormotion.cli.commands import simulate as command
+
+    command.run(
+        plugin,
+        port=port,
+        host=host,
+        fault=fault,
+        bench=bench,
+        machine=machine,
+        seed=seed,
+        settings=set_ or [],
+        as_json=json_,
+    )
+
+
+@app.command()
+@guarded
 def plan(
     campaign: Annotated[Path, typer.Argument(help="A campaign file.")],
     test: Annotated[str | None, typer.Option(help="One test; default: every test.")] = None,

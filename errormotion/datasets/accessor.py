@@ -233,6 +233,24 @@ class ErrorMotion:
             xr.DataArray(C, dims=(*rest, "dof", "dof_"), coords=self._coords("dof", "dof_", without=dim)),
         )
 
+    def since(self, time: float | tuple[float, float]) -> xr.Dataset:
+        """Return the changes since an instant, or since the mean of an interval; see `reduction.since`."""
+        from errormotion.datasets.reduction import since
+
+        return since(self._ds, time)
+
+    def mean(self, dim: str) -> xr.Dataset:
+        """Return the mean over a dimension with its covariance; see `reduction.mean`."""
+        from errormotion.datasets.reduction import mean
+
+        return mean(self._ds, dim)
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the reader."""
+        notes = self._ds.attrs.get("notes", [])
+        return [note for note in ([notes] if isinstance(notes, str) else list(notes)) if note]
+
     def budget(self) -> xr.DataArray:
         """Return the uncertainty budget: standard uncertainty (k = 1) by group of sources, and the independent rest.
 

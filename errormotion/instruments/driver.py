@@ -1,14 +1,17 @@
-"""Base of drivers: settings, opening and closing, an error for use before opening."""
+"""Base of drivers: settings, opening and closing, an error for use before opening, requests and their answers."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from errormotion.errors import InstrumentError, ReplayError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports import Transport, open_transport
+from errormotion.instruments.transports.quiet import await_quiet, discard_input
 from errormotion.plugins import InstrumentInfo, PluginSettings
 
 
@@ -16,8 +19,8 @@ class Driver:
     """Base of drivers with one transport.
 
     A subclass has ``info`` and ``Settings``, starts the device in ``_start_session``, stops it in ``_end_session``, and
-    uses
-    ``self.transport``.
+    sends each request, and reads its answer, within ``with self.exchange() as line:``. A driver of a device that sends
+    without requests uses ``self.transport``. Settings called ``timeout`` (s) and ``baudrate`` apply to the transport.
 
     Parameters
     ----------
@@ -37,6 +40,8 @@ class Driver:
         self.settings: Any = self.Settings() if settings is None else settings
         self._record = record
         self._transport: Transport | None = None
+        self._failed_at: float | None = None
+        self._timed_out = False
 
     @property
     def transport(self) -> Transport:
@@ -58,6 +63,7 @@ class Driver:
         if self._transport is not None:
             return
         self._transport = self._connect()
+        self._failed_at = None
         try:
             self._start_session()
         except BaseException:
@@ -87,8 +93,61 @@ class Driver:
         with suppress(InstrumentError):  # the first error states the cause
             self.close()
 
+    @contextmanager
+    def exchange(self) -> Iterator[Transport]:
+        """Give the transport for one request and its answer: the first bytes that are read belong to this request.
+
+        Unread bytes are discarded ahead of the request. If the previous exchange ended with an error, its answer may
+        still arrive, or its rest: `resynchronise` is called first. An answer is therefore checked and decoded within
+        the block, so that a wrong one is known as an error of this exchange.
+
+        Raises
+        ------
+        InstrumentError
+            The driver is not open, or the device cannot be resynchronised; the next exchange tries again.
+        """
+        line = self.transport
+        try:
+            if self._failed_at is None:
+                discard_input(line)
+            else:
+                self.resynchronise()
+            yield line
+        except BaseException as error:
+            self._failed_at, self._timed_out = time.monotonic(), isinstance(error, InstrumentTimeoutError)
+            raise
+        self._failed_at = None
+
+    def resynchronise(self) -> None:
+        """Make sure, after a failed exchange, that no answer to an earlier request is read as the next one.
+
+        Everything is discarded until nothing has arrived for a time limit since the failure. If an answer was missing
+        and has not arrived by then, a TCP connection is opened again: the answer is lost with the old one.
+
+        An answer that is later still, on a serial line or through a serial server, would be read as the next one. A
+        driver whose answers have no number overrides this method where the protocol has a request with an answer of
+        its own form: it calls ``super().resynchronise()``, sends this request, and reads until its answer.
+
+        Raises
+        ------
+        InstrumentError
+            The device does not stop sending, or the connection is lost.
+        """
+        line = self.transport
+        try:
+            discarded = await_quiet(line, line.timeout, self._failed_at)
+        except ProtocolError:
+            raise
+        except InstrumentError:
+            if not line.reconnects:
+                raise
+            return
+        if self._timed_out and not discarded:
+            line.reopen()
+
     def _connect(self) -> Transport:
-        return open_transport(self.address, simulator=self.info.simulator, recorder=self._record)
+        given = {name: getattr(self.settings, name) for name in ("timeout", "baudrate") if hasattr(self.settings, name)}
+        return open_transport(self.address, simulator=self.info.simulator, recorder=self._record, **given)
 
     def _start_session(self) -> None:
         """Check the device right after connecting."""

@@ -26,6 +26,7 @@ from errormotion.plugins import (
     kind_registry,
     load_object,
 )
+from errormotion.testing import wire_checks
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
 
@@ -299,6 +300,11 @@ def _complaint(outcome: Session, sound: Session, subject: InstrumentSubject, har
     if outcome.unexplained:
         return f"{outcome.unexplained} values are NaN without a count or a reason"
     return ""
+
+
+INSTRUMENT_CHECKS.add(limit=60.0, why_not=wire_checks.no_late_answers)(wire_checks.late_answers)
+INSTRUMENT_CHECKS.add(why_not=wire_checks.no_time_limit)(wire_checks.time_limit)
+INSTRUMENT_CHECKS.add(why_not=wire_checks.no_baudrate)(wire_checks.baudrate)
 
 
 @INSTRUMENT_CHECKS.add()

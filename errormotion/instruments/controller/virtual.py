@@ -331,9 +331,10 @@ class VirtualController(Driver):
         self._call("set_station", position=[float(x) for x in position])
 
     def _call(self, op: str, **arguments: Any) -> Any:
-        self._number += 1
-        self.transport.write(encode_request(self._number, op, arguments))
-        return decode_answer(self.transport.read_until(LINE_END), self._number)
+        with self.exchange() as line:
+            self._number += 1
+            line.write(encode_request(self._number, op, arguments))
+            return decode_answer(line.read_until(LINE_END), self._number)
 
     def _connect(self) -> Transport:
         self._number = 0

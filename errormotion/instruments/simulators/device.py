@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import threading
+
 import numpy as np
 
 from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_bytes
@@ -39,6 +42,8 @@ class SimulatedDevice:
         self._line_end = line_end
         self._buffer = b""
         self._answers = 0
+        self._held: tuple[object, bytes] | None = None  # the connection and the answer that is late
+        self._releasing: threading.Timer | None = None
         seed = int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *self.name.encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -47,7 +52,9 @@ class SimulatedDevice:
         if clock := address.number("clock", 0.0):
             self.world.tick(clock)
         try:
-            self._server = make_server(address.params.get("wire", "tcp"), self.name, self._on_data)
+            self._server = make_server(
+                address.params.get("wire", "tcp"), self.name, self._on_data, self.connection_opened
+            )
         except BaseException:
             self.world.detach(self)
             raise
@@ -62,11 +69,18 @@ class SimulatedDevice:
 
     def close(self) -> None:
         """End the device; with the last one of its world the world ends."""
+        if self._releasing is not None:
+            self._releasing.cancel()
+            self._releasing.join()
         self._server.close()
         self.world.detach(self)
 
     def report_delivered(self, samples: int) -> None:
         """Record the number of samples of the running stream that the reader has received."""
+
+    def connection_opened(self) -> None:
+        """Forget an unfinished request of the previous connection."""
+        self._buffer = b""
 
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request, given without its line end."""
@@ -83,9 +97,28 @@ class SimulatedDevice:
             return
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
+        if fault.kind == "late" and number == fault.at:
+            self._hold(data)
+            return
         with self._server.lock:
+            self._release()
             for piece in fault.pieces(data):
                 self._server.send(piece)
+
+    def _hold(self, data: bytes) -> None:
+        """Hold an answer back; see `simulators.faults`."""
+        self._held = self._server.connection, data
+        if math.isfinite(self.fault.delay):
+            self._releasing = threading.Timer(self.fault.delay, self._release)
+            self._releasing.daemon = True
+            self._releasing.start()
+
+    def _release(self) -> None:
+        """Send the answer that was held back, if its connection is still open."""
+        with self._server.lock:
+            held, self._held = self._held, None
+            if held is not None and held[0] is self._server.connection:
+                self._server.send(held[1])
 
     def _silent(self) -> bool:
         return self._answers > self.fault.at

@@ -9,6 +9,8 @@
 * ``out_of_range``: nothing to measure
 * ``drop``: samples, or answers, are missing
 * ``disconnect``: the connection breaks; it can be opened again
+* ``late``: one answer, number ``fault_at``, is held back for ``late_by`` s, and in any case until the next answer,
+  which it precedes (without ``late_by``: until then); it is lost with its connection
 
 ``fault_at`` is the first sample (of a stream) or answer (of others) with the fault; default 0. ``silence`` without
 ``fault_at`` starts before the first answer. ``fault_every`` is the period of ``garbage`` and ``drop``, ``fault_for``
@@ -17,6 +19,7 @@ the number of samples that ``out_of_range`` lasts (default: no limit).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -25,7 +28,7 @@ import numpy as np
 from errormotion.errors import InstrumentError
 from errormotion.instruments.transports import Address
 
-FAULTS = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect")
+FAULTS = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect", "late")
 
 
 @dataclass
@@ -44,6 +47,8 @@ class Fault:
         Number of samples; 0 = no limit.
     from_the_start : bool
         Whether ``fault_at`` is not given.
+    delay : float
+        Time for which ``late`` holds an answer back, s; infinite: until the next answer.
     """
 
     kind: str = ""
@@ -51,6 +56,7 @@ class Fault:
     every: int = 1
     length: int = 0
     from_the_start: bool = False
+    delay: float = math.inf
 
     def hits(self, kind: str, number: int) -> bool:
         """Whether a sample or answer of this number has this fault."""
@@ -93,6 +99,7 @@ def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -
         every=max(1, int(address.number("fault_every", every))),
         length=int(address.number("fault_for", 0)),
         from_the_start="fault_at" not in address.params,
+        delay=address.number("late_by", math.inf),
     )
 
 

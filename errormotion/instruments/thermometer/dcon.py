@@ -11,13 +11,15 @@ from typing import ClassVar
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, Thermometer, ThermometerSettings
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
+from errormotion.instruments.transports.reconnecting import open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
+MAX_LINE_BYTES = 512
+MAX_LATE_LINES = 16
 OPEN_SENSOR = 9999.0  # degC: this absolute value and more means an open or overrun input
 UNDER_RANGE = "-0000"  # the code of an ADAM for the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
@@ -145,19 +147,30 @@ class DconTemperature(Thermometer):
     def _query(self, request: str, expected: str) -> str:
         """Send a request and return the answer without its expected start."""
         with_checksum = self.settings.checksum
-        line = self.transport
-        discard_input(line)
-        line.write(encode(request, with_checksum=with_checksum))
-        try:
-            answer = decode(line.read_until(LINE_END, limit=512), with_checksum=with_checksum)
-        except InstrumentTimeoutError:
-            disconnect_after_timeout(line)
-            raise
+        with self.exchange() as line:
+            line.write(encode(request, with_checksum=with_checksum))
+            answer = decode(line.read_until(LINE_END, limit=MAX_LINE_BYTES), with_checksum=with_checksum)
         if answer.startswith("?"):
             raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
         if not answer.startswith(expected):
             raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'")
         return answer.removeprefix(expected)
+
+    def resynchronise(self) -> None:
+        """Discard late answers; those that are later still come before the answer that states the name.
+
+        Raises
+        ------
+        InstrumentError
+            The module does not answer.
+        """
+        super().resynchronise()
+        line, start = self.transport, f"!{self._unit}".encode("ascii")
+        line.write(encode(f"${self._unit}M", with_checksum=self.settings.checksum))
+        for _ in range(MAX_LATE_LINES):
+            if line.read_until(LINE_END, limit=MAX_LINE_BYTES).startswith(start):
+                return
+        raise ProtocolError(f"{self.address}: expected an answer that starts with {start!r}; found other lines")
 
     def _connect(self) -> Transport:
         return open_reconnecting(

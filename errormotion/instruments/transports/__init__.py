@@ -15,6 +15,7 @@ Buses have modules of their own: `transports.modbus` (``modbus+tcp``, ``modbus+r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,7 +74,7 @@ def open_transport(
         case "sim":
             from errormotion.instruments.transports.simulated import SimulatedTransport
 
-            transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout)
+            transport = SimulatedTransport(address, load_simulator(simulator, url), timeout=timeout, baudrate=baudrate)
         case _:
             raise InstrumentError(
                 f"This instrument has no connection of type {address.scheme}: expected "
@@ -88,15 +89,23 @@ def open_transport(
         raise
 
 
-def load_simulator(name: str | None, url: str) -> Any:
-    """Return the simulator class named ``module:Class``; InstrumentError where there is none."""
+def load_simulator(name: str | None, url: str) -> Callable[[Address], Any]:
+    """Return what starts the simulator called ``module:Class`` at an address; InstrumentError where there is none."""
     if name is None:
         raise InstrumentError(f"This instrument has no simulator; found '{url}', expected the address of a device")
     module, _, attribute = name.partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        simulator = getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise InstrumentError(f"The simulator '{name}' behind '{url}' does not load: {error}") from error
+
+    def start(address: Address) -> Any:
+        from errormotion.instruments.transports.serving import placed
+
+        with placed(address):
+            return simulator(address)
+
+    return start
 
 
 __all__ = ["SCHEMES", "Address", "Transport", "open_transport", "parse_address"]

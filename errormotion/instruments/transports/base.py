@@ -25,9 +25,12 @@ class Transport(ABC):
         bytes are lost without notice.
     simulated : bool
         Whether a simulator is at the other end.
+    reconnects : bool
+        Whether the next write opens a connection that was lost.
     """
 
     flow_control = True
+    reconnects = False
     simulated = False
 
     def __init__(self, url: str, timeout: float) -> None:
@@ -99,6 +102,14 @@ class Transport(ABC):
                     f"{self.url}: expected {size} bytes within {allowed:g} s; received {len(data)}"
                 ) from None
         return data
+
+    def reopen(self) -> bool:
+        """Open another connection to the same device: a late answer is lost with the old one.
+
+        Returns whether there is another connection; False for a line that has none, such as a serial line.
+        InstrumentError where the device cannot be reached.
+        """
+        return False
 
     def report_delivered(self, samples: int) -> None:  # noqa: B027 - without effect for most transports
         """Report the number of samples of the running stream that the caller has received.

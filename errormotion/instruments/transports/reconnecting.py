@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import Address, parse_address
-from errormotion.instruments.transports.base import CHUNK, Transport
+from errormotion.instruments.transports.base import Transport
 from errormotion.instruments.transports.lost import Reopened
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 
@@ -17,7 +16,7 @@ from errormotion.instruments.transports.recording import Recorder, ReplayTranspo
 class ReconnectingTransport(Transport):
     """A transport whose connection is opened again after it was lost; see `transports.lost`.
 
-    A connection that was closed while it was not in use is detected by `discard_input`, ahead of a request.
+    A connection that was closed while it was not in use is detected by `quiet.discard_input`, ahead of a request.
 
     Parameters
     ----------
@@ -35,6 +34,8 @@ class ReconnectingTransport(Transport):
         Records the frames of all connections, and those that were not sent without a connection: in a replay the same
         exchanges fail.
     """
+
+    reconnects = True
 
     def __init__(
         self,
@@ -63,6 +64,12 @@ class ReconnectingTransport(Transport):
         lost = self._line.drop(reason)
         if lost is not None:
             lost.close()
+
+    def reopen(self) -> bool:
+        """Drop a TCP connection; the next exchange opens another one."""
+        if self.flow_control:
+            self.drop(f"{self.url} did not answer")
+        return self.flow_control
 
     def _opened(self) -> Transport:
         line = self._connect()
@@ -109,19 +116,10 @@ class ReconnectingTransport(Transport):
                 self._recorder.close()
 
 
-def discard_input(line: Transport) -> bytes:
-    """Discard and return the unread bytes of a line, such as late answers; detect a connection that was lost."""
-    old = b""
-    with suppress(InstrumentError):  # a timeout is expected; the next write opens a lost connection again
-        while data := line.read(CHUNK, timeout=0.0):
-            old += data
-    return old
-
-
 def disconnect_after_timeout(line: Transport) -> None:
     """Drop a TCP connection after a timeout: it may be broken, and a late answer must not be read as the next one."""
-    if isinstance(line, ReconnectingTransport) and line.flow_control:
-        line.drop(f"{line.url} did not answer")
+    if isinstance(line, ReconnectingTransport):
+        line.reopen()
 
 
 def open_reconnecting(

@@ -84,6 +84,11 @@ class RecordingTransport(Transport):
         self._recorder.frame("R", data)
         return data
 
+    def reopen(self) -> bool:
+        """Open another connection to the same device."""
+        self._rest = b""
+        return self._inner.reopen()
+
     def report_delivered(self, samples: int) -> None:
         """Report the reader's progress."""
         self._inner.report_delivered(samples)

@@ -1,18 +1,96 @@
-"""The device's end of a connection, on loopback, for the simulators."""
+"""The device's end of a connection, for the simulators: on a free port of loopback, or where an address says.
+
+The parameters ``port`` and ``host`` of a ``sim://`` address hold for every server that the simulator makes: the first
+one listens at ``port``, a further line of the same device at the next one.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import socket
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments.transports.address import Address
 
+LOOPBACK = "127.0.0.1"
+ANY_HOST = "0.0.0.0"
 SEND_BUFFER = 32768
 """Bytes: bounds how far a virtual clock runs ahead of its reader."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Placement:
+    """Where the servers of one simulated device listen.
+
+    Attributes
+    ----------
+    host : str
+        Name or address of an interface of this computer.
+    port : int
+        Of the next server; 0: any free one.
+    """
+
+    host: str = LOOPBACK
+    port: int = 0
+
+
+_placement: ContextVar[Placement | None] = ContextVar("placement", default=None)
+
+
+@contextmanager
+def placed(address: Address) -> Iterator[None]:
+    """Have the servers that are made in this context listen where an address says; see the module.
+
+    Raises
+    ------
+    InstrumentError
+        ``port`` is no port.
+    """
+    placement = Placement(address.params.get("host", LOOPBACK), address.whole("port", 0, 65535))
+    token = _placement.set(placement)
+    try:
+        yield
+    finally:
+        _placement.reset(token)
+
+
+def standing_alone() -> bool:
+    """Whether the servers that are made now have a stated port: their device outlives its clients."""
+    placement = _placement.get()
+    return placement is not None and placement.port > 0
+
+
+def listening_at() -> tuple[str, int]:
+    """Return host and port of the server that is made now; the next one gets the next port."""
+    placement = _placement.get() or Placement()
+    port = placement.port
+    if port:
+        placement.port = port + 1 if port < 65535 else 0
+    return placement.host, port
+
+
+def reachable_at(host: str, port: int) -> str:
+    """Return host and port for a client on this computer."""
+    return f"{LOOPBACK if host in (ANY_HOST, '') else host}:{port}"
+
+
+def not_listening(host: str, port: int, error: Exception) -> InstrumentError:
+    """Return the error of a server that cannot listen."""
+    reason = getattr(error, "strerror", None) or error
+    return InstrumentError(
+        f"The simulated device cannot listen at {host}:{port}: {reason}. Choose another port, or an address of this "
+        "computer"
+    )
 
 
 class Server(ABC):
@@ -28,8 +106,12 @@ class Server(ABC):
 
     url: str
 
-    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
+    ) -> None:
         self._on_data = on_data
+        self._on_connection = on_connection or _nothing
+        self._alone = standing_alone()
         self.lock = threading.RLock()
         self._ended = threading.Event()
         self._wake_read, self._wake_write = socket.socketpair()
@@ -52,6 +134,11 @@ class Server(ABC):
         self._wake_read.close()
         self._wake_write.close()
 
+    @property
+    def connection(self) -> object:
+        """The present connection: another object after the next one was opened."""
+        return self
+
     @abstractmethod
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
@@ -60,6 +147,16 @@ class Server(ABC):
     def disconnect(self) -> None:
         """Drop the present connection; another one may come."""
 
+    def _deliver(self, data: bytes) -> None:
+        """Pass bytes on. A device that stands alone outlives what it cannot answer: it hangs up."""
+        try:
+            self._on_data(data)
+        except Exception:
+            if not self._alone:
+                raise
+            log.exception("the simulated device failed at %r", data[:200])
+            self.disconnect()
+
     @abstractmethod
     def _run(self) -> None: ...
 
@@ -67,16 +164,40 @@ class Server(ABC):
     def _release(self) -> None: ...
 
 
-class TcpServer(Server):
-    """Listens on a free port of 127.0.0.1; one connection at a time."""
+def _nothing() -> None:
+    return
 
-    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
-        super().__init__(name, on_data)
-        self._listener = socket.create_server(("127.0.0.1", 0))
+
+class TcpServer(Server):
+    """Listens where `placed` says, else on a free port of loopback; one connection at a time.
+
+    Attributes
+    ----------
+    connections : int
+        Connections accepted so far.
+    """
+
+    def __init__(
+        self, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
+    ) -> None:
+        super().__init__(name, on_data, on_connection)
+        host, port = listening_at()
+        try:
+            self._listener = socket.create_server((host, port))
+        except (OSError, UnicodeError) as error:
+            self._wake_read.close()
+            self._wake_write.close()
+            raise not_listening(host, port, error) from None
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._line: socket.socket | None = None
         self._connected = threading.Event()
-        self.url = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.connections = 0
+        self.url = f"tcp://{reachable_at(host, self._listener.getsockname()[1])}"
+
+    @property
+    def connection(self) -> object:
+        """The present connection; None without one."""
+        return self._line
 
     def await_connection(self, timeout: float) -> bool:
         """Wait for a connection; False where there is none within ``timeout`` s.
@@ -115,6 +236,8 @@ class TcpServer(Server):
                 line, _ = self._listener.accept()
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._line = line
+                self.connections += 1
+                self._on_connection()
                 self._connected.set()
                 continue
             try:
@@ -122,7 +245,7 @@ class TcpServer(Server):
             except OSError:
                 data = b""
             if data:
-                self._on_data(data)
+                self._deliver(data)
             else:
                 self._forget()
 
@@ -143,15 +266,32 @@ class TcpServer(Server):
 class PtyServer(Server):
     """A pseudo terminal: the driver opens its far end as a serial line."""
 
-    def __init__(self, name: str, on_data: Callable[[bytes], None]) -> None:
-        import tty  # only where there are terminals
+    def __init__(
+        self, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
+    ) -> None:
+        import termios  # only where there are terminals
+        import tty
 
-        super().__init__(name, on_data)
+        super().__init__(name, on_data, on_connection)
         self._near, self._far = os.openpty()  # the far end stays open here, else its first close ends the line
         tty.setraw(self._far)
+        flags = termios.tcgetattr(self._far)
+        flags[4] = flags[5] = termios.B0  # no driver has set it
+        termios.tcsetattr(self._far, termios.TCSANOW, flags)
         os.set_blocking(self._near, False)
         self._cut = False
         self.url = f"serial://{os.ttyname(self._far)}"
+
+    @property
+    def baudrate(self) -> int:
+        """Baud rate to which a driver has set the line; 0 before."""
+        import termios
+
+        code = termios.tcgetattr(self._far)[5]
+        rates = {
+            getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
+        }
+        return rates.get(code, 0)
 
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
@@ -181,17 +321,22 @@ class PtyServer(Server):
             except OSError:
                 break
             if data and not self._cut:
-                self._on_data(data)
+                self._deliver(data)
 
     def _release(self) -> None:
         os.close(self._near)
         os.close(self._far)
 
 
-def make_server(wire: str, name: str, on_data: Callable[[bytes], None]) -> Server:
-    """Return a server for ``wire``: ``tcp`` or ``pty``; InstrumentError for another one."""
+def make_server(
+    wire: str, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
+) -> Server:
+    """Return a server for ``wire``: ``tcp`` or ``pty``; InstrumentError for another one.
+
+    ``on_data`` is called with received bytes, ``on_connection`` ahead of those of a new TCP connection.
+    """
     if wire == "tcp":
-        return TcpServer(name, on_data)
+        return TcpServer(name, on_data, on_connection)
     if wire == "pty":
-        return PtyServer(name, on_data)
+        return PtyServer(name, on_data, on_connection)
     raise InstrumentError(f"A simulated device has 'wire=tcp' or 'wire=pty'; found 'wire={wire}'")

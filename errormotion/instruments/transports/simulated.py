@@ -18,15 +18,16 @@ RECEIVE_BUFFER = 65536
 class SimulatedTransport(Transport):
     """A connection to a simulator that lives in this process and ends with the connection.
 
-    ``simulator(address)`` starts the device; the object has ``url`` (a ``tcp://`` or ``serial://`` address on this
-    machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of the further
-    ones, by name.
+    ``simulator(address)`` starts the device, see `load_simulator`; the object has ``url`` (a ``tcp://`` or ``serial://``
+    address on this machine), ``close()`` and ``report_delivered(samples)``. A device with several lines has ``urls`` of
+    the further ones, by name.
     """
 
     simulated = True
 
-    def __init__(self, address: Address, simulator: Any, *, timeout: float = 1.0) -> None:
+    def __init__(self, address: Address, simulator: Any, *, timeout: float = 1.0, baudrate: int | None = None) -> None:
         super().__init__(address.url, timeout)
+        self._baudrate = baudrate
         self._device = simulator(address)
         self._inner = self._connect(self._device.url)
 
@@ -45,7 +46,7 @@ class SimulatedTransport(Transport):
             line: Transport = (
                 TcpTransport(inner, timeout=self.timeout, receive_buffer=RECEIVE_BUFFER)
                 if inner.scheme == "tcp"
-                else SerialTransport(inner, timeout=self.timeout)
+                else SerialTransport(inner, timeout=self.timeout, baudrate=self._baudrate)
             )
         except BaseException:
             self._device.close()
@@ -58,6 +59,11 @@ class SimulatedTransport(Transport):
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         return self._inner.read(max_bytes, timeout)
+
+    def reopen(self) -> bool:
+        """Open another connection to the same simulated device."""
+        self._rest = b""
+        return self._inner.reopen()
 
     def report_delivered(self, samples: int) -> None:
         """Report the reader's progress to the simulator."""

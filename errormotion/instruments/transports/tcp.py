@@ -17,23 +17,33 @@ class TcpTransport(Transport):
 
     def __init__(self, address: Address, *, timeout: float = 1.0, receive_buffer: int | None = None) -> None:
         super().__init__(address.url, timeout)
-        self._socket: socket.socket | None = None
+        self._host, self._port, self._receive_buffer = address.host, address.port, receive_buffer
+        self._socket: socket.socket | None = self._connected()
+
+    def reopen(self) -> bool:
+        """Open another connection to the same device; always True."""
+        self._rest = b""
+        self.close()
+        self._socket = self._connected()
+        return True
+
+    def _connected(self) -> socket.socket:
         line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
-            if receive_buffer is not None:
-                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-            line.settimeout(timeout)
-            line.connect((address.host, address.port))
+            if self._receive_buffer is not None:
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._receive_buffer)
+            line.settimeout(self.timeout)
+            line.connect((self._host, self._port))
             line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except TimeoutError:
             line.close()
-            raise InstrumentTimeoutError(f"No device answered at {self.url} within {timeout:g} s") from None
+            raise InstrumentTimeoutError(f"No device answered at {self.url} within {self.timeout:g} s") from None
         except OSError as error:
             line.close()
             raise InstrumentError(
                 f"No connection to {self.url}: {error.strerror or error}; is the device on?"
             ) from None
-        self._socket = line
+        return line
 
     def _line(self) -> socket.socket:
         if self._socket is None:

@@ -1,7 +1,4 @@
-"""Driver of the LG7: asked ``GET 3``, it answers three lines ``17,+0.946142*57`` (counter, mm) and then ``.*2E``.
-
-Behind the star stands the sum of all characters before it, in two hexadecimal digits.
-"""
+"""Driver of the LG7; `codec` describes its lines."""
 
 import math
 import time
@@ -12,47 +9,50 @@ import numpy as np
 from errormotion.errors import ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.plugins import Identity, InstrumentInfo, Samples
-
-RATE = 1000.0
-OUT_OF_RANGE = "------"
-
-
-def with_check(text: str) -> bytes:
-    return f"{text}*{sum(text.encode()) & 0xFF:02X}\r".encode()
+from line_gauge.codec import END, LONGEST, RATE, identity_of, sample_of, text_of, with_check
+from line_gauge.settings import LineGaugeSettings
 
 
 class LineGauge(Driver):
     summary = "LG7 line gauge, lines of ASCII on a serial line or TCP"
     simulator = "line_gauge.simulator:SimulatedLineGauge"
     info = InstrumentInfo("line_gauge", "point_lds", summary, "simulated_only", simulator=simulator)
+    Settings = LineGaugeSettings
     measuring_range, mid_range = (0.0, 2e-3), 1e-3  # m
 
     def identify(self) -> Identity:
-        model, serial, firmware = self._ask("ID")[0].split(",")
-        return Identity("Example Instruments", model, serial, firmware, simulated=self.transport.simulated)
+        (parts,) = self._ask("ID", 1, identity_of)
+        return Identity("Example Instruments", *parts, simulated=self.transport.simulated)
 
     def read(self) -> float:
         return float(next(self.stream(block=1)).values[0, -1])
 
     def stream(self, block: int = 200) -> Iterator[Samples]:
-        start, due = None, 0
+        start = due = -1
         while True:
-            found = {int(counter): text for counter, text in (line.split(",") for line in self._ask(f"GET {block}"))}
-            if not found:
-                raise ProtocolError(f"The gauge at {self.address} answered 'GET {block}' without a sample")
-            start, due = (min(found), min(found)) if start is None else (start, due)
-            texts = [found.get(counter) for counter in range(due, max(found) + 1)]
-            values = [math.nan if text in (None, OUT_OF_RANGE) else float(text) * 1e-3 for text in texts]
-            invalid = {"out of range": texts.count(OUT_OF_RANGE)}
-            yield Samples(np.array([values]), due - start, RATE, time.monotonic(), texts.count(None), invalid)
-            due += len(texts)
+            found = dict(self._ask(f"GET {block}", block, sample_of))
+            start, due = (start, due) if start >= 0 else (min(found), min(found))
+            if not due <= min(found) <= max(found) <= due + 1000 * block:
+                raise ProtocolError(f"The gauge at {self.address} sent no samples from {due} on after 'GET {block}'")
+            values = np.array([[found.get(counter, math.nan) for counter in range(due, max(found) + 1)]])
+            invalid = {"out of range": sum(math.isnan(value) for value in found.values())}
+            yield Samples(values, due - start, RATE, time.monotonic(), values.size - len(found), invalid)
+            due += values.size
 
-    def _ask(self, request: str) -> list[str]:
-        self.transport.write(with_check(request))
-        lines: list[str] = []
-        while not lines or lines[-1] != ".":
-            line = self.transport.read_until(b"\r")
-            lines.append(line.partition(b"*")[0].decode(errors="replace"))
-            if with_check(lines[-1]) != line:
-                raise ProtocolError(f"The gauge at {self.address} sent {line!r}, whose check is wrong; open it again")
-        return lines[:-1]
+    def _ask(self, request: str, most: int, decode) -> list:
+        texts: list[str] = []
+        with self.exchange() as line:  # after an error, late answers are discarded first
+            line.write(with_check(request))
+            while texts[-1:] != [END] and len(texts) <= most:
+                texts.append(text_of(line.read_until(b"\r", limit=LONGEST)))
+            if texts.pop() != END or not texts:
+                raise ProtocolError(
+                    f"Expected 1 to {most} lines and {END!r} after '{request}'; {self.address} sent {texts}"
+                )
+            return [decode(text) for text in texts]
+
+    def resynchronise(self) -> None:  # an answer that is later still ends ahead of the gauge's name
+        super().resynchronise()
+        self.transport.write(with_check("ID"))
+        self.transport.read_until(b"LG7,", limit=1 << 20)
+        self.transport.read_until(with_check(END), limit=LONGEST)

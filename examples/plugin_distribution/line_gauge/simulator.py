@@ -1,11 +1,11 @@
 """A gauge on the wire that looks at the virtual machine in the place of the frame's sensor X1."""
 
 from errormotion.instruments.simulators.device import SimulatedDevice
-from line_gauge.driver import OUT_OF_RANGE, RATE, with_check
+from line_gauge.codec import OUT_OF_RANGE, RATE, with_check
 
 
 class SimulatedLineGauge(SimulatedDevice):
-    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect")
+    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
 
     def __init__(self, address):
         self.counter = 0

@@ -266,6 +266,8 @@ class LinuxCNC(Driver):
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
                 continue
+            if isinstance(message.number, int) and message.number < number:  # late: of an order that has failed
+                continue
             if message.number != number:
                 raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
             if isinstance(message, codec.Answer):

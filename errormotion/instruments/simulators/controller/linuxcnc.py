@@ -169,7 +169,7 @@ def end() -> None:
 class SimulatedLinuxCNC(SimulatedDevice):
     """Forwards messages between the driver and the bridge of a real LinuxCNC."""
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect")
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late")
 
     def __init__(self, address: Address) -> None:
         self._numbers = 0

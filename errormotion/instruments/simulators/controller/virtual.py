@@ -24,7 +24,7 @@ class SimulatedController(SimulatedDevice):
     or is stuck).
     """
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect", *MACHINE_FAULTS)
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", *MACHINE_FAULTS)
 
     def __init__(self, address: Address) -> None:
         super().__init__(address, line_end=b"\n", default_name="controller")

@@ -16,7 +16,7 @@ class SimulatedDcon(SimulatedDevice):
     `simulators.thermometers`), ``unit`` (1), ``checksum`` (0 or 1).
     """
 
-    faults: tuple[str, ...] = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "unplugged")
+    faults: tuple[str, ...] = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late", "unplugged")
 
     def __init__(self, address: Address) -> None:
         self._unit = f"{int(address.number('unit', 1)):02X}"

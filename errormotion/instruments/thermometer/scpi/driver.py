@@ -10,7 +10,8 @@ from errormotion.instruments.thermometer.scpi import codec
 from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, Thermometer
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
+from errormotion.instruments.transports.quiet import discard_input
+from errormotion.instruments.transports.reconnecting import disconnect_after_timeout, open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
 
 MAX_ERRORS = 32

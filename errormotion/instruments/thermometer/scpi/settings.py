@@ -87,7 +87,7 @@ class ScpiSettings(ThermometerSettings):
 
     def corrected(self, index: int, reading: float) -> float:
         """Return a temperature (degC) from a reading (degC) of the channel with this index."""
-        return self._each(self.scale)[index] * reading + self._each(self.offset)[index]
+        return float(self._each(self.scale)[index] * reading + self._each(self.offset)[index])
 
     def commands(self) -> Iterator[str]:
         """Yield the commands that set channels, scan list and format of the readings."""

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+
 _MAX_LINE_BYTES = 8192
 _MAX_HEADERS = 100
 
@@ -16,7 +18,7 @@ Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 
 
 class HttpServer:
-    """Answers GET requests on a free port of 127.0.0.1, on any number of connections.
+    """Answers GET requests on any number of connections, where `serving.placed` says, else on a free port of loopback.
 
     Parameters
     ----------
@@ -69,8 +71,12 @@ class HttpServer:
             allow_reuse_address = True
             daemon_threads = False  # so that closing waits for them
 
-        self._server = Server(("127.0.0.1", 0), Handler)
-        self.url = f"tcp://127.0.0.1:{self._server.server_address[1]}"
+        host, port = listening_at()
+        try:
+            self._server = Server((host, port), Handler)
+        except (OSError, UnicodeError) as error:
+            raise not_listening(host, port, error) from None
+        self.url = f"tcp://{reachable_at(host, self._server.server_address[1])}"
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.05,), name=f"sim-{name}-http", daemon=True
         )

@@ -27,7 +27,8 @@ from errormotion.instruments.transports.modbus.codec import (
     encode_request,
     missing,
 )
-from errormotion.instruments.transports.reconnecting import discard_input, disconnect_after_timeout, open_reconnecting
+from errormotion.instruments.transports.quiet import await_quiet, discard_input
+from errormotion.instruments.transports.reconnecting import disconnect_after_timeout, open_reconnecting
 from errormotion.instruments.transports.recording import read_recording
 
 QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
@@ -61,6 +62,7 @@ class ModbusLine(Transport):
         self.flow_control, self.simulated = line.flow_control, line.simulated
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
+        self._unanswered_at: float | None = None
 
     def registers(self, function: int, register: int, count: int) -> list[int]:
         """Return ``count`` registers from ``register`` on, by function 3 (holding) or 4 (input).
@@ -86,7 +88,7 @@ class ModbusLine(Transport):
         raise AssertionError  # the loop has ended by itself
 
     def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        discard_input(self._line)
+        self._await_late_answer()
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
         end = time.monotonic() + self.timeout
@@ -103,8 +105,26 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
+            self._unanswered_at = time.monotonic()
             disconnect_after_timeout(self._line)
             raise
+
+    def _await_late_answer(self) -> None:
+        """Discard unread bytes; after a timeout, also what arrives within a further time limit.
+
+        An RTU frame has no number: a late answer would be taken for that to the next request.
+        """
+        since, self._unanswered_at = self._unanswered_at, None
+        if since is None or self.framing == "tcp":
+            discard_input(self._line)
+            return
+        try:
+            await_quiet(self._line, self.timeout, since)
+        except ProtocolError:
+            self._unanswered_at = time.monotonic()
+            raise
+        except InstrumentError:  # the connection was dropped: the answer is lost with it
+            return
 
     def _frame(self, end: float) -> bytes:
         """Return one answer, of the length that its start states."""

@@ -1,0 +1,145 @@
+"""``errormotion simulate``: a simulated device by itself, for drivers and for other people's clients."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from errormotion.cli.app import app
+from errormotion.cli.commands import simulate
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.line_profiler.keyence_ljx.driver import KeyenceLJX
+from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
+from errormotion.instruments.transports import load_simulator, parse_address
+from errormotion.plugins import get
+
+WAIT = 60  # s
+
+
+@contextmanager
+def device(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """Start the command in a process of its own; return what it prints."""
+    command = [sys.executable, "-m", "errormotion", "simulate", *arguments, "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            text = ""
+            while not text.rstrip().endswith("\n}"):
+                line = process.stdout.readline()
+                assert line, process.communicate(timeout=WAIT)[1]
+                text += line
+            yield process, json.loads(text)
+        finally:
+            process.kill()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def test_a_device_answers_one_client_after_another_and_outlives_them() -> None:
+    port = free_port()
+    with device("dcon_temperature", "--port", str(port), "--set", "noise=0") as (process, printed):
+        assert printed["url"] == f"tcp://127.0.0.1:{port}"
+        readings = []
+        for _ in range(3):
+            with DconTemperature(printed["url"]) as thermometer:
+                readings.append(thermometer.read())
+                assert not thermometer.identify().simulated  # for its driver it is any device on the network
+            with socket.create_connection(("127.0.0.1", port)) as line:
+                line.sendall(b"#0")  # half a request, which the next client must not complete
+        assert readings[0] == pytest.approx(readings[2], abs=0.1)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(WAIT) == 0
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", port), timeout=1.0)
+
+
+def test_a_fault_is_one_of_the_device() -> None:
+    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=3") as (process, printed):
+        with DconTemperature(printed["url"], DconSettings(timeout=0.3)) as thermometer:
+            thermometer.read()
+            with pytest.raises(InstrumentTimeoutError):
+                thermometer.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WAIT) == 0
+
+
+def test_all_lines_of_a_device_are_printed() -> None:
+    port = free_port()
+    with device("keyence_ljx", "--port", str(port)) as (_, printed):
+        assert printed["url"] == f"tcp://127.0.0.1:{port}"
+        assert printed["lines"] == {"stream": f"tcp://127.0.0.1:{port + 1}"}
+        with KeyenceLJX(f"{printed['url']}?stream={port + 1}") as profiler:
+            assert profiler.read().size > 0
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Any:
+    """Run the command without its wait."""
+    monkeypatch.setattr(simulate, "_wait", lambda: None)
+    return CliRunner().invoke(app, ["simulate", *arguments])
+
+
+def test_a_bench_file_states_machine_and_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    bench = tmp_path / "bench.toml"
+    bench.write_text(
+        'schema = "errormotion.bench/1"\nname = "b"\nmachine = "cframe"\n\n[instruments.air]\n'
+        'driver = "dcon_temperature"\naddress = "sim://gantry/air?seed=5&unit=7"\n'
+    )
+    result = run(monkeypatch, "dcon_temperature", "--bench", str(bench), "--seed", "6", "--json")
+    address = parse_address(json.loads(result.stdout)["simulator"])
+    assert (address.host, address.path) == ("gantry", "air")
+    assert {name: address.params[name] for name in ("seed", "unit", "pace")} == {"seed": "6", "unit": "7", "pace": "1"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["tracker_table"], "has no simulator of its own"),
+        (["spindle_drift"], "expected an instrument"),
+        (["dcon_temperatur"], "did you mean"),
+        (["dcon_temperature", "--fault", "rust"], "unknown fault"),
+        (["dcon_temperature", "--set", "unit"], "expected KEY=VALUE"),
+        (["dcon_temperature", "--host", "192.0.2.1"], "cannot listen at 192.0.2.1:0"),
+        (["can_temperature"], "bus=udp_multicast"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused_in_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    result = run(monkeypatch, *arguments)
+    assert result.exit_code == 1
+    assert message.lower() in result.stderr.lower()
+    assert "Traceback" not in result.output
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        address = parse_address(f"sim://cframe/thermometer?port={port}")
+        with pytest.raises(InstrumentError, match=f"cannot listen at 127.0.0.1:{port}"):
+            load_simulator(get("instruments", "dcon_temperature").info.simulator, address.url)(address)
+
+
+def test_a_device_that_stands_alone_outlives_a_request_that_it_cannot_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = get("instruments", "dcon_temperature").info.simulator
+    module, _, cls = name.partition(":")
+    monkeypatch.setattr(f"{module}.{cls}.answer", lambda self, request: 1 / 0)
+    address = parse_address(f"sim://cframe/thermometer?port={free_port()}")
+    device = load_simulator(name, address.url)(address)
+    try:
+        for _ in range(2):
+            with socket.create_connection(("127.0.0.1", int(address.params["port"])), timeout=WAIT) as line:
+                line.sendall(b"#01\r")
+                assert line.recv(10) == b""
+    finally:
+        device.close()

@@ -1,0 +1,180 @@
+"""A driver that takes a late answer for the next one, or ignores its time limit or baud rate, fails that check only."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from pydantic import Field
+
+from errormotion.datasets.units import Time
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.driver import Driver
+from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.transports import Address, Transport, open_transport, parse_address
+from errormotion.instruments.transports.serial_line import SerialTransport
+from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
+from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks
+
+ADDRESS = "sim://cframe/dial?seed=3"
+
+
+class DialSettings(PluginSettings):
+    timeout: Time = Field(1.0, gt=0)
+    baudrate: int = Field(9600, gt=0)
+
+
+class Dial(Driver):
+    """Asked ``R``, it answers a distance in m; asked ``N``, its name. Answers have no number."""
+
+    info = InstrumentInfo(
+        "dial",
+        "point_lds",
+        "A dial that answers lines of text",
+        "simulated_only",
+        simulator=f"{__name__}:SimulatedDial",
+    )
+    Settings = DialSettings
+    measuring_range, mid_range = (0.0, 2e-3), 1e-3
+
+    def identify(self) -> Identity:
+        return Identity("Nobody", "Dial", self.ask("N"), simulated=self.transport.simulated)
+
+    def read(self) -> float:
+        text = self.ask("R")
+        try:
+            return float(text)
+        except ValueError:
+            raise ProtocolError(f"expected a number, found {text!r}") from None
+
+    def ask(self, request: str) -> str:
+        with self.exchange() as line:
+            line.write(request.encode() + b"\r")
+            text = line.read_until(b"\r")[:-1].decode(errors="replace")
+            if not text.isascii() or (request == "N") != text.startswith("dial"):
+                raise ProtocolError(f"expected an answer to {request!r}, found {text!r}")
+            return text
+
+
+class SimulatedDial(SimulatedDevice):
+    faults = ("silence", "split", "late")
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(address, line_end=b"\r", default_name="dial")
+
+    def answer(self, request: bytes) -> bytes:
+        return b"dial 7\r" if request == b"N" else f"{1e-3 + 1e-6 * self._answers:.6f}\r".encode()
+
+
+class TestDial(InstrumentConformance):
+    subject = InstrumentSubject(Dial, ADDRESS)
+
+
+class TestDialOnALine(InstrumentConformance):
+    subject = InstrumentSubject(Dial, f"{ADDRESS}&wire=pty", faults=("silence", "split"))
+
+
+class TakesTheLateAnswer(Dial):
+    @contextmanager
+    def exchange(self) -> Iterator[Transport]:
+        yield self.transport
+
+
+class DiscardsWhatIsThereOnly(Dial):
+    def resynchronise(self) -> None:
+        pass
+
+
+class HasItsOwnTimeLimit(Dial):
+    def _connect(self) -> Transport:
+        simulator, speed = self.info.simulator, self.settings.baudrate
+        return open_transport(self.address, simulator=simulator, recorder=self._record, baudrate=speed)
+
+
+class HasItsOwnBaudrate(Dial):
+    def _connect(self) -> Transport:
+        simulator, limit = self.info.simulator, self.settings.timeout
+        return open_transport(self.address, simulator=simulator, recorder=self._record, timeout=limit)
+
+
+class AsksTwice(Dial):
+    """Opens with a request: a silent device is noticed."""
+
+    def _start_session(self) -> None:
+        self.identify()
+
+
+class WithItsOwnTimeLimit(HasItsOwnTimeLimit, AsksTwice):
+    pass
+
+
+class WithItsOwnBaudrate(HasItsOwnBaudrate, AsksTwice):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("check", "plugin"),
+    [
+        ("late_answers", TakesTheLateAnswer),
+        ("late_answers", DiscardsWhatIsThereOnly),
+        ("time_limit", WithItsOwnTimeLimit),
+        ("baudrate", WithItsOwnBaudrate),
+    ],
+)
+def test_a_broken_driver_fails_exactly_its_check(check: str, plugin: type[Dial]) -> None:
+    failed = {result.name for result in run_checks(InstrumentSubject(plugin, ADDRESS)) if not result.ok}
+    assert failed == {check}
+
+
+@pytest.mark.parametrize("wire", ["tcp", "pty"])
+def test_readings_stay_in_step_after_an_answer_that_was_late(wire: str) -> None:
+    address = f"{ADDRESS}&wire={wire}&fault=late&fault_at=2&late_by=0.3"
+    with Dial(address, DialSettings(timeout=0.2)) as dial:
+        assert [dial.read(), dial.read()] == [0.001, 0.001001]
+        with pytest.raises(InstrumentTimeoutError):
+            dial.read()
+        assert [dial.read(), dial.read()] == [0.001003, 0.001004]
+
+
+def test_an_answer_that_is_later_still_is_lost_with_its_connection() -> None:
+    with Dial(f"{ADDRESS}&fault=late&fault_at=1", DialSettings(timeout=0.2)) as dial:
+        dial.read()
+        with pytest.raises(InstrumentTimeoutError):
+            dial.read()
+        assert dial.read() == 0.001002
+
+
+def test_a_device_that_does_not_stop_sending_is_an_error() -> None:
+    class Babbling(SimulatedDial):
+        def answer(self, request: bytes) -> bytes:
+            return b"?" * 100_000 if request == b"R" else b"dial 7\r"
+
+        def reply(self, data: bytes) -> None:
+            for _ in range(30):
+                super().reply(data)
+
+    globals()["Babbling"] = Babbling
+
+    class Asking(Dial):
+        info = InstrumentInfo(
+            "asking", "point_lds", "Asks a device that babbles", "simulated_only", simulator=f"{__name__}:Babbling"
+        )
+
+    with Asking(ADDRESS, DialSettings(timeout=0.2)) as dial:
+        with pytest.raises(ProtocolError):
+            dial.read()
+        with pytest.raises(ProtocolError, match="without a request"):
+            dial.read()
+
+
+def test_settings_reach_a_line_of_the_base_class(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, object] = {}
+
+    def opened(self: SerialTransport, address: Address, **options: object) -> None:
+        given.update(options, url=address.url)
+        raise InstrumentError("no such line")
+
+    monkeypatch.setattr(SerialTransport, "__init__", opened)
+    with pytest.raises(InstrumentError, match="no such line"):
+        Dial("serial:///dev/ttyUSB7", DialSettings(timeout=0.7, baudrate=57600)).open()
+    assert given == {"url": "serial:///dev/ttyUSB7", "timeout": 0.7, "baudrate": 57600}
+    assert parse_address("serial:///dev/ttyUSB7?baudrate=300").params == {"baudrate": "300"}
