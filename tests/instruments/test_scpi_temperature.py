@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import mutants
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -374,6 +375,7 @@ class Line:
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.url, self.waiting, self.late = unit, "serial:///dev/none", [], 0
+        self.timeout, self.reconnects = 0.05, False
 
     def write(self, data: bytes) -> None:
         text = self.unit.answer(data.decode().strip())
@@ -382,6 +384,9 @@ class Line:
 
     def read(self, max_bytes: int = 65536, timeout: float | None = None) -> bytes:
         raise InstrumentTimeoutError("no data")
+
+    def reopen(self) -> None:
+        """A serial line stays as it is."""
 
     def read_until(self, terminator: bytes, *, limit: int = 65536, timeout: float | None = None) -> bytes:
         if self.late:  # this answer comes after the next request
@@ -494,3 +499,18 @@ def test_a_pty_carries_the_session_of_a_serial_line() -> None:
         thread.join(timeout=5)
         os.close(slave)
         os.close(master)
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (codec.parse_readings, "+2.61950000E+01,101,+9.90000000E+37,102,-1.5,103"),
+        (codec.parse_identity, IDENTITY),
+        (codec.parse_error, '-113,"Undefined header"'),
+        (codec.parse_channels, "#214(@101,102,103)"),
+    ],
+)
+def test_damaged_answers_give_values_or_protocol_errors(parse: Callable[[str], object], text: str) -> None:
+    mutants.check(
+        lambda data: parse(codec.decode(data)), text.encode() + b"\n", seed=1, number=mutants.count(2000), limit=0.1
+    )
