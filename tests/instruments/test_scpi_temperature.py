@@ -466,7 +466,7 @@ def test_a_recorded_session_gives_the_same_readings(tmp_path: Path) -> None:
         assert thermometer.flags["oil"] == "open"
 
 
-def test_a_pty_carries_the_session_of_a_serial_line() -> None:
+def test_a_pty_carries_the_session_of_a_serial_line(tmp_path: Path) -> None:
     import pty
 
     unit = Unit()
@@ -491,7 +491,8 @@ def test_a_pty_carries_the_session_of_a_serial_line() -> None:
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     try:
-        with ScpiTemperature(f"serial://{name}?baudrate=9600", pt100(timeout=2.0)) as thermometer:
+        address, settings = f"serial://{name}?baudrate=9600", pt100(timeout=2.0)
+        with ScpiTemperature(address, settings, record=tmp_path / "s.rec") as thermometer:
             assert thermometer.read() == {"frame": 20.0, "oil": 20.0}
     finally:
         stop.set()
@@ -499,6 +500,10 @@ def test_a_pty_carries_the_session_of_a_serial_line() -> None:
         thread.join(timeout=5)
         os.close(slave)
         os.close(master)
+    commands = [command for command in unit.received if command and not command.endswith("?")]
+    assert (commands[:2], commands[-1]) == (["*CLS", "SYST:REM"], "SYST:LOC")
+    with ScpiTemperature(f"replay://{tmp_path / 's.rec'}", settings) as thermometer:
+        assert thermometer.read() == {"frame": 20.0, "oil": 20.0}
 
 
 @pytest.mark.parametrize(

@@ -122,6 +122,8 @@ class ScpiTemperature(Thermometer):
         """Set the unit, and report what it refuses."""
         self.unit_errors = tuple(self.errors())
         self._set("*CLS")
+        if self._serial:
+            self._set("SYST:REM")
         for command in self.settings.commands() if self.settings.setup else self.settings.format_commands():
             self._set(command)
         if not self.settings.setup:
@@ -183,7 +185,17 @@ class ScpiTemperature(Thermometer):
             baudrate=self.settings.baudrate,
         )
 
+    @property
+    def _serial(self) -> bool:
+        """Whether the unit is on a serial line, where it has a remote mode of its own."""
+        return str(getattr(self.transport, "recorded_address", self.address)).startswith("serial:")
+
     def _start_session(self) -> None:
         self._ready = False
         self.identify()
         self._prepare()
+
+    def _end_session(self) -> None:
+        if self._serial:
+            with self.exchange() as line:
+                line.write(codec.encode("SYST:LOC"))
