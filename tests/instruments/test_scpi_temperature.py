@@ -494,6 +494,9 @@ def test_a_pty_carries_the_session_of_a_serial_line(tmp_path: Path) -> None:
         address, settings = f"serial://{name}?baudrate=9600", pt100(timeout=2.0)
         with ScpiTemperature(address, settings, record=tmp_path / "s.rec") as thermometer:
             assert thermometer.read() == {"frame": 20.0, "oil": 20.0}
+        end = time.monotonic() + 5
+        while "SYST:LOC" not in unit.received and time.monotonic() < end:
+            time.sleep(0.01)
     finally:
         stop.set()
         os.write(slave, b"\n")
