@@ -174,4 +174,7 @@ def test_damaged_lists_of_recordings_and_scans(tmp_path: Path) -> None:
         with ProfileFiles(f"replay://{tmp_path / 'damaged.rec'}", GRID) as files:
             files.identify()
 
-    mutants.check(replay, (tmp_path / "scans.rec").read_bytes(), seed=8, number=mutants.count(500))
+    good = (tmp_path / "scans.rec").read_bytes()
+    mutants.check(replay, good, seed=8, number=mutants.count(500))
+    with pytest.raises(InstrumentError, match="no name of a file"):
+        replay(good.replace(b"scan.csv", b"scan.csv\0"))

@@ -2,7 +2,9 @@
 
 ``mutants`` is for files and for frames of a protocol. Every mutant follows from the seed and its number alone, so that
 a failure is repeated with ``mutant(data, seed, number)``. The environment variable ``ERRORMOTION_MUTANTS`` sets the
-number of mutants of each input (the quick default is that of the test; 1e5 and more for a long run).
+number of mutants of each input (the quick default is that of the test); a long run takes the time limit off::
+
+    ERRORMOTION_MUTANTS=1e5 pytest -n0 --timeout=0 -k damaged tests
 """
 
 import os
