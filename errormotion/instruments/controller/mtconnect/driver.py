@@ -77,7 +77,7 @@ class MTConnect(Driver):
         id="mtconnect",
         kind="controller",
         summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.controller.mtconnect:SimulatedAgent",
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
