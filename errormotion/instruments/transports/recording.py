@@ -232,4 +232,7 @@ def read_index(path: Path) -> dict[str, Path]:
     pairs = [line.partition(" ") for line in lines[1:]]
     if not lines or lines[0] != INDEX_FORMAT or not all(name for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
-    return {part: path.with_name(name) for part, _, name in pairs}
+    try:
+        return {part: path.with_name(name) for part, _, name in pairs}
+    except ValueError:
+        raise ReplayError(f"{path}: expected names of files beside the list; found a path") from None
