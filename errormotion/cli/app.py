@@ -345,12 +345,15 @@ def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: 
 def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
+    mutants: Annotated[
+        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
     from errormotion.cli.commands import plugins as command
 
-    if not command.check_plugin(plugin, address, json_):
+    if not command.check_plugin(plugin, address, mutants, json_):
         raise typer.Exit(INVALID)
 
 

@@ -21,13 +21,14 @@ after that write; and at the end no frame may remain. Everything else is a `Repl
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 from zlib import crc32
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
@@ -152,7 +153,16 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
 
 
 class ReplayTransport(Transport):
-    """Plays a recorded session back; see the module for the conditions."""
+    """Plays a recorded session back; see the module for the conditions.
+
+    Attributes
+    ----------
+    longest_wait : float
+        Longest time for which a read waits for a write, s. Where bytes were changed on purpose, it is short: an answer
+        that is missing does not come.
+    """
+
+    longest_wait: ClassVar[float] = math.inf
 
     def __init__(self, path: Path, *, timeout: float = 1.0) -> None:
         super().__init__(f"replay://{path}", timeout)
@@ -193,7 +203,7 @@ class ReplayTransport(Transport):
                 raise InstrumentError(f"The recording {self.url} is closed")
             if not self._reads:
                 raise EndOfRecordingError(f"{self.url}: the driver reads after the end of the recording")
-            if not self._change.wait_for(lambda: self._closed or self._reads[0][0] <= self._written, timeout):
+            if not self._change.wait_for(self._readable, min(timeout, self.longest_wait)):
                 raise InstrumentTimeoutError(f"{self.url}: no data before the driver has written {self._writes[0]!r}")
             if self._closed:
                 raise InstrumentError(f"The recording {self.url} is closed")
@@ -201,6 +211,9 @@ class ReplayTransport(Transport):
             if len(data) > max_bytes:
                 self._reads.appendleft((before, data[max_bytes:]))
             return data[:max_bytes]
+
+    def _readable(self) -> bool:
+        return self._closed or self._reads[0][0] <= self._written
 
     def close(self) -> None:
         """Close; idempotent.
