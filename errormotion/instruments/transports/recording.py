@@ -261,7 +261,10 @@ def read_index(path: Path) -> dict[str, Path]:
     expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
     if not lines or lines[0] != expected or not all(name and Path(name).name == name for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
-    return {part: path.with_name(name) for part, _, name in pairs}
+    try:
+        return {part: path.with_name(name) for part, _, name in pairs}
+    except ValueError:
+        raise ReplayError(f"{path}: expected names of files beside the list; found a path") from None
 
 
 def parts_of(path: Path, levels: int = 2) -> list[Path]:
