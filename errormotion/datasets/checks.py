@@ -118,19 +118,25 @@ def time_violations(name: str, variable: xr.Variable) -> list[str]:
 
 
 def storable_violations(ds: xr.Dataset) -> list[str]:
-    """Return attributes that a NetCDF file cannot hold: it knows text, numbers and flat arrays of numbers."""
+    """Return what a NetCDF file cannot hold: attributes but text, numbers and flat arrays of them, text with NUL."""
     owners: list[tuple[str, Mapping[Any, Any]]] = [("", ds.attrs)]
     owners += [(f"{name}: ", variable.attrs) for name, variable in ds.variables.items()]
-    return [
+    found = [
         f"{owner}attribute '{name}': expected text, a number or a flat array of them; found {_what(value)}"
         for owner, attrs in owners
         for name, value in attrs.items()
         if not _storable(value)
     ]
+    for name, variable in ds.variables.items():
+        if variable.dtype.kind in "UTO" and any("\0" in str(text) for text in variable.values.flat):
+            found.append(f"{name}: expected text without the character NUL")
+    return found
 
 
 def _storable(value: Any) -> bool:
-    if isinstance(value, (str, int, float, np.integer, np.floating)):
+    if isinstance(value, str):
+        return "\0" not in value
+    if isinstance(value, (int, float, np.integer, np.floating)):
         return not isinstance(value, bool)
     if isinstance(value, np.ndarray):
         return value.ndim <= 1 and value.dtype.kind in "fiuU"
@@ -143,6 +149,8 @@ def _storable(value: Any) -> bool:
 def _what(value: Any) -> str:
     if value is None or isinstance(value, (bool, np.bool_)):
         return str(value)
+    if isinstance(value, str):
+        return "text with the character NUL"
     return type(value).__name__
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Hashable, Sequence
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ from errormotion.datasets.schemas import (
     ERROR_DIMS,
     ERROR_ROWS,
     ERROR_UNITS,
+    INDEX,
+    OPTIONAL_ATTRIBUTES,
     SCHEMA,
     SIGN,
     Row,
@@ -68,7 +71,7 @@ def error_violations(ds: xr.Dataset) -> list[str]:
         if variable.attrs.get("units") is None:
             complaints.append(f"{name}: expected the attribute units = '{unit}'; found none")
         complaints += magnitude_violations(name, variable, _ROWS[name])
-    found += complaints + _coordinate_violations(ds)
+    found += complaints + _coordinate_violations(ds) + _comparison_violations(ds, dims)
     shape_complaints = _shape_violations(ds, dims)
     found += shape_complaints
     if not complaints and not shape_complaints:
@@ -138,6 +141,55 @@ def _coordinate_violations(ds: xr.Dataset) -> list[str]:
         row = Row("temperature", ("...", "sensor"), "degC", -60.0, 200.0, "")
         found += magnitude_violations("temperature", ds.variables["temperature"], row)
     return found
+
+
+def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
+    """Return what is wrong with what a comparison needs: start, reference, identities, and untouched values."""
+    found = []
+    start = ds.attrs.get("start")
+    if start is not None and not _is_instant(start):
+        found.append(f"attribute 'start': expected {OPTIONAL_ATTRIBUTES['start']}; found {start!r}")
+    for name, size in (("reference_interval", 2), ("reference_position", 1)):
+        if name in ds.attrs and not _is_rising(ds.attrs[name], size):
+            found.append(f"attribute '{name}': expected {OPTIONAL_ATTRIBUTES[name]}; found {ds.attrs[name]!r}")
+    for name in ("source_id", "source_reference"):
+        if name in ds.variables and ds.variables[name].dims != ("source",):
+            found.append(f"{name}: expected dims (source); found {dims_text(ds.variables[name])}")
+    if "source_id" in ds.coords and ds.variables["source_id"].dims == ("source",):
+        ids = [each for each in ds["source_id"].values.tolist() if each]
+        if len(set(ids)) < len(ids):
+            found.append("source_id: expected texts that differ, or empty ones; found one twice")
+    for name in (f"{dim}{INDEX}" for dim in dims):
+        if name not in ds.variables:
+            continue
+        variable = ds.variables[name]
+        numbers = np.asarray(variable.values, dtype=float) if variable.dtype.kind in "iuf" else np.empty(0)
+        if variable.dims != (name.removesuffix(INDEX),) or not (numbers % 1 == 0).all():
+            found.append(_TOUCHED.format(name))
+    lost = [name for name in ds.variables if str(name).endswith(INDEX) and str(name).removesuffix(INDEX) not in dims]
+    found += [_TOUCHED.format(name) for name in lost]
+    return found
+
+
+_TOUCHED = (
+    "{}: expected whole numbers along its own dimension; a mean or an interpolation of plain xarray changed them and "
+    "did not carry the covariance along. Use ds.em.mean, ds.em.to_times or ds.em.to_positions"
+)
+
+
+def _is_instant(value: Any) -> bool:
+    try:
+        return datetime.fromisoformat(value).tzinfo is not None
+    except (TypeError, ValueError):
+        return False
+
+
+def _is_rising(value: Any, size: int) -> bool:
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        return False
+    return numbers.shape == (size,) and bool(np.isfinite(numbers).all() and (np.diff(numbers) >= 0).all())
 
 
 def _shape_violations(ds: xr.Dataset, dims: tuple[Any, ...]) -> list[str]:

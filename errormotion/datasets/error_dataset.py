@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.error_checks import error_violations
-from errormotion.datasets.schemas import DOF, ERROR_ROWS, ERROR_UNITS, SCHEMA, SIGN
+from errormotion.datasets.schemas import DOF, ERROR_ROWS, ERROR_UNITS, INDEX, SCHEMA, SIGN
 from errormotion.errors import DatasetError
 
 _ROWS = {row.name: row for row in ERROR_ROWS}
@@ -41,6 +41,12 @@ def build_errors(
     source_groups: Sequence[str] | None = None,
     extras: Mapping[str, xr.DataArray] | None = None,
     component_description: str = "",
+    source_ids: Mapping[str, str] | None = None,
+    reference_sources: Sequence[str] = (),
+    reference_interval: tuple[float, float] | None = None,
+    reference_position: float | None = None,
+    start: str = "",
+    notes: Sequence[str] = (),
 ) -> xr.Dataset:
     """Return an error dataset that follows its schema.
 
@@ -69,6 +75,19 @@ def build_errors(
         Further results, with their own units.
     component_description : str, optional
         What a component is that the schema does not list.
+    source_ids : mapping of str to str, optional
+        Identity of a source by its name: what makes it the same draw in another dataset, such as the hash of a
+        calibration or the number of a certificate. Sources without one are shared with no other dataset.
+    reference_sources : sequence of str, optional
+        Names of the sources that are the uncertainty of the reference state.
+    reference_interval : tuple of float, optional
+        First and last time of the reference state, s on the ``time`` of the dataset; alike for one instant.
+    reference_position : float, optional
+        Position whose errors are zero by definition, m or rad, for errors over ``position``.
+    start : str, optional
+        Instant of time 0: ISO 8601 with an offset from UTC.
+    notes : sequence of str, optional
+        What a reader has to know, one sentence each.
 
     Returns
     -------
@@ -89,13 +108,14 @@ def build_errors(
         name: (dims, E[..., k].copy(), {"units": unit})
         for k, (name, unit) in enumerate(zip(DOF, ERROR_UNITS, strict=True))
     }
+    variables |= {f"{dim}{INDEX}": ((dim,), np.arange(size)) for dim, size in zip(dims, E.shape, strict=False)}
     variables["covariance"] = ((*dims, "dof", "dof_"), C, {"long_name": "total covariance; m^2, m rad, rad^2"})
     own_coords: dict[str, Any] = {"dof": list(DOF), "dof_": list(DOF)}
     if influence is not None:
         variables["influence"], source_coords = _influence(influence, unseen, dims, sources, source_groups)
-        own_coords |= source_coords
+        own_coords |= source_coords | _identities(list(sources or ()), source_ids or {}, reference_sources)
     own_coords |= {name: _coordinate(name, value) for name, value in coords.items()}
-    attrs = {
+    attrs: dict[str, Any] = {
         "schema": SCHEMA,
         "component": component,
         "machine": machine,
@@ -109,6 +129,14 @@ def build_errors(
     }
     if component_description:
         attrs["component_description"] = component_description
+    if reference_interval is not None:
+        attrs["reference_interval"] = np.array(reference_interval, dtype=float)
+    if reference_position is not None:
+        attrs["reference_position"] = float(reference_position)
+    if start:
+        attrs["start"] = start
+    if notes:
+        attrs["notes"] = list(notes)
     try:
         ds = xr.Dataset(variables, coords=own_coords, attrs=attrs)
         clash = sorted(set(extras or {}) & set(ds.variables))
@@ -167,7 +195,9 @@ def build_deviations(
     }
     coords = dict(coords)
     if influence is not None:
-        coords |= {"source": list(sources or ()), "source_group": ("source", list(source_groups or ()))}
+        names = list(sources or ())
+        coords |= {"source": names, "source_group": ("source", list(source_groups or ()))}
+        coords |= _identities(names, attributes.pop("source_ids", {}), attributes.pop("reference_sources", ()))
         unknown = np.broadcast_to(np.isnan(value), np.shape(influence))
         found["deviation_influence"] = (("source", *dims), np.where(unknown, np.nan, influence), {"units": "m"})
     try:
@@ -213,11 +243,21 @@ def _influence(
     return variable, {"source": names, "source_group": ("source", list(groups))}
 
 
+def _identities(names: list[str], ids: Mapping[str, str], references: Sequence[str]) -> dict[str, Any]:
+    """Return the coordinates that say which sources are draws of other datasets too, and which are the reference."""
+    if stray := sorted({*ids, *references} - set(names)):
+        raise DatasetError(f"source_ids, reference_sources: expected names among {names}; found {', '.join(stray)}")
+    return {
+        "source_id": ("source", [ids.get(name, "") for name in names]),
+        "source_reference": ("source", np.array([name in references for name in names], dtype=np.int8)),
+    }
+
+
 def _coordinate(name: str, value: Any) -> Any:
     if not isinstance(value, tuple):
         value = (name, value)
     names, array, attrs = (*value, {})[:3]
     row = _ROWS.get(name)
     if row is not None and row.unit:
-        attrs = {"units": row.unit, **attrs}
+        attrs = {"units": row.unit, "long_name": row.meaning, **attrs}
     return (names, array, attrs)

@@ -20,6 +20,12 @@ SIGN = "actual minus commanded, tool side relative to workpiece side"
 ERROR_DIMS = ("time", "position", "target", "beam")
 """Dimensions that errors may have; others are declared by a coordinate of their own name."""
 
+INDEX = "_index"
+"""Ending of the variables that number the values along each dimension, such as ``time_index``.
+
+Selecting keeps them whole; an interpolation or a mean that knows nothing of the covariance does not, and shows.
+"""
+
 ERROR_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 """Units of the six freedoms."""
 
@@ -162,6 +168,25 @@ ERROR_ROWS = (
         required=False,
     ),
     Row("source_group", ("source",), "", -NO_LIMIT, NO_LIMIT, "what a source belongs to in the budget", required=False),
+    Row(
+        "source_id",
+        ("source",),
+        "",
+        -NO_LIMIT,
+        NO_LIMIT,
+        "what makes a source the same draw in another dataset: hash of a calibration, number of a certificate; "
+        "empty where it is shared with no other",
+        required=False,
+    ),
+    Row(
+        "source_reference",
+        ("source",),
+        "",
+        0.0,
+        1.0,
+        "1 for the uncertainty of the reference state, else 0",
+        required=False,
+    ),
     Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "since the reference state, increasing", required=False),
     *(
         Row(name, ("position|target",), "m", *POSITION, f"commanded {name.upper()}", required=False)
@@ -182,6 +207,15 @@ ERROR_ATTRIBUTES = {
     "sign": f"`{SIGN}`",
     "provenance": "JSON text: settings with defaults, hash of the raw dataset, instruments, software, seed, steps",
 }
+
+OPTIONAL_ATTRIBUTES = {
+    "start": "instant of time 0: ISO 8601 with an offset from UTC",
+    "reference_interval": "first and last time of the reference state, s on `time`",
+    "reference_position": "position whose errors are zero by definition",
+    "notes": "list of sentences for the reader",
+    "component_description": "what a component is that the schema does not list",
+}
+"""Attributes that an error dataset may have."""
 
 
 def variants(schema: str) -> tuple[RawSchema, ...]:

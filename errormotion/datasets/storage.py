@@ -309,6 +309,8 @@ def _tidy(ds: xr.Dataset) -> xr.Dataset:
         ds = ds.assign({name: _text(variable) for name, variable in texts.items()}).set_coords(coords)
         ds = ds.drop_indexes([name for name in coords if name in ds.xindexes])
     ds.attrs = _tidy_attrs(ds.attrs)
+    if isinstance(notes := ds.attrs.get("notes"), str):  # a list of one sentence comes back as a text
+        ds.attrs["notes"] = [notes]
     for variable in ds.variables.values():
         variable.attrs = _tidy_attrs(variable.attrs)
     return ds

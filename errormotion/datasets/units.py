@@ -29,10 +29,19 @@ EDGE = {"edge": True}
 
 ArrayLike = float | np.ndarray
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,2})?"
-_TERM = r"[^\W\d_]+(?:(?:\^|\*\*)?-?\d+)?|°C?|%"
-_UNIT = rf"(?:1?/)?\s*(?:{_TERM})(?:\s*[*·/ ]\s*(?:{_TERM}))*"
-_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*({_UNIT})\s*")
+LONGEST = 100
+"""Longest text of a quantity or a unit, characters."""
+
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2}(?![0-9]))?")
+# A name and its exponent, as pint (m^2, m**2), CF and UDUNITS (m2, s-1) and people (m²) write it.
+_TERM = re.compile(r"([^\W\d_]+(?:_[^\W\d_]+)*|°C?|%)(?:(?:\^|\*\*)?([+-]?[0-9]{1,2})(?![0-9]))?")
+_LEAD = re.compile(r"1?/\s*")
+_SEPARATOR = re.compile(r"\s*[*·⋅/.]\s*|\s+")
+_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁺⁻", "0123456789+-")
+# Names of UDUNITS that pint does not have.
+_CELSIUS = ("degree_C", "degrees_C", "degreesC", "degree_c", "degree_celsius", "degrees_celsius", "degrees_Celsius")
+_NAMES = {**dict.fromkeys((*_CELSIUS, "Celsius", "degree_Celsius"), "degC"), "arc_second": "arcsecond"}
+_NAMES |= {"arc_minute": "arcminute", "arc_degree": "degree"}
 
 # A turn is no angle here: pint's rpm carries a factor 2 pi, so spindle speeds have their own table, in 1/min.
 _PER_MINUTE = {
@@ -61,17 +70,21 @@ class Quantity:
 
     def parse(self, text: str) -> float:
         """Return the value of a text such as ``"5 mm"``; ValueError states what was expected."""
-        match = _QUANTITY.fullmatch(text)
-        expected = f"expected {self.kind} with its unit, such as '{self.example}'; found '{text}'"
-        if match is None:
-            hint = " (the decimal sign is a point)" if re.match(r"\s*[+-]?\d+,\d", text) else ""
-            raise ValueError(expected + hint)
+        shown = text if len(text) <= LONGEST else text[:LONGEST] + "..."
+        expected = f"expected {self.kind} with its unit, such as '{self.example}'; found '{shown}'"
+        plain = text.strip() if len(text) <= LONGEST else ""
+        match = _NUMBER.match(plain)
+        if match is None or match.end() == len(plain):
+            raise ValueError(expected)
+        unit = plain[match.end() :].strip()
         try:
-            factor, offset = _linear(match[2], self.unit)
-            value = float(Fraction(match[1]) * factor + offset)
+            factor, offset = _linear(unit, self.unit)
+            return float(Fraction(match[0]) * factor + offset)
         except DatasetError as error:
-            raise ValueError(f"{expected}: {error}") from error
-        return value
+            hint = " (the decimal sign is a point)" if re.match(r",[0-9]", unit) else f": {error}"
+            raise ValueError(expected + hint) from error
+        except OverflowError:
+            raise ValueError(f"{expected}: the number is too large") from None
 
     def _validate(self, value: Any, info: core_schema.ValidationInfo) -> Any:
         if isinstance(value, str):
@@ -129,12 +142,39 @@ def _registry() -> pint.UnitRegistry[Any]:
 def _unit(text: str) -> pint.Unit:
     import pint
 
-    if not re.fullmatch(_UNIT, text):
-        raise DatasetError(f"'{text}' is not a known unit")
+    expression = _expression(text)
     try:
-        return _registry().parse_units("1" + text if text.startswith("/") else text)
-    except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
+        return _registry().parse_units(expression)
+    # pint's own errors, and those of Python's that it lets through for names such as 'nan'
+    except (pint.PintError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise DatasetError(f"'{text}' is not a known unit") from error
+
+
+def _expression(text: str) -> str:
+    """Return a unit as an expression of pint; factors count from left to right, as in UDUNITS.
+
+    Raises
+    ------
+    DatasetError
+        Anything but names with whole exponents, and signs between them.
+    """
+    if len(text) > LONGEST:
+        raise DatasetError(f"'{text[:LONGEST]}...' is not a known unit")
+    plain = text.strip().translate(_SUPERSCRIPTS)
+    if plain == "1":
+        return ""
+    lead = _LEAD.match(plain)
+    sign, position = (-1, lead.end()) if lead else (1, 0)
+    factors: list[str] = []
+    while match := _TERM.match(plain, position):
+        factors.append(f"{_NAMES.get(match[1], match[1])}**({sign * int(match[2] or 1)})")
+        if match.end() == len(plain):
+            return " * ".join(factors)
+        between = _SEPARATOR.match(plain, match.end())
+        if between is None:
+            break
+        sign, position = (-1 if "/" in between[0] else 1), between.end()
+    raise DatasetError(f"'{text}' is not a known unit")
 
 
 @cache
@@ -149,8 +189,15 @@ def _linear(source: str, target: str) -> tuple[Fraction, Fraction]:
     # Compared in base units, not in dimensions: a per cent is no angle.
     if registry.get_base_units(from_)[1] != registry.get_base_units(to)[1]:
         raise DatasetError(f"'{source}' is not convertible to '{target}'")
-    zero, one = (Fraction(registry.Quantity(Fraction(number), from_).to(to).magnitude) for number in (0, 1))
-    return one - zero, zero
+    try:
+        zero, one, two = (Fraction(registry.Quantity(Fraction(n), from_).to(to).magnitude) for n in (0, 1, 2))
+        factor = one - zero
+        float(factor), float(1 / factor), float(zero)
+    except (ArithmeticError, TypeError, ValueError) as error:  # logarithmic units, powers beyond all numbers
+        raise DatasetError(f"'{source}' is not convertible to '{target}'") from error
+    if two - one != factor:
+        raise DatasetError(f"'{source}' is not convertible to '{target}' by a factor and an offset")
+    return factor, zero
 
 
 def convert(values: ArrayLike, source: str, target: str) -> ArrayLike:

@@ -165,14 +165,19 @@ def brought(name: str, *groups: Group) -> Iterator[tuple[Any, Any]]:
             yield cls, value
 
 
-@cache
 def _attribute(cls: Any, name: str) -> Any:
     """Return an attribute of a plugin class; None where it has none, or, with a warning, where it does not load."""
     try:
         return getattr(cls, name, None)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
-        warnings.warn(f"The plugin '{cls.info.id}': `{name}` is ignored: {error}", PluginWarning, stacklevel=3)
+        _warn(f"The plugin '{cls.info.id}': `{name}` is ignored: {error}")
         return None
+
+
+@cache
+def _warn(message: str) -> None:
+    """Warn once."""
+    warnings.warn(message, PluginWarning, stacklevel=4)
 
 
 def owner_of_schema(schema: str) -> Any:
@@ -216,5 +221,5 @@ def refresh() -> None:
     """Forget what was found: entry points are read again at the next call."""
     _found.cache_clear()
     _loaded.cache_clear()
-    _attribute.cache_clear()
+    _warn.cache_clear()
     kind_registry.refresh()

@@ -107,3 +107,58 @@ def test_arrays_convert_elementwise() -> None:
 def test_a_unit_that_measures_nothing_here_is_refused(unit: str) -> None:
     with pytest.raises(DatasetError, match=f"'{unit}'".replace(")", r"\)")):
         units.si_unit(unit)
+
+
+@pytest.mark.parametrize(
+    ("found", "usual"),
+    [
+        ("m2", "m^2"),
+        ("m.s-1", "m/s"),
+        ("m s-1", "m/s"),
+        ("m/s2", "m/s^2"),
+        ("W m-2 K-1", "W/m^2/K"),
+        ("m²", "m^2"),
+        ("µm·m⁻¹·K⁻¹", "um/m/K"),
+        ("rad2", "rad^2"),
+        ("um K-1", "um/K"),
+        ("um/degC", "um/K"),
+        ("degree_C", "degC"),
+        ("degrees_Celsius", "degC"),
+        ("arc_second", "arcsec"),
+        ("µm", "um"),
+        ("percent", "%"),
+        ("1", "m/m"),
+        ("s-1", "Hz"),
+    ],
+)
+def test_units_as_cf_and_udunits_write_them_are_read(found: str, usual: str) -> None:
+    assert units.convert(3.0, found, usual) == pytest.approx(3.0, rel=1e-15)
+    assert units.convert(3.0, usual, found) == pytest.approx(3.0, rel=1e-15)
+
+
+def test_text_with_a_unit_of_udunits_is_read() -> None:
+    assert units.EXPANSION.parse("2.1 um K-1") == 2.1e-6
+    assert units.VELOCITY.parse("1500 mm.min-1") == 0.025
+    assert units.convert(50.0, "%", "1") == 0.5
+
+
+@pytest.mark.parametrize(
+    "unit",
+    [
+        *("5 mm-1", "mdegC", "nan", "NaN m", "inf", "m.", "1e-3 m", "m^99999999", "mm-1", "dBm", "pH", "Ym99"),
+        *("m\0", "", "m--1", "seconds since 2020-01-01", "m" * 10_000, "m " * 10_000),
+    ],
+)
+def test_a_nonsense_unit_gives_an_error_of_the_project(unit: str) -> None:
+    for target in ("m", "degC", "1", "W"):
+        with pytest.raises(DatasetError, match=r"not (a known unit|convertible)"):
+            units.convert(1.0, unit, target)
+
+
+@pytest.mark.parametrize(
+    "text", ["5 mm-1", "5 nan", "5 mdegC", "9" * 90 + "e99 Ym9", "9" * 10_000 + " mm", "5" + " " * 10_000]
+)
+def test_a_nonsense_quantity_is_refused_with_an_example(text: str) -> None:
+    for quantity in units.KINDS:
+        with pytest.raises(ValueError, match=f"expected {quantity.kind} with its unit"):
+            quantity.parse(text)

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
+from errormotion.instruments.point_lds.optoncdt import OptoNCDT
 from errormotion.instruments.simulators import world
 from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFrame, FrameSettings
 from errormotion.plugins import Samples
@@ -145,15 +146,19 @@ def test_the_identity_names_all_sensors_and_is_json() -> None:
     assert json.loads(json.dumps(asdict(identity)))["details"]["address"] == ADDRESS
 
 
-def test_sensors_are_warm_two_hours_after_they_were_switched_on() -> None:
+def test_sensors_that_report_no_operating_time_are_taken_as_cold() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
-        assert frame.warm
-    with FiveSensorFrame(f"{ADDRESS}&warm=0", settings()) as frame:
         assert not frame.warm
-        world("cframe", 3, warm=False).elapse(7199.0)
+    late = datetime.now(UTC) - timedelta(hours=1)
+    with FiveSensorFrame(ADDRESS, settings(powered_since=late)) as frame:
         assert not frame.warm
-        world("cframe", 3, warm=False).elapse(1.0)
-        assert frame.warm
+
+
+def test_sensors_that_report_their_operating_time_are_warm_after_two_hours(monkeypatch: pytest.MonkeyPatch) -> None:
+    with FiveSensorFrame(ADDRESS, settings()) as frame:
+        for seconds, warm in ((7199.0, False), (7200.0, True)):
+            monkeypatch.setattr(OptoNCDT, "on_for", lambda _, seconds=seconds: seconds, raising=False)
+            assert frame.warm == warm
 
 
 def test_a_person_may_say_when_the_sensors_were_switched_on() -> None:

@@ -1,17 +1,22 @@
 """Requests over HTTP: connections that end, answers that are none, streams of parts, recordings."""
 
-from collections.abc import Callable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports import parse_address
+from errormotion.instruments.transports.http import client
 from errormotion.instruments.transports.http.client import HttpTransport
 from errormotion.instruments.transports.http.serving import HttpServer
 
 Respond = Callable[[str, Mapping[str, str]], Iterator[bytes] | None]
 MULTIPART = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x\r\n"
+
+
+CHUNKED = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n"
 
 
 def answer(body: bytes, status: bytes = b"200 OK", head: bytes = b"") -> bytes:
@@ -26,7 +31,7 @@ class Site:
     """A server of which a test states what it answers, path by path."""
 
     def __init__(self) -> None:
-        self.pages: dict[str, list[bytes] | None] = {}
+        self.pages: dict[str, Iterable[bytes] | None] = {}
         self.asked: list[tuple[str, Mapping[str, str]]] = []
         self.server = HttpServer("site", self._respond)
         self.url = self.server.url.replace("tcp://", "http://")
@@ -96,7 +101,24 @@ def test_a_connection_that_ended_while_idle_is_asked_again(site: Site, http: Htt
         ([], InstrumentTimeoutError, "sent no data"),
         ([answer(b"12345")[:-2], b""], ProtocolError, "cut off, 2 bytes before its end"),
         ([answer(b"x" * 2000)], ProtocolError, "larger than 1000 bytes"),
-        ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n"], ProtocolError, "cut off"),
+        ([CHUNKED + b"zz\r\n"], ProtocolError, "damaged: expected a chunk size"),
+        ([CHUNKED + b"5\r\nxxxxx\r\n", b""], ProtocolError, "cut off between two chunks"),
+        ([CHUNKED + b"5\r\nxxx", b""], ProtocolError, "cut off within a chunk"),
+        ([CHUNKED + b"-1\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-1'"),
+        ([CHUNKED + b"-5\r\n" + b"x" * 50], ProtocolError, "expected a chunk size; found b'-5'"),
+        ([CHUNKED + b"0x5\r\nxxxxx\r\n0\r\n\r\n"], ProtocolError, "chunk size"),
+        ([CHUNKED + b"1_0\r\n" + b"x" * 50], ProtocolError, "chunk size"),
+        ([CHUNKED + b"fffffffff\r\n"], ProtocolError, "chunk size"),
+        ([CHUNKED + b"5\r\nxxxxxxxxxx\r\n"], ProtocolError, "end of a chunk"),
+        ([CHUNKED + b"ffffff\r\n" + b"x" * 3000], ProtocolError, "larger than 1000 bytes"),
+        ([CHUNKED + b"0\r\n", *[b"X: 1\r\n"] * 200], ProtocolError, "more than 100 lines"),
+        ([b"HTTP/1.1 200 OK\r\n", *[b"X: 1\r\n"] * 200], ProtocolError, "more than 100 lines"),
+        ([b"HTTP/1.1 200 OK\r\nX: ", b"y" * 9000], ProtocolError, "longer than 8192 bytes"),
+        ([b"HTTP/1.1 100 Continue\r\n\r\n"] * 20, ProtocolError, "only preliminary"),
+        ([answer(b"1", head=b"Content-Length: 2\r\n")], ProtocolError, "two lengths"),
+        ([b"HTTP/1.1 200 OK\r\nContent-Length: -1\r\n\r\n"], ProtocolError, "length of the body; found '-1'"),
+        ([b"HTTP/1.1 200 OK\r\nTransfer-Encoding: gzip\r\n\r\n"], ProtocolError, "in chunks; found 'gzip'"),
+        ([answer(b"1", head=b"Content-Encoding: gzip\r\n")], ProtocolError, "not compressed"),
     ],
 )
 def test_what_is_no_answer_is_an_error_and_the_next_one_is_right(
@@ -106,6 +128,64 @@ def test_what_is_no_answer_is_an_error_and_the_next_one_is_right(
     with pytest.raises(error, match=message):
         http.get("/bad", limit=1000)
     assert http.get("/good").body == b"1"
+
+
+def slowly(head: bytes, piece: bytes, count: int) -> Iterator[bytes]:
+    yield head
+    for _ in range(count):
+        time.sleep(0.02)
+        yield piece
+
+
+@pytest.mark.parametrize(
+    ("head", "piece"),
+    [
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n", b"x"),
+        (b"HTTP/1.1 200 OK\r\n\r\n", b"x"),
+        (b"HTTP/1.1 200 OK\r\nX: ", b"y"),
+        (CHUNKED, b"1\r\nx\r\n"),
+        (CHUNKED + b"5;", b"x"),
+        (b"H", b"T"),
+    ],
+)
+@pytest.mark.parametrize("streamed", [False, True])
+def test_an_answer_that_drips_ends_at_its_deadline(
+    site: Site, head: bytes, piece: bytes, streamed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
+    site.pages["/slow"] = slowly(head, piece, 150)  # 3 s; the deadline is 0.45 s
+    started = time.monotonic()
+    with pytest.raises(InstrumentTimeoutError, match="not complete within the time limit"):
+        list(http.parts("/slow")) if streamed else http.get("/slow")
+    assert time.monotonic() - started < 2.0
+    http.close()
+
+
+def test_a_part_that_drips_ends_at_its_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
+    site.pages["/sample"] = slowly(MULTIPART + b"\r\n" + part(b"1") + b"--x\r\nContent-length: 999\r\n\r\n", b"x", 150)
+    stream = http.parts("/sample")
+    assert next(stream) == b"1"
+    with pytest.raises(InstrumentTimeoutError, match="not complete within the time limit"):
+        next(stream)
+    http.close()
+
+
+def test_a_stream_that_pauses_between_its_parts_has_no_deadline(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_ANSWER_TIMEOUTS", 1.5)
+    http = HttpTransport(site.url, timeout=0.3)
+    site.pages["/sample"] = slowly(MULTIPART + b"\r\n", part(b"1"), 40)  # 0.8 s
+    stream = http.parts("/sample")
+    assert [next(stream) for _ in range(40)] == [b"1"] * 40
+    http.close()
+
+
+def test_bytes_after_an_answer_are_not_the_next_answer(site: Site, http: HttpTransport) -> None:
+    site.pages |= {"/one": [answer(b"1") + answer(b"stale")], "/two": [answer(b"2")]}
+    assert http.get("/one").body == b"1"
+    assert http.get("/two").body == b"2"
 
 
 @pytest.mark.parametrize("chunked", [False, True])
@@ -135,6 +215,9 @@ def test_an_answer_of_one_piece_is_a_stream_of_one_part(site: Site, http: HttpTr
         (b"--x\r\nContent-length: -1\r\n\r\n", "found None"),
         (b"--x\r\nContent-type: text/xml\r\n\r\n", "found None"),
         (b"x" * 5000, "header line of a part"),
+        (b"\r\n" * 40, "expected the boundary"),
+        (b"--x\r\n" + b"X: 1\r\n" * 200, "more than 100 lines"),
+        (b"--x\r\nContent-length: 1_0\r\n\r\n", "found None"),
     ],
 )
 def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: bytes, message: str) -> None:

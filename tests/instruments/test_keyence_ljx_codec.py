@@ -27,13 +27,14 @@ def layout(points: int = 16, kind: int = 0) -> StreamLayout:
 
 def plain_pack(raws: list[int], intensities: list[int], trigger: int, encoder: int) -> bytes:
     """One profile, written with Python's integers: the reference for the compiled loop."""
-    heights = sum((raw & 0xFFFFF) << 20 * i for i, raw in enumerate(raws))
-    body = heights.to_bytes(-(-20 * len(raws) // 32) * 4, "little")
+    bits = sum((raw & 0xFFFFF) << 20 * i for i, raw in enumerate(raws))
+    size = -(-20 * len(raws) // 32)
     if intensities:
         pairs = [*intensities, 0] if len(intensities) % 2 else intensities
         fields = [(a << 10 | b) if i + 1 < len(intensities) else a for i, a, b in zip(*_pairs(pairs), strict=True)]
-        light = sum(field << 10 * 2 * k for k, field in enumerate(fields))
-        body += light.to_bytes(-(-10 * len(intensities) // 32) * 4, "little")
+        bits |= sum(field << 10 * 2 * k for k, field in enumerate(fields)) << 20 * len(raws)
+        size += -(-10 * len(intensities) // 32)
+    body = bits.to_bytes(4 * size, "little")
     words = struct.pack("<IIiIII", 0, trigger, encoder, 0, 0, 0) + body
     total = sum(struct.unpack(f"<{len(words) // 4}I", words)) % (1 << 32)
     return words + struct.pack("<I", total)

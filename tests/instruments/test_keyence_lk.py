@@ -183,7 +183,7 @@ def test_after_refused_settings_the_old_ones_go_on() -> None:
 
 
 def test_an_output_that_the_controller_does_not_have_is_refused() -> None:
-    with pytest.raises(InstrumentError, match=r"refuses 'SR,OI,02' with error 22: a parameter is out of range"):
+    with pytest.raises(InstrumentError, match=r"refuses 'SR,OI,02' with error 62: a parameter is out of range"):
         KeyenceLK(SIX, LKSettings(output=2)).open()
 
 
@@ -191,7 +191,7 @@ def test_the_wrong_generation_is_refused() -> None:
     settings = LKSettings(controller="LK-G3000", head="LK-G30", set_up="trust")
     with (
         KeyenceLK(SIX, settings) as sensor,
-        pytest.raises(InstrumentError, match="refuses 'M1' with error 00: unknown command"),
+        pytest.raises(InstrumentError, match="refuses 'M1' with error 50: unknown command"),
     ):
         sensor.read()
 
@@ -264,7 +264,7 @@ def test_split_answers_change_nothing() -> None:
         np.testing.assert_allclose(values(take(sensor, 1, block=12)), SHOWN * 2, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("code", ["00", "01", "20", "21", "22", "88", "99", "47"])
+@pytest.mark.parametrize("code", ["00", "01", "20", "21", "22", "50", "51", "60", "61", "62", "88", "99", "47"])
 def test_every_error_reply_is_an_error_with_its_code_and_no_reading(code: str) -> None:
     with (
         KeyenceLK(f"{SIX}&fault=error&fault_at=5&code={code}", QUICK) as sensor,
@@ -322,7 +322,7 @@ def test_a_controller_left_in_its_setting_mode_is_brought_to_measure() -> None:
     with KeyenceLK(SIX, PATIENT) as sensor:
         sensor.transport.write(b"Q0\r")
         assert sensor.transport.read_until(b"\r") == b"Q0\r"
-        with pytest.raises(InstrumentError, match="refuses 'MS,01' with error 01: not possible in this mode"):
+        with pytest.raises(InstrumentError, match="refuses 'MS,01' with error 51: not possible in this mode"):
             sensor.read()
         sensor.identify()
         assert sensor.read() == pytest.approx(1.2345e-3)
@@ -346,17 +346,17 @@ def test_a_babbling_device_is_no_controller() -> None:
     [
         ("MS,01", "MS,01,-01.5000"),
         ("ms,01", "MS,01,-01.5000"),
-        ("MS", "ER,MS,21"),
-        ("MS,01,02", "ER,MS,21"),
-        ("MS,1", "ER,MS,20"),
-        ("MS,02", "ER,MS,22"),
-        ("M1", "ER,M1,00"),
-        ("WS,01", "WS,01"),
-        ("SR,OI,01", "ER,SR,01"),
-        ("R0", "ER,R0,01"),
+        ("MS", "ER,MS,61"),
+        ("MS,01,02", "ER,MS,61"),
+        ("MS,1", "ER,MS,60"),
+        ("MS,02", "ER,MS,62"),
+        ("M1", "ER,M1,50"),
+        ("WS,01", "WS"),
+        ("SR,OI,01", "ER,SR,51"),
+        ("R0", "ER,R0,51"),
         ("Q0", "Q0"),
-        ("HELLO", "ER,HELLO,00"),
-        ("", "ER,,00"),
+        ("HELLO", "ER,HELLO,50"),
+        ("", "ER,,50"),
     ],
 )
 def test_the_controller_answers_as_the_manual_says(request_text: str, answer: str) -> None:
@@ -372,17 +372,17 @@ def test_the_controller_answers_in_its_setting_mode_as_the_manual_says() -> None
     try:
         talk = [
             ("Q0", "Q0"),
-            ("Q0", "ER,Q0,01"),
-            ("MS,01", "ER,MS,01"),
+            ("Q0", "ER,Q0,51"),
+            ("MS,01", "ER,MS,51"),
             ("SR,OI,01", "SR,OI,01,2"),
             ("SR,OF,01", "SR,OF,01,-00.2500"),
-            ("SR,OF", "ER,SR,21"),
-            ("SR,OF,03", "ER,SR,22"),
-            ("SR,ZZ,01", "ER,SR,22"),
-            ("SW,OF,01,0", "ER,SW,22"),
+            ("SR,OF", "ER,SR,61"),
+            ("SR,OF,03", "ER,SR,62"),
+            ("SR,ZZ,01", "ER,SR,62"),
+            ("SW,OF,01,0", "ER,SW,60"),
             ("SW,OF,01,+005000", "SW,OF"),
             ("SR,OF,01", "SR,OF,01,+00.5000"),
-            ("SW,OI,01,9", "ER,SW,22"),
+            ("SW,OI,01,9", "ER,SW,62"),
             ("SW,OI,01,1", "SW,OI"),
             ("R0", "R0"),
             ("MS,01", "MS,01,-001.000"),

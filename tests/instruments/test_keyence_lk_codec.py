@@ -5,6 +5,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.point_lds.keyence_lk import codec
@@ -96,6 +97,21 @@ def test_whatever_comes_is_a_number_a_reason_or_a_protocol_error(text: str) -> N
     assert not value > MM4.largest
 
 
+@pytest.mark.parametrize("vector", vectors("keyence_lk", "answer"), ids=str)
+def test_answers_that_clients_of_others_read_are_read(vector: Vector) -> None:
+    expected = vector.expected
+    display = next(each for each in DISPLAYS.values() if each.decimals == expected["decimals"])
+    text = codec.parse_answer(expected["request"], codec.decode(vector.data + codec.LINE_END))
+    assert codec.parse_value(text, display) == (pytest.approx(expected["value"] * display.unit, rel=1e-15), 0)
+
+
+@pytest.mark.parametrize("vector", vectors("keyence_lk", "error"), ids=str)
+def test_errors_of_both_series_are_named(vector: Vector) -> None:
+    with pytest.raises(InstrumentError) as caught:
+        codec.parse_answer(vector.expected["request"], vector.data.decode())
+    assert "unknown code" not in str(caught.value)
+
+
 # ---------------------------------------------------------------------- requests and answers
 
 
@@ -126,6 +142,11 @@ def test_an_answer_to_something_else_is_a_protocol_error(text: str) -> None:
         ("20", "wrong length"),
         ("21", "wrong number of parameters"),
         ("22", "is out of range"),
+        ("50", "unknown command"),
+        ("51", "not possible in this mode"),
+        ("60", "wrong length"),
+        ("61", "wrong number of parameters"),
+        ("62", "is out of range"),
         ("88", "timeout"),
         ("99", "another error"),
         ("47", "unknown code"),

@@ -7,7 +7,7 @@ class TestKit(InstrumentConformance):
 
     subject = InstrumentSubject(
         KeyenceLK,
-        "sim://cframe/lk?seed=3&wire=pty&readings=-9.9999,nan,9.5,-12,12,0",
+        "sim://cframe/lk?seed=3&wire=pty&readings=-9.9999,1,9.5,nan,-12,12,0",
         settings={"timeout": 0.5},
         name="pty",
     )

@@ -6,6 +6,7 @@ import struct
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import ProtocolError
 from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
@@ -31,6 +32,84 @@ def decoded(data: bytes) -> codec.Packet:
     size, kind = codec.decode_header(data[: codec.HEADER.size])
     assert size == len(data) - codec.HEADER.size
     return codec.decode_packet(kind, data[codec.HEADER.size :])
+
+
+@pytest.mark.parametrize("vector", vectors("leica_emscon", "command"), ids=str)
+def test_commands_are_those_of_the_published_interface(vector: Vector) -> None:
+    values = dict(vector.expected)
+    number = values.pop("number")
+    assert codec.encode_command(number, **values) == vector.data
+    assert codec.decode_command(vector.data) == (number, values)
+
+
+@pytest.mark.parametrize("vector", vectors("leica_emscon", "answer"), ids=str)
+def test_answers_are_those_of_the_published_interface(vector: Vector) -> None:
+    values = dict(vector.expected)
+    packet = decoded(vector.data)
+    assert (packet.kind, packet.command, packet.status) == (codec.COMMAND, values.pop("number"), statuses.OK)
+    assert {name: packet.values[name] for name in values} == values
+
+
+@pytest.mark.parametrize("vector", vectors("leica_emscon", "result"), ids=str)
+def test_results_are_those_of_the_published_interface(vector: Vector) -> None:
+    values = dict(vector.expected)
+    packet = decoded(vector.data)
+    assert (packet.kind, packet.command, packet.status) == (values.pop("type"), -1, values.pop("status"))
+    assert {name: packet.values[name] for name in values} == values
+
+
+def test_points_and_errors_are_those_of_the_published_interface() -> None:
+    (vector,) = vectors("leica_emscon", "points")
+    packet = decoded(vector.data)
+    assert (packet.values["count"], packet.values["mode"]) == (vector.expected["count"], vector.expected["mode"])
+    for name, field in (("statuses", "status"), ("microseconds", "microseconds"), ("distances", "val3")):
+        assert [point[field] for point in packet.points] == vector.expected[name]
+    (vector,) = vectors("leica_emscon", "error")
+    packet = decoded(vector.data)
+    assert (packet.kind, packet.command, packet.status) == (codec.ERROR, codec.UNKNOWN, vector.expected["status"])
+
+
+#: Sizes in bytes of the structures of ES_C_API_Def.h 3.6 (4-byte alignment): command, answer.
+SIZES = {
+    codec.GET_SYSTEM_STATUS: (12, 56),
+    codec.SET_UNITS: (32, 16),
+    codec.GET_UNITS: (12, 36),
+    codec.INITIALIZE: (12, 16),
+    codec.SET_ENVIRONMENT: (36, 16),
+    codec.GET_ENVIRONMENT: (12, 40),
+    codec.SET_REFRACTION: (28, 16),
+    codec.GET_REFRACTION: (12, 32),
+    codec.SET_MODE: (16, 16),
+    codec.SET_COORDINATES: (16, 16),
+    codec.GET_COORDINATES: (12, 20),
+    codec.SET_STATIONARY: (20, 16),
+    codec.SET_CONTINUOUS_TIME: (28, 16),
+    codec.SET_REFLECTOR: (16, 16),
+    codec.GET_REFLECTOR: (12, 20),
+    codec.GET_REFLECTORS: (12, 100),
+    codec.SET_SEARCH: (24, 16),
+    codec.SET_SYSTEM_SETTINGS: (48, 16),
+    codec.GET_SYSTEM_SETTINGS: (12, 52),
+    codec.START_MEASUREMENT: (12, 16),
+    codec.STOP_MEASUREMENT: (12, 16),
+    codec.GO_POSITION: (40, 16),
+    codec.FIND_REFLECTOR: (20, 16),
+    codec.GET_DIRECTION: (12, 32),
+    codec.GO_BIRD_BATH2: (16, 16),
+    codec.GET_TRACKER_INFO: (12, 164),
+    codec.GO_AND_MEASURE: (36, 16),
+    codec.GET_METEO_STATION: (12, 92),
+}
+
+
+def test_all_commands_have_the_sizes_of_the_c_structures() -> None:
+    assert {
+        number: (len(codec.encode_command(number)), len(codec.encode_answer(number))) for number in codec.COMMANDS
+    } == SIZES
+
+
+def test_a_continuous_measurement_names_a_region_that_every_version_of_the_interface_has() -> None:
+    assert codec.SPHERE in (0, 1)
 
 
 @given(command_and_values("request"))
@@ -83,7 +162,14 @@ def test_a_command_that_is_not_known_here_is_told_by_its_number() -> None:
 
 
 @pytest.mark.parametrize(
-    "header", [b"HTTP/1.1", struct.pack("<iI", 4, 0), struct.pack("<iI", -12, 8), struct.pack("<iI", 156, 77)]
+    "header",
+    [
+        b"HTTP/1.1",
+        struct.pack("<iI", 4, 0),
+        struct.pack("<iI", -12, 8),
+        struct.pack("<iI", 156, 77),
+        struct.pack("<iI", 1 << 17, 3),
+    ],
 )
 def test_what_is_no_header_is_named_so(header: bytes) -> None:
     with pytest.raises(ProtocolError, match="Expected the header of an emScon packet"):

@@ -23,11 +23,44 @@ SIMULATOR = """
 import logging, sys
 from CESAPI.test import LTSimulator
 logging.disable(logging.CRITICAL)
-simulator = LTSimulator()
+simulator = eval(sys.argv[2])()
 simulator.host, simulator.port, simulator.daemon = "127.0.0.1", int(sys.argv[1]), True
 simulator.start()
 print("up", flush=True)
 sys.stdin.read()
+"""
+
+MEASURING = """
+import CESAPI.packet as packets
+class Measuring(LTSimulator):
+    # Its own simulator answers StartMeasurement, but sends no result, and it fills units with counters.
+    def packets(self, data):
+        found = super().packets(data)
+        command, answer = found
+        for name in ("SetUnits", "SetCoordinateSystemType", "SetSystemSettings"):
+            if command.packetInfo.command == getattr(packets, "ES_C_" + name):
+                self.__dict__[name] = command
+        if command.packetInfo.command == packets.ES_C_StartMeasurement:
+            return command, WithResult(answer)
+        return found
+    def populateReturnPacket(self, thing):
+        super().populateReturnPacket(thing)
+        number = thing.packetInfo.command if hasattr(thing, "packetInfo") else None
+        if number == packets.ES_C_GetUnits:
+            thing.unitsSettings = self.SetUnits.unitsSettings
+        elif number == packets.ES_C_GetCoordinateSystemType:
+            thing.coordSysType = self.SetCoordinateSystemType.coordSysType
+        elif number == packets.ES_C_GetSystemSettings and hasattr(self, "SetSystemSettings"):
+            thing.systemSettings = self.SetSystemSettings.systemSettings
+class WithResult:
+    def __init__(self, answer):
+        self.answer, self.packetInfo = answer, answer.packetInfo
+    def pack(self):
+        result = packets.SingleMeasResultT()
+        result.dVal1, result.dVal2, result.dVal3 = 0.25, 1.5, 2.125
+        result.dStd1, result.dStd2, result.dStd3 = 1e-6, 2e-6, 3e-6
+        result.dTemperature, result.dPressure, result.dHumidity = 21.0, 1000.0, 40.0
+        return self.answer.pack() + result.pack()
 """
 
 CLIENT = """
@@ -52,10 +85,23 @@ connection.disconnect()
 
 @pytest.fixture
 def port() -> Iterator[int]:
+    yield from running(SIMULATOR, "LTSimulator")
+
+
+@pytest.fixture
+def measuring_port() -> Iterator[int]:
+    head, start, rest = SIMULATOR.partition("logging.disable")
+    yield from running(head + MEASURING + start + rest, "Measuring")
+
+
+def running(script: str, simulator: str) -> Iterator[int]:
     with socket.create_server(("127.0.0.1", 0)) as server:
         free = server.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, "-c", SIMULATOR, str(free)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ
+        [sys.executable, "-c", script, str(free), simulator],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ,
     )
     assert process.stdin is not None
     assert process.stdout is not None
@@ -97,6 +143,18 @@ def test_a_simulator_of_another_origin_is_spoken_to_without_change(port: int) ->
     assert (index, reflectors) == (1.00027, ())  # it states that it knows 0 reflectors
     assert np.isfinite(direction).all()
     assert changes == ["initialisation changed", "ready to measure", "statistics changed"]
+
+
+def test_a_measurement_that_another_implementation_encodes_is_read(measuring_port: int) -> None:
+    tracker = connected(measuring_port, EmSconSettings(timeout=5.0))
+    try:
+        found = tracker.measure()
+    finally:
+        tracker.close()
+    assert found.valid
+    assert (found.distance, found.angles, found.std) == (2.125, (0.25, 1.5), (3e-6, 1e-6, 2e-6))
+    assert (found.environment.temperature, found.environment.pressure) == (21.0, 100_000.0)
+    assert found.refraction_index == 1.00027
 
 
 def test_a_client_of_another_origin_measures_with_our_simulator() -> None:

@@ -1,13 +1,16 @@
 """XML of MTConnect agents: every version, hostile documents, and which data item reports what."""
 
 import math
+import re
+import tracemalloc
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.controller.mtconnect.choice import choose
+from errormotion.instruments.controller.mtconnect.choice import Choice, choose
 from errormotion.instruments.controller.mtconnect.codec import DataItem, Device, Observation, parse, parse_time
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
 
@@ -189,11 +192,57 @@ def test_times_without_a_zone_are_utc() -> None:
     assert parse_time("2025-03-01T12:00:00") == parse_time("2025-03-01T13:00:00+01:00") == 1740830400.0
 
 
+# ---------------------------------------------------------------------- limits
+
+
+def test_a_long_namespace_costs_nothing_but_its_own_length() -> None:
+    """Resolved into each of 8000 names, these 500 kB were 4 GB."""
+    tags = "<t/>" * 8000
+    document = f'<MTConnectStreams xmlns="urn:{"x" * 500_000}">{HEADER}/><Streams>{tags}</Streams></MTConnectStreams>'
+    tracemalloc.start()
+    try:
+        assert parse(document.encode()).observations == ()
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ("<a>" * 100 + "</a>" * 100, "nested at most 64 deep"),
+        ("<a/>" * 200_001, "at most 200000 elements"),
+        ("<a " + " ".join(f"b{k}=''" for k in range(100)) + "/>", "at most 64 attributes"),
+        (f"<{'a' * 300}/>", "at most 256 characters"),
+        (f"<a {'b' * 300}=''/>", "at most 256 characters"),
+        ("&a;", "cannot be parsed"),
+        (f'<P dataItemId="x" timestamp="2025-03-01T12:00:00Z" sequence="{"9" * 5000}">1</P>', "'sequence'"),
+        (f'<P dataItemId="x" timestamp="{"2" * 5000}" sequence="1">1</P>', "Expected a time"),
+    ],
+)
+def test_what_is_larger_than_its_limit_is_refused(inside: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match=message):
+        parse(f"<MTConnectStreams>{HEADER}/>{inside}</MTConnectStreams>".encode())
+
+
+@pytest.mark.parametrize("text", ["1e999", "inf", "nan", "1_0", "0x10", "1" * 200_000 + "x", "\u0661"])
+def test_values_that_python_takes_for_numbers_are_no_numbers(text: str) -> None:
+    with pytest.raises(ProtocolError, match="expected a number"):
+        Observation("p", 1, 0.0, text).number()
+
+
+def test_an_observation_that_holds_others_does_not_repeat_their_text() -> None:
+    inner = '<P dataItemId="x" timestamp="2025-03-01T12:00:00Z" sequence="2">7</P>'
+    outer = f'<P dataItemId="y" timestamp="2025-03-01T12:00:00Z" sequence="1">5{inner}</P>'
+    document = parse(f"<MTConnectStreams>{HEADER}/>{outer}</MTConnectStreams>".encode())
+    assert [each.value for each in document.observations] == ["5", "7"]
+
+
 # ---------------------------------------------------------------------- which item reports what
 
 
 def test_native_names_and_machine_coordinates_decide() -> None:
-    chosen = choose(*device(spindle="C"))
+    chosen = choose(*device(spindle="C")).items
     assert chosen["position.X"].id == "xm"
     assert chosen["spindle_speed"].id == "cv"
     assert chosen["spindle_load"].id == "cl"
@@ -204,17 +253,132 @@ def test_native_names_and_machine_coordinates_decide() -> None:
 
 
 def test_a_path_position_stands_in_where_no_axis_tells_its_own() -> None:
-    chosen = choose(*device(spindle="C", axes=("U", "V", "W")))
+    chosen = choose(*device(spindle="C", axes=("U", "V", "W"))).items
     assert chosen["position"].id == "pp"
 
 
-def test_two_spindles_are_named_and_a_setting_decides() -> None:
-    with pytest.raises(InstrumentError, match=r"Several data items report 'spindle_speed': .*[cb]v .*items = "):
-        choose(*device())
-    assert choose(*device(items={"spindle_speed": "bv"}))["spindle_speed"].id == "bv"
+def test_two_spindles_are_unknown_until_a_setting_decides() -> None:
+    choice = choose(*device())
+    assert "spindle_speed" not in choice.items
+    assert "spindle_load" not in choice.items
+    assert re.search(r"Several data items report 'spindle_speed': .*[cb]v .*items = ", choice.unclear["spindle_speed"])
+    choice = choose(*device(items={"spindle_speed": "bv"}))
+    assert choice.items["spindle_speed"].id == "bv"
+    assert choice.unclear == {}
     with pytest.raises(InstrumentError, match="no rotary axis 'S'; it has B, C"):
         choose(*device(spindle="S"))
     with pytest.raises(InstrumentError, match="no data item 'nope'; it has avail"):
         choose(*device(spindle="C", items={"feed": "nope"}))
     with pytest.raises(ValueError, match="found colour"):
         MTConnectSettings(items={"colour": "x"})
+
+
+def made(inside: str, configuration: str = "", **settings: object) -> Choice:
+    """Return what is chosen of a device with these components."""
+    document = (
+        f'<MTConnectDevices>{HEADER}/><Devices><Device id="d" name="M">{configuration}<Components>{inside}'
+        "</Components></Device></Devices></MTConnectDevices>"
+    )
+    return choose(parse(document.encode()).devices[0], MTConnectSettings(**settings))
+
+
+def item(id: str, kind: str, **attributes: str) -> str:
+    named = "".join(f' {key}="{value}"' for key, value in attributes.items())
+    return f'<DataItem category="SAMPLE" id="{id}" type="{kind}"{named}/>'
+
+
+def axis(name: str, *items: str, component: str = "Linear") -> str:
+    return f'<{component} id="i{name}" name="{name}"><DataItems>{"".join(items)}</DataItems></{component}>'
+
+
+SYSTEMS = """<Configuration><CoordinateSystems>
+<CoordinateSystem id="b" type="BASE"/><CoordinateSystem id="m" type="MACHINE" parentIdRef="b"/>
+<CoordinateSystem id="w" type="OBJECT" parentIdRef="m"/></CoordinateSystems></Configuration>"""
+
+
+@pytest.mark.parametrize("order", [("w", "m"), ("m", "w"), ("b", "m"), ("gone", "m")])
+def test_from_version_2_the_configuration_of_the_device_decides_on_the_coordinates(order: tuple[str, str]) -> None:
+    both = [item(f"x{ref}", "POSITION", subType="ACTUAL", coordinateSystemIdRef=ref) for ref in order]
+    chosen = made(axis("X", *both), SYSTEMS).items["position.X"]
+    assert (chosen.id, chosen.coordinate_system) == ("xm", "MACHINE")
+
+
+def test_work_coordinates_are_only_taken_where_there_are_no_others() -> None:
+    work = item("xw", "POSITION", subType="ACTUAL", coordinateSystemIdRef="w")
+    plain = item("x", "POSITION", subType="ACTUAL")
+    assert made(axis("X", work, plain), SYSTEMS).items["position.X"].id == "x"
+    assert made(axis("X", work), SYSTEMS).items["position.X"].coordinate_system == "WORK"
+
+
+def test_percent_is_an_override_and_no_speed() -> None:
+    feeds = [item("f", "PATH_FEEDRATE", units="MILLIMETER/SECOND"), item("o", "PATH_FEEDRATE", units="PERCENT")]
+    speeds = [
+        item("s", "SPINDLE_SPEED", subType="ACTUAL", units="REVOLUTION/MINUTE"),
+        item("so", "SPINDLE_SPEED", subType="ACTUAL", units="PERCENT"),
+    ]
+    choice = made(axis("P", *feeds, component="Path") + axis("C", *speeds, component="Rotary"))
+    assert choice.items["feed"].id == "f"
+    assert choice.items["spindle_speed"].id == "s"
+    assert choice.unclear == {}
+    assert "feed" not in made(axis("P", feeds[1], component="Path")).items
+
+
+@pytest.mark.parametrize("representation", ["TIME_SERIES", "DATA_SET", "TABLE"])
+def test_items_of_many_values_do_not_compete(representation: str) -> None:
+    feeds = [item("fs", "PATH_FEEDRATE", representation=representation), item("f", "PATH_FEEDRATE")]
+    choice = made(axis("P", *feeds, component="Path"))
+    assert choice.items["feed"].id == "f"
+    assert choice.unclear == {}
+    assert "feed" not in made(axis("P", feeds[0], component="Path")).items
+
+
+def test_a_time_series_can_be_named_and_a_set_cannot() -> None:
+    series = item("fs", "PATH_FEEDRATE", representation="TIME_SERIES", units="MILLIMETER/SECOND")
+    assert made(axis("P", series, component="Path"), items={"feed": "fs"}).items["feed"].id == "fs"
+    table = item("ft", "PATH_FEEDRATE", representation="TABLE")
+    with pytest.raises(InstrumentError, match="'ft' is a TABLE of keys and values"):
+        made(axis("P", table, component="Path"), items={"feed": "ft"})
+
+
+def test_of_numbered_axes_the_first_one_is_meant() -> None:
+    axes = [axis(name, item(name, "POSITION", subType="ACTUAL")) for name in ("Z4", "Z1", "X")]
+    chosen = made("".join(axes)).items
+    assert (chosen["position.Z"].id, chosen["position.X"].id) == ("Z1", "X")
+    assert "position.Y" not in chosen
+
+
+def test_sets_and_tables_are_text_of_keys_and_values() -> None:
+    entries = (
+        '<V dataItemId="v" timestamp="2025-03-01T12:00:00Z" sequence="1" count="2"><Entry key="a">1</Entry>'
+        '<Entry key="b"><Cell key="X">2</Cell><Cell key="Y">3</Cell></Entry></V>'
+    )
+    document = parse(f"<MTConnectStreams>{HEADER}/>{entries}</MTConnectStreams>".encode())
+    assert document.observations[0].value == "a=1 b={X=2 Y=3}"
+
+
+# ---------------------------------------------------------------------- golden vectors
+
+
+@pytest.mark.parametrize("vector", vectors("mtconnect", "probe"), ids=str)
+def test_published_devices_open_with_default_settings(vector: Vector) -> None:
+    found = parse(vector.data).devices[0]
+    choice = choose(found, MTConnectSettings())
+    assert {key: each.id for key, each in choice.items.items()} == vector.expected["items"]
+    assert sorted(choice.unclear) == vector.expected["unclear"]
+    for each in choice.items.values():
+        assert each.category != "SAMPLE" or each.scale > 0
+
+
+@pytest.mark.parametrize("vector", vectors("mtconnect", "streams"), ids=str)
+def test_published_observations(vector: Vector) -> None:
+    document = parse(vector.data)
+    found = {
+        each.item: each.value if not each.level else f"{each.level} {each.value}" for each in document.observations
+    }
+    assert found == vector.expected["values"]
+    assert document.header.next == vector.expected["next"]
+
+
+@pytest.mark.parametrize("vector", vectors("mtconnect", "error"), ids=str)
+def test_published_errors(vector: Vector) -> None:
+    assert parse(vector.data).errors == vector.expected["errors"]

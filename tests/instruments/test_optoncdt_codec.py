@@ -6,29 +6,37 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from optoncdt_by_the_manual import Sensor
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.point_lds.optoncdt import codec, kernels
+from errormotion.instruments.point_lds.optoncdt import codec, commands, kernels
 from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
+from errormotion.instruments.point_lds.optoncdt.models import MODELS
 
 ALL_CODES = sorted(codec.ERROR_CODES)
+HIGHEST = MODELS["ILD2300"].highest
 compiled = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
-def wire(raws: list[int], first: int = 0, counter: bool = True) -> bytes:
+def wire(raws: list[int], first: int = 0, counter: bool = True, *, counter_first: bool = False) -> bytes:
     """What the sensor sends, by the plain codec."""
-    data = b""
+    values: list[bytes] = []
     for number, raw in enumerate(raws, first):
-        data += codec.encode_value(raw)
-        if counter:
-            data += codec.encode_value(number & 0x3FFFF, first=False)
-    return data
+        row = [raw, number & 0x3FFFF] if counter else [raw]
+        for position, value in enumerate(reversed(row) if counter_first else row):
+            values.append(codec.encode_value(value, first=position == 0))
+    return b"".join(values)
 
 
-def decode(pieces: list[bytes], counter: bool = True, from_zero: bool = True) -> tuple[np.ndarray, np.ndarray, bytes]:
+def decode(
+    pieces: list[bytes], counter: bool = True, from_zero: bool = True, *, counter_first: bool = False
+) -> tuple[np.ndarray, np.ndarray, bytes]:
     """Values (range 1, so that they are relative), reasons and text."""
-    decoder = StreamDecoder(1.0, counter=counter, from_zero=from_zero)
-    chunks = [decoder(piece) for piece in pieces]
+    decoder = StreamDecoder(1.0, highest=HIGHEST, counter=counter, counter_first=counter_first, from_zero=from_zero)
+    another = [codec.encode_value(0), codec.encode_value(0, first=False)]  # confirms the last one
+    confirming = another[:1] if not counter else another if counter_first else []
+    chunks = [decoder(piece) for piece in [*pieces, *confirming]]
     return (
         np.concatenate([chunk.values for chunk in chunks]),
         np.concatenate([chunk.reasons for chunk in chunks]),
@@ -37,12 +45,54 @@ def decode(pieces: list[bytes], counter: bool = True, from_zero: bool = True) ->
 
 
 def expected(raws: list[int]) -> list[float]:
-    return [codec.distance(raw, 1.0) if not codec.reason(raw) else np.nan for raw in raws]
+    return [codec.distance(raw, 1.0) if not codec.reason(raw, HIGHEST) else np.nan for raw in raws]
 
 
-def test_published_vector() -> None:
-    assert codec.encode_value(32760) == bytes.fromhex("38 7F 87")
-    assert codec.decode_value(bytes.fromhex("38 7F 87")) == 32760
+@pytest.mark.parametrize("vector", vectors("optoncdt", "value"), ids=str)
+def test_values_by_the_documents(vector: Vector) -> None:
+    raw, first = vector.expected["raw"], vector.expected["first"]
+    assert codec.encode_value(raw, first=first) == vector.data
+    assert codec.decode_value(vector.data) == raw
+    if "reason" in vector.expected:
+        assert codec.reason(raw, HIGHEST) == vector.expected["reason"]
+
+
+@pytest.mark.parametrize("vector", vectors("optoncdt", "distance"), ids=str)
+def test_distances_by_the_documents(vector: Vector) -> None:
+    raw = codec.decode_value(vector.data)
+    assert raw == vector.expected["raw"]
+    found = codec.distance(raw, vector.expected["range_mm"])
+    assert found == pytest.approx(vector.expected["distance_mm"], abs=5e-6)  # some were printed from a 32-bit float
+
+
+@pytest.mark.parametrize("vector", vectors("optoncdt", "getinfo"), ids=str)
+def test_identities_by_the_manuals(vector: Vector) -> None:
+    facts = commands.parse_info(commands.parse_answer("GETINFO", vector.data))
+    expected = dict(vector.expected)
+    assert commands.reported_range(facts) == pytest.approx(expected.pop("range_mm") * 1e-3)
+    assert {key: facts[key] for key in expected} == expected
+
+
+@pytest.mark.parametrize("vector", vectors("optoncdt", "answer"), ids=str)
+def test_answers_by_the_documents(vector: Vector) -> None:
+    command = vector.expected["command"]
+    if "refused" in vector.expected:
+        for answer in (vector.data, command.encode() + b" " + vector.data, command.encode() + b"\r\n" + vector.data):
+            with pytest.raises(commands.RefusedCommandError, match=f"'{command}': {vector.expected['refused']}$"):
+                commands.parse_answer(command, answer)
+    else:
+        assert commands.parse_answer(command, vector.data) == vector.expected["lines"]
+
+
+@pytest.mark.parametrize("vector", vectors("optoncdt", "command"), ids=str)
+def test_the_sensor_of_the_tests_takes_the_commands_of_the_manuals(vector: Vector) -> None:
+    for model in MODELS:
+        sensor = Sensor(model)
+        try:
+            answer = sensor._answer(vector.data.decode().strip())
+        finally:
+            sensor.wire.close()
+        assert (b" ok\r\n->" in answer) == (model in vector.expected["models"])
 
 
 @pytest.mark.parametrize(("raw", "millimetres"), [(0, -0.1), (32760, 5.0), (65520, 10.1)])
@@ -51,7 +101,10 @@ def test_published_scale_at_10_mm(raw: int, millimetres: float) -> None:
 
 
 def test_measuring_range_ends_where_it_is_published() -> None:
-    assert [codec.reason(raw) for raw in (642, 643, 64876, 64877)] == ["below range", "", "", "above range"]
+    for model, last in (("ILD2300", 64876), ("ILD1420", 64877)):
+        highest = MODELS[model].highest
+        found = [codec.reason(raw, highest) for raw in (642, 643, last, last + 1)]
+        assert found == ["below range", "", "", "above range"]
     step = 1.02 / 65520  # the published ends are whole numbers within two steps of 0 and 1
     assert codec.distance(643, 1.0) == pytest.approx(0, abs=2 * step)
     assert codec.distance(64876, 1.0) == pytest.approx(1, abs=2 * step)
@@ -66,14 +119,22 @@ def test_each_error_code_has_a_reason_of_its_own(code: int) -> None:
 
 
 def test_the_error_codes_are_the_published_ones() -> None:
-    assert list(range(262073, 262083)) == ALL_CODES
+    assert ALL_CODES == [262075, 262076, 262077, 262078, 262080, 262081, 262082]
 
 
 @pytest.mark.parametrize(
-    ("raw", "reason"), [(0, "below range"), (65535, "above range"), (65536, "unknown code"), (262083, "unknown code")]
+    ("raw", "reason"),
+    [
+        (0, "below range"),
+        (65520, "above range"),
+        (65521, "unknown code"),
+        (262074, "unknown code"),
+        (262079, "unknown code"),
+        (262083, "unknown code"),
+    ],
 )
 def test_what_is_no_distance_says_why(raw: int, reason: str) -> None:
-    assert codec.reason(raw) == reason
+    assert codec.reason(raw, HIGHEST) == reason
     _, reasons, _ = decode([wire([raw])])
     assert codec.REASONS[reasons[0]] == reason
 
@@ -94,39 +155,24 @@ def test_every_value_comes_back(raw: int, first: bool) -> None:
     assert (triple[2] >> 6) == (0b10 if first else 0b11)
 
 
-@given(st.lists(st.integers(0, (1 << 18) - 1)), st.integers(0, 1 << 20), st.booleans())
-@compiled
-def test_the_compiled_encoder_writes_the_same_bytes(raws: list[int], first: int, counter: bool) -> None:
-    data = np.empty(6 * len(raws), dtype=np.uint8)
-    used = kernels.encode(np.array(raws, dtype=np.int32), first, counter, data)
-    assert data[:used].tobytes() == wire(raws, first, counter)
-
-
-@given(st.lists(st.floats(-0.1, 1.1) | st.just(float("nan")), min_size=1))
-@compiled
-def test_quantising_is_off_by_half_a_step_at_most_and_codes_what_is_outside(distances: list[float]) -> None:
-    raws = np.empty(len(distances), dtype=np.int32)
-    kernels.quantise(np.array(distances), 1.0, raws)
-    for x, raw in zip(distances, raws, strict=True):
-        if codec.reason(int(raw)):
-            assert np.isnan(x) or not 1e-4 < x < 1 - 1e-4
-            assert int(raw) in (codec.NO_PEAK, codec.BEFORE_RANGE, codec.AFTER_RANGE)
-        else:
-            assert abs(codec.distance(int(raw), 1.0) - x) <= codec.SCALE / 2 + 1e-12
-
-
 @st.composite
 def splits(draw: st.DrawFn, data: bytes) -> list[bytes]:
     cuts = sorted(draw(st.lists(st.integers(0, len(data)), max_size=12)))
     return [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
 
 
-@given(st.data(), st.lists(st.integers(0, 65535) | st.sampled_from(ALL_CODES), max_size=40), st.booleans())
+ORDERS = st.sampled_from([(False, False), (True, False), (True, True)])
+"""With a counter, and whether it precedes the distance."""
+
+
+@given(st.data(), st.lists(st.integers(0, 65535) | st.sampled_from(ALL_CODES), max_size=40), ORDERS)
 @compiled
-def test_any_split_gives_the_same_samples(data: st.DataObject, raws: list[int], counter: bool) -> None:
-    values, reasons, text = decode(data.draw(splits(wire(raws, counter=counter))), counter)
+def test_any_split_gives_the_same_samples(data: st.DataObject, raws: list[int], order: tuple[bool, bool]) -> None:
+    counter, counter_first = order
+    pieces = data.draw(splits(wire(raws, counter=counter, counter_first=counter_first)))
+    values, reasons, text = decode(pieces, counter, counter_first=counter_first)
     np.testing.assert_allclose(values, expected(raws), rtol=1e-12, atol=1e-12)
-    assert [codec.REASONS[code] for code in reasons] == [codec.reason(raw) for raw in raws]
+    assert [codec.REASONS[code] for code in reasons] == [codec.reason(raw, HIGHEST) for raw in raws]
     assert text == b""
 
 
@@ -160,19 +206,20 @@ def test_answers_between_the_data_are_told_apart_and_harm_nothing(
     st.data(),
     st.lists(st.integers(643, 64876), min_size=30, max_size=60),
     st.lists(st.binary(min_size=1, max_size=5), min_size=1, max_size=4),
+    st.booleans(),
 )
 @compiled
 def test_garbage_makes_no_wrong_value_and_costs_few_samples(
-    data: st.DataObject, raws: list[int], garbage: list[bytes]
+    data: st.DataObject, raws: list[int], garbage: list[bytes], counter_first: bool
 ) -> None:
     """One stray burst spoils at most the sample it hits and two after it; what keeps a value has the right one."""
     base = 123456  # no burst of 5 bytes is a sample with the right counter, which takes 6
-    stream = wire(raws, base)
-    places = sorted(data.draw(st.lists(st.integers(1, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
+    stream = wire(raws, base, counter_first=counter_first)
+    places = sorted(data.draw(st.lists(st.integers(2, 25), min_size=len(garbage), max_size=len(garbage), unique=True)))
     for place, burst in reversed(list(zip(places, garbage, strict=True))):
         at = place * 6 + data.draw(st.integers(0, 5))
         stream = stream[:at] + burst + stream[at:]
-    values, reasons, _ = decode(data.draw(splits(stream)), from_zero=False)
+    values, reasons, _ = decode(data.draw(splits(stream)), from_zero=False, counter_first=counter_first)
     known = np.isfinite(values)
     np.testing.assert_allclose(values[known], np.array(expected(raws))[: values.size][known], rtol=1e-12)
     assert (~known).sum() <= 3 * len(garbage)
@@ -204,15 +251,13 @@ def test_a_counter_known_to_begin_at_zero_shows_what_was_lost_before() -> None:
 
 def test_a_counter_goes_on_over_its_18_bits() -> None:
     raws = np.full(300_000, 5000, dtype=np.int32)
-    data = np.empty(6 * raws.size, dtype=np.uint8)
-    kernels.encode(raws, 0, True, data)
-    values, reasons, _ = decode([data.tobytes()])
+    values, reasons, _ = decode([wire(raws.tolist())])
     assert values.size == 300_000
     assert not reasons.any()
 
 
 def test_a_counter_that_starts_again_is_a_protocol_error() -> None:
-    decoder = StreamDecoder(1.0, counter=True, from_zero=True)
+    decoder = StreamDecoder(1.0, highest=HIGHEST, counter=True, from_zero=True)
     decoder(wire([1000] * 100))
     with pytest.raises(ProtocolError, match="restarted"):
         decoder(wire([1000] * 100))
@@ -238,17 +283,27 @@ def test_the_compiled_splitter_agrees_with_the_plain_one(parts: list[bytes]) -> 
     assert text[:n_text].tobytes() == plain_text
 
 
-def test_an_answer_is_read_without_echo_and_prompt() -> None:
-    assert codec.parse_reply("GETINFO", b"GETINFO\r\nName: ILD2300-2\r\nSerial: 1\r\n->") == [
-        "Name: ILD2300-2",
-        "Serial: 1",
-    ]
-    assert codec.parse_reply("OUTPUT NONE", b"->") == []
+@given(st.binary(max_size=200), st.sampled_from(["GETINFO", "SYNC", "GETOUTINFO_RS422", "MEASRATE 20"]))
+@compiled
+def test_whatever_the_sensor_answers_is_an_answer_or_an_error_of_the_project(text: bytes, command: str) -> None:
+    try:
+        lines = commands.parse_answer(command, text)
+        commands.setting(command, lines)
+        commands.reported_range(commands.parse_info(lines))
+        commands.parse_layout(lines, counter=True)
+    except InstrumentError:
+        pass
 
 
-def test_a_refusal_is_an_instrument_error_with_the_sensors_words() -> None:
-    with pytest.raises(InstrumentError, match="refuses 'LASERPOW FULL': E104 Timeout"):
-        codec.parse_reply("LASERPOW FULL", b"E104 Timeout\r\n->")
+def test_an_answer_that_is_too_long_is_a_protocol_error() -> None:
+    with pytest.raises(ProtocolError, match="65536 at most"):
+        commands.parse_answer("PRINT", b"x" * (commands.LONGEST_ANSWER + 1))
+
+
+@pytest.mark.parametrize("wrong", ["20.00um", "mm", "-1.00mm", "0.00mm", "1e99mm", "9" * 400 + "mm"])
+def test_a_range_that_is_no_length_is_a_protocol_error(wrong: str) -> None:
+    with pytest.raises(ProtocolError, match="a measuring range such as"):
+        commands.reported_range({"measuring range": wrong})
 
 
 def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
@@ -256,8 +311,3 @@ def test_a_rate_that_does_not_fit_is_refused_with_the_arithmetic() -> None:
         codec.check_line(20e3, 921600, counter=True)
     codec.check_line(20e3, 921600, counter=False)
     codec.check_line(49.14e3, 4000000, counter=True)
-
-
-@pytest.mark.parametrize(("rate", "text"), [(49140.0, "49.14"), (1500.0, "1.5"), (250.0, "0.25"), (20000.0, "20")])
-def test_a_rate_is_sent_in_kilohertz(rate: float, text: str) -> None:
-    assert codec.rate_text(rate) == text

@@ -95,6 +95,19 @@ def test_a_number_may_stand_for_no_height(tmp_path: Path) -> None:
     assert found.heights == pytest.approx(1e-6 * np.array([[1, np.nan, 3], [4, 5, np.nan]]), nan_ok=True)
 
 
+@pytest.mark.parametrize(
+    "text", ["1,,3,\n4,5,,\n", "1,,3\n4,5,,\n", "# um\r\n1, ,3 ,\r\n\r\n4,5, , \r\n", "1,,3,,\n4,5,,,\n"]
+)
+def test_a_delimiter_at_the_end_of_the_lines_adds_no_column(tmp_path: Path, text: str) -> None:
+    (tmp_path / "scan.csv").write_text(text)
+    found = scan(tmp_path / "scan.csv", GRID)
+    expected = [[1, np.nan, 3], [4, 5, np.nan]]
+    if text.endswith(",,,\n"):  # one delimiter ends the line, the others stand between cells
+        expected = [[*row, np.nan] for row in expected]
+    assert found.heights == pytest.approx(1e-6 * np.array(expected), nan_ok=True)
+    assert found.x.size == len(expected[0])
+
+
 def test_several_files_stream_in_the_order_of_their_names(tmp_path: Path) -> None:
     for name in ("b", "a"):
         write_netcdf(tmp_path / f"{name}.nc")
@@ -169,7 +182,8 @@ def test_millimetres_taken_for_metres_are_found(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("1,2,3\n4,5\n", "line 2: expected 3 cells as in the lines before; found 2"),
-        ("1,2,3\n4,five,6\n", "line 2 of heights: could not convert string to float: 'five'"),
+        ("1,2,3\n4,five,6\n", "line 2: could not convert string to float: 'five'"),
+        ("1,2,3\n4,5,6,7,\n", "line 2: expected 3 cells as in the lines before; found 4"),
         ("# nothing\n", "expected heights; found none"),
         (",,\n,,\n", "expected heights; found none"),
     ],

@@ -117,13 +117,16 @@ def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
         bars.stage("importing")
         raw = read_log(log, map_file, out)
     sizes = {str(dim): size for dim, size in raw.sizes.items()}
-    missing = json.loads(raw.attrs["missing_values"])
+    missing, notes = json.loads(raw.attrs["missing_values"]), json.loads(raw.attrs.get("import_notes", "[]"))
     if as_json:
-        show_json({"ok": True, "raw": str(out), "schema": raw.attrs["schema"], "sizes": sizes, "missing": missing})
+        answer = {"schema": raw.attrs["schema"], "sizes": sizes, "missing": missing, "notes": notes}
+        show_json({"ok": True, "raw": str(out), **answer})
     else:
         show(f"{out}: {raw.attrs['schema']}, " + ", ".join(f"{size} along {dim}" for dim, size in sizes.items()))
         for column, count in missing.items():
             show(f"  {column}: {count} empty cells, kept as NaN")
+        for note in notes:
+            show(f"  note: {note}")
 
 
 def report(run: Path, out: Path | None, as_json: bool) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import codecs
+import re
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-TIMESTAMP = "iso8601"
-"""Unit of a time column that holds dates and times of day."""
+from errormotion.datasets.text.dates import zone_of
+
+_POINT_BETWEEN_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+(?:,[0-9]*)?")
 
 
 class LogTable(BaseModel):
@@ -24,7 +26,18 @@ def _known_encoding(name: str) -> str:
         raise ValueError("expected an encoding such as 'utf-8', 'cp1252' or 'utf-16'") from error
 
 
+def _known_zone(name: str) -> str:
+    if name:
+        zone_of(name)
+    return name
+
+
 Column = Annotated[str | Annotated[int, Field(ge=1)], Field(description="name of the column, or its number from 1")]
+
+TimeColumn = Annotated[
+    Column | Annotated[list[Column], Field(min_length=2, max_length=2)],
+    Field(description="name or number of the column, or those of date and time of day, two columns"),
+]
 
 
 class Format(LogTable):
@@ -33,13 +46,51 @@ class Format(LogTable):
     encoding: Annotated[str, AfterValidator(_known_encoding)] = "utf-8"
     delimiter: Literal[",", ";", "\t", " ", "auto"] = "auto"
     decimal: Literal[".", ","] = "."
+    thousands: Literal["", ".", ",", " ", "'"] | None = Field(
+        None, description="sign between groups of three digits; empty: there is none"
+    )
+    zone: Annotated[str, AfterValidator(_known_zone)] = Field(
+        "", description="time zone of dates without an offset, such as 'Europe/Berlin'"
+    )
     comment: str = "#"
     header: bool = True
     skip: int = Field(0, ge=0)
     missing: tuple[str, ...] = ("NaN", "nan")
 
     @model_validator(mode="after")
-    def _decimal_is_no_delimiter(self) -> Self:
+    def _signs_differ(self) -> Self:
         if self.decimal == self.delimiter:
             raise ValueError("decimal sign and delimiter are both ','; a log with decimal commas has another delimiter")
+        if self.thousands and self.thousands in (self.decimal, self.delimiter):
+            raise ValueError(
+                f"thousands: '{self.thousands}' is the decimal sign or the delimiter; expected another sign"
+            )
         return self
+
+    def plain(self, text: str) -> str:
+        """Return a number without signs between thousands and with a point as decimal sign.
+
+        Raises
+        ------
+        ValueError
+            The point under decimal commas may stand between thousands, and the format does not state it; a sign between
+            thousands is not between groups of three digits.
+        """
+        if self.thousands:
+            return self._without_thousands(text)
+        if self.decimal == "," and self.thousands is None and _POINT_BETWEEN_THOUSANDS.fullmatch(text):
+            raise ValueError(
+                f"the point in '{text}' may be a decimal sign or stand between thousands; set format.thousands = '.' "
+                "in the map, or '' where the point is a decimal sign"
+            )
+        return text.replace(",", ".") if self.decimal == "," and "." not in text else text
+
+    def _without_thousands(self, text: str) -> str:
+        sign = str(self.thousands)
+        plain = re.sub("[\u00a0\u202f]", " ", text) if sign == " " else text.replace("\u2019", "'")
+        whole, decimal, rest = plain.partition(self.decimal)
+        if sign not in plain:
+            return f"{whole}.{rest}" if decimal else plain
+        if not re.fullmatch(rf"[+-]?[0-9]{{1,3}}(?:{re.escape(sign)}[0-9]{{3}})+", whole) or sign in rest:
+            raise ValueError(f"expected a number with '{sign}' between groups of three digits; found '{text}'")
+        return whole.replace(sign, "") + (f".{rest}" if decimal else "")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,20 @@ from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model, nearest
 from errormotion.datasets.schemas import RawSchema, Row, variants
 from errormotion.datasets.text.csv_text import Table
-from errormotion.datasets.text.log_format import TIMESTAMP
+from errormotion.datasets.text.dates import Clock, is_date
+from errormotion.datasets.text.log_format import Format
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
-from errormotion.datasets.text.log_reader import Mistakes, columns_of, seconds, top_lines
+from errormotion.datasets.text.log_reader import (
+    NOTES,
+    Place,
+    clock_notes,
+    clock_of,
+    columns_of,
+    holes,
+    seconds,
+    top_lines,
+)
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.text.table_reader import (
     NUMBER,
     Column,
@@ -56,14 +69,15 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     map_mistakes.raise_any()
     known = {key: column for key, column in columns.items() if column is not None}
     mistakes = Mistakes(log)
-    table, start = _table(settings, mistakes)
+    table, start, notes = _table(settings, mistakes)
     for part, columns_of_part, keys in _parts(table, known, settings, names, mistakes):
         for text in incomplete(columns_of_part, keys, names):
             mistakes.add(0, text)
         if not mistakes.count:
             read_table(part, columns_of_part, keys, names, found, mistakes)
     mistakes.raise_any()
-    stated = {"machine": settings.machine, "start": start}
+    notes += _missing_rows(table, list(settings.labels))
+    stated = {"machine": settings.machine, "start": start, NOTES: json.dumps(notes) if notes else ""}
     attrs = {**settings.attributes, **{name: text for name, text in stated.items() if text}}
     return found.dataset({"schema": settings.schema_, **attrs}, names)
 
@@ -80,11 +94,13 @@ def _tables(settings: LogMap, mistakes: Mistakes) -> Sequence[RawSchema]:
 
 def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
     """Return the labels of the last dimension of variables whose components the map names, such as sensors."""
-    rows_of = {row.name: row for table in reversed(variants(settings.schema_)) for row in table.rows}
+    tables = variants(settings.schema_)
+    rows_of = {row.name: row for table in reversed(tables) for row in table.rows}
+    fixed = {dim for table in tables for dim in table.labels}
     found: dict[str, tuple[str, ...]] = {}
     for key in settings.columns:
         name, dot, label = key.partition(".")
-        if dot and name in rows_of and rows_of[name].dims:
+        if dot and name in rows_of and rows_of[name].dims and not fixed & set(rows_of[name].dims):
             dim = rows_of[name].dims[-1]
             found[dim] = (*(each for each in found.get(dim, ()) if each != label), label)
     return found
@@ -103,7 +119,7 @@ def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> 
         expected = " ".join(f"columns.{name}.{each}" for each in labels) or f"columns.{name}"
         mistakes.add(0, f"columns.{key}: expected {expected}")
         return None
-    unit = row.unit if entry.unit == TIMESTAMP and row.unit == "s" else entry.unit
+    unit = row.unit if is_date(entry.unit) and row.unit == "s" else entry.unit
     where = f"columns.{key}"
     if converted(np.ones(1), unit, row, f"{where}.unit", 0, mistakes) is None:
         return None
@@ -185,14 +201,14 @@ def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
     return None
 
 
-def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str]:
-    """Return the wanted columns of a log as a table with points as decimal signs, and its first date."""
+def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str, list[str]]:
+    """Return the wanted columns of a log as a table with points as decimal signs, its first date, and notes."""
     form = settings.format
-    wanted = {f"labels.{dim}": column for dim, column in settings.labels.items()}
+    wanted: dict[str, Place] = {f"labels.{dim}": column for dim, column in settings.labels.items()}
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
-    dated = {f"columns.{key}" for key, entry in settings.columns.items() if entry.unit == TIMESTAMP}
+    dated = {f"columns.{key}": entry.unit for key, entry in settings.columns.items() if is_date(entry.unit)}
+    clocks = {key: clock_of(form, unit, repeats=True) for key, unit in dated.items()}
     (line, titles), lines, places = columns_of(wanted, form, mistakes)
-    start: datetime | None = None
     cells = []
     for number, row in lines:
         if len(row) != len(titles):
@@ -200,18 +216,52 @@ def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str]:
             continue
         texts = []
         for key, place in places.items():
-            text = row[place].strip()
+            text = " ".join(row[each].strip() for each in place)
             if text in form.missing:
                 text = ""
-            elif key in dated and text:
-                start, value = seconds(text, start, f"column '{titles[place]}'", number, mistakes)
-                text = repr(value)
-            elif form.decimal == "," and key.startswith("columns") and "." not in text:
-                text = text.replace(",", ".")
+            elif key in clocks and text:
+                text = repr(seconds(text, clocks[key], f"column '{titles[place[0]]}'", number, mistakes))
+            elif key.startswith("columns"):
+                text = _plain(text, f"column '{titles[place[0]]}'", form, number, mistakes)
             texts.append(text)
         cells.append((number, texts))
-    heads = [titles[place] if form.header else str(place + 1) for place in places.values()]
-    return Table((line, heads), cells), start.isoformat() if start else ""
+    heads = [titles[place[0]] if form.header else str(place[0] + 1) for place in places.values()]
+    start = next((clock.start.isoformat() for clock in clocks.values() if clock.start), "")
+    notes = [note for clock in clocks.values() for note in clock_notes(clock)]
+    time = next((k for k, key in enumerate(places) if key == "columns.time"), None)
+    if time is not None and not mistakes.count:
+        notes += _holes(cells, time, clocks.get("columns.time"), settings)
+    return Table((line, heads), cells), start, notes
+
+
+def _plain(text: str, place: str, form: Format, line: int, mistakes: Mistakes) -> str:
+    try:
+        return form.plain(text)
+    except ValueError as error:
+        mistakes.add(line, f"{place}: {error}", f"{place}: thousands")
+        return text
+
+
+def _holes(cells: list[tuple[int, list[str]]], place: int, clock: Clock | None, settings: LogMap) -> list[str]:
+    """Return the notes on holes in the rows of a log with times."""
+    known = [(line, float(texts[place])) for line, texts in cells if NUMBER.fullmatch(texts[place])]
+    lines, times = np.array([line for line, _ in known]), np.array([time for _, time in known])
+    unit = "s" if clock else settings.columns["time"].unit
+    return holes(np.asarray(convert(times, unit, "s"), dtype=float), lines)
+
+
+def _missing_rows(table: Table, dims: list[str]) -> list[str]:
+    """Return the note on combinations of labels for which the log has no row."""
+    rows = [texts[: len(dims)] for _, texts in table.rows]
+    labels = [list(dict.fromkeys(column)) for column in zip(*rows, strict=True)]
+    there = {tuple(row) for row in rows}
+    lacking = math.prod(map(len, labels)) - len(there)
+    if not lacking:
+        return []
+    first = next(each for each in itertools.product(*labels) if each not in there)
+    where = ", ".join(f"{dim} '{label}'" for dim, label in zip(dims, first, strict=True))
+    number = "1 combination" if lacking == 1 else f"{lacking} combinations"
+    return [f"no row for {number} of the labels, whose values are NaN; the first is {where}"]
 
 
 def _parts(
@@ -244,9 +294,11 @@ def _without_repetition(table: Table, keys: Sequence[int], values: Sequence[int]
         before = kept.setdefault(tuple(texts[number] for number in keys), (line, texts))
         for number in values:
             if texts[number] != before[1][number]:
+                title = table.head[1][number]
                 mistakes.add(
                     line,
-                    f"column '{table.head[1][number]}': expected {before[1][number] or 'nothing'} as in line "
-                    f"{before[0]}, which has the same labels; found {texts[number] or 'nothing'}",
+                    f"column '{title}': expected {before[1][number] or 'nothing'} as in line {before[0]}, which has "
+                    f"the same labels; found {texts[number] or 'nothing'}",
+                    f"column '{title}': other values with the same labels",
                 )
     return Table(table.head, list(kept.values()))

@@ -6,16 +6,31 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from errormotion.datasets.text.log_format import Column, Format, LogTable
+from errormotion.datasets.text.dates import is_date
+from errormotion.datasets.text.log_format import Column, Format, LogTable, TimeColumn
 
 
 class MappedColumn(LogTable):
     """A column of the log that holds a variable, or one component of it."""
 
-    column: Column
-    unit: str = Field("", description="unit of the cells, such as 'um', or 'iso8601' for dates; empty for pure numbers")
-    scale: float = Field(1.0, description="factor to the cells; -1 where they count in the opposite direction")
+    column: TimeColumn
+    unit: str = Field(
+        "",
+        description="unit of the cells, such as 'um'; for dates 'iso8601' or their order, such as 'dd.mm.yyyy'; "
+        "empty for pure numbers",
+    )
+    scale: float = Field(
+        1.0, allow_inf_nan=False, description="factor to the cells; -1 where they count in the opposite direction"
+    )
     offset: str = Field("", description="added after scaling, with its unit, such as '2 mm'")
+
+    @model_validator(mode="after")
+    def _two_columns_are_dates(self) -> Self:
+        if isinstance(self.column, list) and not is_date(self.unit):
+            raise ValueError(
+                "column: two columns are date and time of day; expected the unit 'iso8601' or 'dd.mm.yyyy'"
+            )
+        return self
 
 
 class MappedValue(LogTable):
@@ -43,7 +58,9 @@ class LogMap(LogTable):
     labels: dict[str, Column] = Field(
         default_factory=dict, description="columns that hold the numbers or names along a dimension"
     )
-    columns: dict[str, MappedColumn] = Field(description="columns by variable, or by variable and component")
+    columns: dict[str, MappedColumn] = Field(
+        min_length=1, description="columns by variable, or by variable and component"
+    )
     values: dict[str, MappedValue] = Field(default_factory=dict, description="values by variable")
 
     @model_validator(mode="before")

@@ -6,7 +6,6 @@ import csv
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,37 +14,23 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import nearest
+from errormotion.datasets.text.dates import Clock, zone_of
 from errormotion.datasets.text.log_format import Format
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.errors import DatasetError
 
 T = TypeVar("T")
+Place = str | int | list[str | int]
+"""Name or number of a column, or those of date and time of day."""
 
-_MAX_REPORTED = 20
-"""Largest number of mistakes that are reported with their text."""
+NOTES = "import_notes"
+"""Attribute of an imported dataset: what a reader of it should know, JSON list of sentences."""
+
+_FEWEST_INTERVALS = 4
+"""Least number of intervals of which a usual one can be stated."""
+_SHARE_OF_USUAL = 0.7
+"""Least share of intervals that are the usual one where a longer one is a hole."""
 _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
-
-
-@dataclass
-class Mistakes:
-    """Mistakes in a file: the first ones with their text, the others counted."""
-
-    path: Path
-    texts: list[tuple[int, str]] = field(default_factory=list)
-    count: int = 0
-
-    def add(self, line: int, text: str) -> None:
-        """Add one mistake; ``line`` 0 is the file as a whole."""
-        self.count += 1
-        if len(self.texts) < _MAX_REPORTED:
-            self.texts.append((line, text))
-
-    def raise_any(self) -> None:
-        """Raise DatasetError if there are any."""
-        if self.count:
-            shown = [f"line {line}: {text}" if line else text for line, text in sorted(self.texts)]
-            more = [f"and {self.count - len(shown)} more"] if self.count > len(shown) else []
-            number = "1 mistake" if self.count == 1 else f"{self.count} mistakes"
-            raise DatasetError(f"{self.path}: {number}; nothing was imported", [*shown, *more])
 
 
 @dataclass(frozen=True)
@@ -60,30 +45,33 @@ class Columns:
         Line of each value.
     start : str
         Date and time of the first line, if the log has dates.
+    notes : list of str
+        What a reader of the data should know: holes in the rows, local times that occur twice.
     """
 
     values: dict[str, Array]
     lines: NDArray[np.int64]
     start: str = ""
+    notes: list[str] = field(default_factory=list)
 
 
 def read_columns(
-    wanted: Mapping[str, str | int], time: str, form: Format, mistakes: Mistakes, *, dates: bool = False
+    wanted: Mapping[str, Place], time: str, form: Format, mistakes: Mistakes, *, dates: str = ""
 ) -> Columns:
     """Read columns of the log ``mistakes.path``.
 
     Parameters
     ----------
-    wanted : mapping of str to str or int
-        Column of each key: its name in the header, or its number from 1.
+    wanted : mapping of str to str, int or two of them
+        Column of each key: its name in the header, or its number from 1; two for date and time of day.
     time : str
         Key of the time, where no cell may be empty.
     form : Format
         Format of the text.
     mistakes : Mistakes
         Receives the mistakes in the cells.
-    dates : bool
-        Whether the time is given as dates.
+    dates : str
+        Unit of dates (`errormotion.datasets.text.dates`) where the time is given as dates.
 
     Raises
     ------
@@ -94,34 +82,67 @@ def read_columns(
     width = len(titles)
     cells = {key: array("d") for key in wanted}
     lines = array("q")
-    start: datetime | None = None
+    clock = clock_of(form, dates) if dates else None
     for line, row in remaining:
         if len(row) != width:
             mistakes.add(line, f"expected {width} fields; found {len(row)}")
             continue
         lines.append(line)
         for key, place in places.items():
-            text = row[place].strip()
-            if key == time and dates:
-                start, value = seconds(text, start, f"{key}, field {place + 1}", line, mistakes)
+            text = " ".join(row[each].strip() for each in place)
+            where = f"{key}, field {place[0] + 1}"
+            if key == time and clock is not None:
+                value = seconds(text, clock, where, line, mistakes)
             elif key == time and not text:
-                mistakes.add(line, f"{key}, field {place + 1}: expected a number; found an empty cell")
+                mistakes.add(line, f"{where}: expected a number; found an empty cell")
                 value = np.nan
             else:
-                value = _number(text, f"{key}, field {place + 1}", form, line, mistakes)
+                value = _number(text, where, form, line, mistakes)
             cells[key].append(value)
     if not lines and not mistakes.count:
         raise DatasetError(f"{mistakes.path}: expected lines of numbers below the header; found none")
-    return Columns(
-        {key: np.array(values, dtype=float) for key, values in cells.items()},
-        np.array(lines, dtype=np.int64),
-        start.isoformat() if start else "",
-    )
+    values = {key: np.array(column, dtype=float) for key, column in cells.items()}
+    found = np.array(lines, dtype=np.int64)
+    notes = [*holes(values[time], found), *(clock_notes(clock) if clock else [])]
+    return Columns(values, found, clock.start.isoformat() if clock and clock.start else "", notes)
+
+
+def clock_of(form: Format, unit: str, *, repeats: bool = False) -> Clock:
+    """Return the clock of a log with dates."""
+    return Clock(unit, zone_of(form.zone) if form.zone else None, repeats)
+
+
+def clock_notes(clock: Clock) -> list[str]:
+    """Return the note on local times that occur twice."""
+    if not clock.resolved:
+        return []
+    return [f"{clock.resolved} times of the hour that occurs twice in {clock.zone} were resolved by their order"]
+
+
+def holes(times: Array, lines: NDArray[np.int64]) -> list[str]:
+    """Return a note on holes in the rows: intervals of more than 1.5 times the usual one, where most are usual."""
+    known = ~np.isnan(times)
+    t, at = times[known], lines[known]
+    steps = np.diff(t)
+    at = at[1:][steps > 0]
+    steps = steps[steps > 0]
+    if steps.size < _FEWEST_INTERVALS:
+        return []
+    usual = float(np.median(steps))
+    wide = np.flatnonzero(steps > 1.5 * usual)
+    if not wide.size or np.mean(np.abs(steps - usual) < 0.2 * usual) < _SHARE_OF_USUAL:
+        return []
+    longest = wide[np.argmax(steps[wide])]
+    number = "1 hole" if wide.size == 1 else f"{wide.size} holes"
+    return [
+        f"{number} in the rows, where the usual interval is {usual:.4g} s; the longest, of {steps[longest]:.6g} s, "
+        f"ends in line {at[longest]}"
+    ]
 
 
 def columns_of(
-    wanted: Mapping[str, str | int], form: Format, mistakes: Mistakes
-) -> tuple[tuple[int, list[str]], Iterator[tuple[int, list[str]]], dict[str, int]]:
+    wanted: Mapping[str, Place], form: Format, mistakes: Mistakes
+) -> tuple[tuple[int, list[str]], Iterator[tuple[int, list[str]]], dict[str, tuple[int, ...]]]:
     """Find columns of the log ``mistakes.path``.
 
     Returns
@@ -130,8 +151,8 @@ def columns_of(
         Line and fields of the header, or of the first line where the log has no header.
     iterator of (int, list of str)
         Lines of numbers.
-    dict of str to int
-        Number of the field of each wanted column, from 0.
+    dict of str to tuple of int
+        Numbers of the fields of each wanted column, from 0: one, or two for date and time of day.
 
     Raises
     ------
@@ -219,32 +240,44 @@ def _chain(first: T, rest: Iterator[T]) -> Iterator[T]:
 
 
 def _places(
-    row: list[str], line: int, wanted: Mapping[str, str | int], form: Format, mistakes: Mistakes
-) -> dict[str, int]:
-    """Return the index of each key's column in a row, from the header or by number."""
+    row: list[str], line: int, wanted: Mapping[str, Place], form: Format, mistakes: Mistakes
+) -> dict[str, tuple[int, ...]]:
+    """Return the indices of each key's columns in a row, from the header or by number."""
     names = [name.strip() for name in row] if form.header else []
     places = {}
-    for key, column in wanted.items():
-        if isinstance(column, int):
-            if column > len(row):
-                mistakes.add(line, f"{key}: expected a column {column}; found only {len(row)}")
-            places[key] = column - 1
-        elif not form.header:
-            mistakes.add(line, f"{key}: a log without header has no column '{column}'; give its number in the map")
-        elif column not in names:
-            mistakes.add(line, f"{key}: no column '{column}'; {nearest(column, names)}")
-        elif names.count(column) > 1:
-            mistakes.add(line, f"{key}: column '{column}' occurs {names.count(column)} times; give its number instead")
-        else:
-            places[key] = names.index(column)
+    for key, place in wanted.items():
+        columns = place if isinstance(place, list) else [place]
+        places[key] = tuple(_place(key, column, row, names, line, form, mistakes) for column in columns)
     return places
+
+
+def _place(
+    key: str, column: str | int, row: list[str], names: list[str], line: int, form: Format, mistakes: Mistakes
+) -> int:
+    if isinstance(column, int):
+        if column > len(row):
+            mistakes.add(line, f"{key}: expected a column {column}; found only {len(row)}")
+        return column - 1
+    if not form.header:
+        mistakes.add(line, f"{key}: a log without header has no column '{column}'; give its number in the map")
+    elif column not in names:
+        mistakes.add(line, f"{key}: no column '{column}'; {nearest(column, names)}")
+    elif names.count(column) > 1:
+        mistakes.add(line, f"{key}: column '{column}' occurs {names.count(column)} times; give its number instead")
+    else:
+        return names.index(column)
+    return 0
 
 
 def _number(text: str, place: str, form: Format, line: int, mistakes: Mistakes) -> float:
     """Return a cell as a number; NaN for an empty one."""
     if not text or text in form.missing:
         return np.nan
-    plain = text.replace(",", ".") if form.decimal == "," and "." not in text else text
+    try:
+        plain = form.plain(text)
+    except ValueError as error:
+        mistakes.add(line, f"{place}: {error}", f"{place}: thousands")
+        return np.nan
     try:
         value = float(plain)
     except ValueError:
@@ -257,13 +290,10 @@ def _number(text: str, place: str, form: Format, line: int, mistakes: Mistakes) 
     return np.nan
 
 
-def seconds(
-    text: str, start: datetime | None, place: str, line: int, mistakes: Mistakes
-) -> tuple[datetime | None, float]:
-    """Return the first date of the log, and the seconds since then."""
+def seconds(text: str, clock: Clock, place: str, line: int, mistakes: Mistakes) -> float:
+    """Return the seconds since the first date of the log; NaN and a mistake where the text is no date."""
     try:
-        now = datetime.fromisoformat(text)
-        return start or now, (now - (start or now)).total_seconds()
-    except (ValueError, TypeError):  # TypeError: some dates with a time zone and some without
-        mistakes.add(line, f"{place}: expected a date and time such as 2024-05-31T14:05:09.5; found '{text}'")
-        return start, np.nan
+        return clock.seconds(text)
+    except ValueError as error:
+        mistakes.add(line, f"{place}: {error}", f"{place}: {str(error).partition('; found')[0].replace(text, '')}")
+        return np.nan

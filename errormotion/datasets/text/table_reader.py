@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
 from errormotion.datasets.text.csv_text import Table
-from errormotion.datasets.text.log_reader import Mistakes
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -212,7 +212,8 @@ def read_table(
         inside = converted(cells[number], column.unit, row, title, line, mistakes)
         if inside is None:
             continue
-        inside = inside * column.scale + column.offset
+        with np.errstate(over="ignore"):  # an infinite value is not plausible
+            inside = inside * column.scale + column.offset
         if not plausible(inside, lines, row, title, column.unit, mistakes):
             continue
         found.missing[row.name] = found.missing.get(row.name, 0) + int(np.isnan(inside).sum())
@@ -310,10 +311,10 @@ def _places(
         place = tuple(places[:, k])
         if place in seen:
             label = ", ".join(f"{dim} '{texts[keys[dim]]}'" for dim in record)
-            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}")
+            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}", "duplicate")
         seen.setdefault(place, line)
     for axis, dim in enumerate(record):
-        size = len(found.labels[dim]) if dim in keys else int(places[axis].max(initial=-1)) + 1
+        size = len(found.labels.get(dim, ())) if dim in keys else int(places[axis].max(initial=-1)) + 1
         known, where = found.sizes.setdefault(dim, (size, table.head[0]))
         if size != known:
             mistakes.add(table.head[0], f"expected {known} along {dim}, as in the table of line {where}; found {size}")

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from errormotion.datasets.text.csv_text import Table, blocks
-from errormotion.datasets.text.log_reader import Mistakes
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 

@@ -236,7 +236,8 @@ class FiveSensorFrame:
         """Return the driver of a channel and its settings."""
         if settings.sensors:
             return settings.sensor(name)
-        return OptoNCDT, OptoSettings(**{key: getattr(settings, key) for key in SensorSettings.model_fields})
+        shared = {key: getattr(settings, key) for key in SensorSettings.model_fields}
+        return OptoNCDT, OptoSettings(range=settings.range, **shared)
 
     def _open_sensors(self) -> dict[str, Any]:
         if not self._sensors:

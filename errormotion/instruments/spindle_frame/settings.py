@@ -52,6 +52,7 @@ class FrameSettings(SensorSettings):
         description="driver, address and settings of each sensor; default: five optoncdt",
     )
 
+    range: Length = Field(default=2e-3, description="measuring range of the sensors")
     addresses: dict[str, str] = Field(
         default_factory=dict, description="URL of each sensor; default: made from the frame's own address"
     )
@@ -128,6 +129,11 @@ class FrameSettings(SensorSettings):
                 f"rate: these sensors are read one by one, at {HIGHEST_POLLING_RATE:g} Hz at most; "
                 f"found {self.rate:g} Hz"
             )
+
+    @property
+    def stated_range(self) -> float | None:
+        """The measuring range of the sensors, m."""
+        return self.range
 
     @property
     def synchronised(self) -> bool:

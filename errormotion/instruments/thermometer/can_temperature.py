@@ -1,36 +1,39 @@
-"""Thermometers with CANopen that follow CiA 404: float values, read by SDO."""
+"""Thermometers with CANopen that follow CiA 404, read by SDO or by PDO."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Time
-from errormotion.errors import InstrumentError
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.thermometer.can_inputs import Input, find_inputs, find_pdos
 from errormotion.instruments.thermometer.cia404 import (
     CELSIUS,
     DEVICE_TYPE,
+    FAHRENHEIT,
     IDENTITY,
     KELVIN,
+    MOST_DIGITS,
     NAME,
+    NUMBERS,
     PROFILE,
-    STATUS,
-    UNIT,
-    VALUE,
-    decode_unsigned,
-    decode_value,
     flag_of,
-    to_celsius,
 )
 from errormotion.instruments.thermometer.sensors import NO_ANSWER, Thermometer, ThermometerSettings
-from errormotion.instruments.transports.can.bus import CanNode, SdoRefusal, open_can
+from errormotion.instruments.transports.can.bus import CanNode, open_can
+from errormotion.instruments.transports.can.pdo import TransmitPdo
+from errormotion.instruments.transports.can.sdo import SdoRefusal
 from errormotion.plugins import Identity, InstrumentInfo
 
 #: SDO abort codes of an input that has no value just now: hardware error, device state, no data.
 NO_VALUE = frozenset((0x06060000, 0x08000020, 0x08000021, 0x08000022, 0x08000024))
-_UNITS = {"degC": CELSIUS, "K": KELVIN}
+_UNITS = {"degC": CELSIUS, "K": KELVIN, "degF": FAHRENHEIT}
+_LATENESS = 1.5
+"""Largest interval between two PDOs of a timer, in its own intervals."""
 
 
 class CanSettings(ThermometerSettings):
@@ -40,10 +43,29 @@ class CanSettings(ThermometerSettings):
         default=(), description="subindex of each channel; default: from 1 on, in their order"
     )
     node: int = Field(default=1, description="node number, where the URL has none", ge=1, le=127)
-    unit: Literal["as stated", "degC", "K"] = Field(
+    unit: Literal["as stated", "degC", "K", "degF"] = Field(
         default="as stated", description="unit of the values; 'as stated': what object 0x6131 states"
     )
-    start: bool = Field(default=False, description="send the node to OPERATIONAL when it is opened")
+    number: Literal["as found", "float", "integer 32", "integer 16"] = Field(
+        default="as found",
+        description="form of the values: object 0x6130, 0x9130 or 0x7130; 'as found': the first that the node has",
+    )
+    digits: int | None = Field(
+        default=None,
+        description="decimal digits of whole numbers; default: what object 0x6132 states",
+        ge=0,
+        le=MOST_DIGITS,
+    )
+    transfer: Literal["sdo", "pdo"] = Field(
+        default="sdo",
+        description="'pdo': inputs that the node sends at SYNC or at an interval are received, the others read by SDO",
+    )
+    sync: bool = Field(
+        default=False, description="send SYNC for each reading by PDO, which every node on the bus receives"
+    )
+    start: bool = Field(
+        default=False, description="send the node to OPERATIONAL when it is opened, and after a boot-up"
+    )
     timeout: Time = Field(default=1.0, description="time limit of an answer", gt=0)
     retry: Time = Field(default=1.0, description="least interval between two attempts to open a lost bus", ge=0)
 
@@ -79,8 +101,8 @@ class CanTemperature(Thermometer):
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="can_temperature",
         kind="thermometer",
-        summary="CANopen thermometers after CiA 404: values, units and states of inputs by SDO",
-        status="simulated_only",
+        summary="CANopen thermometers after CiA 404: values, units and states of inputs by SDO or PDO",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.thermometer.canopen_node:SimulatedCanopen",
     )
     Settings: ClassVar[type[CanSettings]] = CanSettings
@@ -99,6 +121,11 @@ class CanTemperature(Thermometer):
         """NMT state that the node's last heartbeat reported; empty before the first one."""
         return self.node.state
 
+    @property
+    def emergency(self) -> int:
+        """Code of the node's last emergency message; 0: none, or it is over."""
+        return self.node.emergency
+
     def identify(self) -> Identity:
         """Return the identity from the profile, name and numbers of the node.
 
@@ -108,12 +135,13 @@ class CanTemperature(Thermometer):
             The node is not a measuring device after CiA 404.
         """
         node = self.node
-        device = decode_unsigned(node.upload(DEVICE_TYPE), DEVICE_TYPE)
+        device = node.unsigned(DEVICE_TYPE)
         if device & 0xFFFF != PROFILE:
             raise InstrumentError(
                 f"{self.address}: node {node.node} follows the profile CiA {device & 0xFFFF}; expected CiA {PROFILE}"
             )
-        vendor, product, serial = (decode_unsigned(node.upload(IDENTITY, i), IDENTITY) for i in (1, 2, 4))
+        vendor = node.unsigned(IDENTITY, 1)
+        product, serial = (_optional(node, IDENTITY, i) for i in (2, 4))
         try:
             name = node.upload(NAME).rstrip(b"\0").decode("latin-1")
         except SdoRefusal:  # the name is optional
@@ -121,7 +149,7 @@ class CanTemperature(Thermometer):
         return Identity(
             manufacturer=f"CiA vendor 0x{vendor:08X}",
             model=name,
-            serial_number=str(serial),
+            serial_number="unknown" if serial is None else str(serial),
             simulated=node.simulated,
             details={"address": self.address, "node": node.node, "product": product},
         )
@@ -130,38 +158,66 @@ class CanTemperature(Thermometer):
         """Use other settings from now on; the node itself is configured with the maker's tool."""
         self.settings = settings
         if self._transport is not None:
-            self._read_units()
+            self._prepare()
 
     def _measure(self) -> dict[str, tuple[float, str]]:
-        node = self.node
-        return {
-            name: self._input(node, subindex, *scale)
-            for name, subindex, scale in zip(self.channels, self.settings.subindices, self._scales, strict=True)
-        }
+        if self.node.boots != self._boots:  # its configuration may have changed
+            self._prepare()
+        frames = self._frames() if self._pdos else {}
+        return {name: self._value(each, frames) for name, each in zip(self.channels, self._inputs, strict=True)}
 
-    def _input(self, node: CanNode, subindex: int, scale: float, offset: float) -> tuple[float, str]:
+    def _value(self, wanted: Input, frames: Mapping[int, bytes]) -> tuple[float, str]:
         try:
-            value = decode_value(node.upload(VALUE, subindex))
-            status = decode_unsigned(node.upload(STATUS, subindex), STATUS) if self._has_status else 0
+            value = wanted.number.decode(self._entry(wanted.number.index, wanted.subindex, frames))
+            status = 0
+            if wanted.status is not None:
+                status = int.from_bytes(self._entry(*wanted.status, frames)[:1], "little")
         except SdoRefusal as refusal:
             if refusal.code in NO_VALUE:
                 return math.nan, NO_ANSWER
             raise
-        return scale * value + offset, flag_of(status, value)
+        except ProtocolError as error:
+            raise ProtocolError(f"{self.address}: node {self.node.node}, {error}") from None
+        return wanted.scale.celsius(value), flag_of(status, value)
 
-    def _read_units(self) -> None:
-        """Read the constant data once: the units, and whether inputs have a status."""
+    def _entry(self, index: int, subindex: int, frames: Mapping[int, bytes]) -> bytes:
+        """Return an entry as the node has sent it, or from its object dictionary."""
+        for pdo in self._pdos:
+            place = pdo.place(index, subindex)
+            if place is not None:
+                return place.data(frames[pdo.identifier])
+        return self.node.upload(index, subindex)
+
+    def _frames(self) -> dict[int, bytes]:
+        """Return new PDOs."""
+        cyclic = [pdo.transmission for pdo in self._pdos if pdo.cyclic]
+        interval = max((pdo.event_timer for pdo in self._pdos if pdo.timed), default=0.0)
+        return self.node.fresh_pdos(
+            [pdo.identifier for pdo in self._pdos],
+            self.settings.timeout + _LATENESS * interval,
+            syncs=max(cyclic, default=0) if self.settings.sync else 0,
+            sync=self._sync,
+        )
+
+    def _prepare(self) -> None:
+        """Start the node where that is set, and read once what does not change: inputs, units, PDOs."""
         node, settings = self.node, self.settings
-        self._scales: list[tuple[float, float]] = []
-        for subindex in settings.subindices:
-            unit = _UNITS.get(settings.unit)
-            stated = decode_unsigned(node.upload(UNIT, subindex), UNIT) if unit is None else unit
-            self._scales.append(to_celsius(stated))
-        try:
-            node.upload(STATUS, 0)
-            self._has_status = True
-        except SdoRefusal:
-            self._has_status = False
+        boots = node.boots
+        if settings.start:
+            node.start_node()
+        self._inputs = find_inputs(
+            node,
+            settings.subindices,
+            numbers=NUMBERS.values() if settings.number == "as found" else (NUMBERS[settings.number],),
+            unit=_UNITS.get(settings.unit),
+            digits=settings.digits,
+        )
+        self._pdos: list[TransmitPdo] = []
+        if settings.transfer == "pdo":
+            self._pdos = find_pdos(node, self._inputs)
+            self._sync = node.sync_identifier()
+            node.await_pdos([pdo.identifier for pdo in self._pdos])
+        self._boots = boots
 
     def _connect(self) -> CanNode:
         return open_can(
@@ -174,7 +230,12 @@ class CanTemperature(Thermometer):
         )
 
     def _start_session(self) -> None:
-        if self.settings.start:
-            self.node.start_node()
         self.identify()
-        self._read_units()
+        self._prepare()
+
+
+def _optional(node: CanNode, index: int, subindex: int) -> int | None:
+    try:
+        return node.unsigned(index, subindex)
+    except SdoRefusal:
+        return None

@@ -1,67 +1,127 @@
-"""CiA 404, measuring devices: the objects of an analogue input as a float, the meaning of its unit and status.
+"""CiA 404, measuring devices: the objects of an analogue input, the meaning of its unit and its status.
 
-All of it is from memory (m) and kept in this one file.
+A node has one of the objects of the process value, or several: a float, or a whole number with a number of decimal
+digits. The documents of each statement are on the page of the device.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from dataclasses import dataclass
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, SHORTED
+from errormotion.instruments.thermometer.sensors import FAULTY, GOOD, OUT_OF_RANGE
 
-DEVICE_TYPE, NAME, HEARTBEAT, IDENTITY = 0x1000, 0x1008, 0x1017, 0x1018
-VALUE = 0x6130
-"""Process value as a float, one subindex an input."""
+DEVICE_TYPE, NAME, IDENTITY = 0x1000, 0x1008, 0x1018
 UNIT = 0x6131
 """Physical unit: prefix, numerator, denominator, reserved, a byte each from the top (CiA 303-2)."""
+DIGITS = 0x6132
+"""Number of decimal digits of a process value that is a whole number."""
 STATUS = 0x6150
 PROFILE = 404
 CELSIUS, KELVIN = 0x002D0000, 0x00050000
-NOT_VALID, POSITIVE, NEGATIVE = 1, 2, 4
-"""Bits of the status: no valid value; overload above, below."""
-ZERO_CELSIUS = 273.15  # K
+FAHRENHEIT = 0x00AC0000  # an assumption: from memory of CiA 303-2
+FAULTY_SENSOR, OVER, UNDER = 1, 2, 4
+"""Bits of the status: sensor faulty or missing, above its range, below it; beyond the range the first one may be set
+too."""
+MOST_DIGITS = 9
+LONGEST_NUMBER = 4  # bytes
+_ZEROS = {CELSIUS: (0.0, 1.0), KELVIN: (273.15, 1.0), FAHRENHEIT: (32.0, 5 / 9)}
+"""0 degC in a unit, and K per unit."""
 
 
-def decode_value(data: bytes) -> float:
-    """Return a process value."""
-    if len(data) != 4:
-        raise ProtocolError(f"0x{VALUE:04X}: expected a float of 4 bytes; found {data.hex(' ') or 'none'}")
-    (value,) = struct.unpack("<f", data)
-    return float(value)
+@dataclass(frozen=True)
+class Number:
+    """A form of the process value.
+
+    Attributes
+    ----------
+    index : int
+        Its object.
+    form : str
+        As of `struct`.
+    whole : bool
+        Whether it has decimal digits, in another object.
+    """
+
+    index: int
+    form: str
+    whole: bool
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return struct.calcsize(self.form)
+
+    def decode(self, data: bytes) -> float:
+        """Return the number; ProtocolError for another number of bytes.
+
+        A node that does not state the size of its entries sends 4 bytes for a number of 2.
+        """
+        if len(data) not in (self.size, LONGEST_NUMBER):
+            what = f"{'a whole number' if self.whole else 'a float'} of {self.size} bytes"
+            raise ProtocolError(f"0x{self.index:04X}: expected {what}; found {data.hex(' ') or 'none'}")
+        (value,) = struct.unpack_from(self.form, data)
+        return float(value)
 
 
-def decode_unsigned(data: bytes, index: int) -> int:
-    """Return an unsigned number of 1 to 4 bytes."""
-    if not 1 <= len(data) <= 4:
-        raise ProtocolError(f"0x{index:04X}: expected a number of 1 to 4 bytes; found {len(data)} bytes")
-    return int.from_bytes(data, "little")
+NUMBERS = {
+    "float": Number(0x6130, "<f", whole=False),
+    "integer 32": Number(0x9130, "<i", whole=True),
+    "integer 16": Number(0x7130, "<h", whole=True),
+}
+"""In the order in which a node is asked for them."""
 
 
-def to_celsius(unit: int) -> tuple[float, float]:
-    """Return scale and offset with which values in a unit become degC.
+@dataclass(frozen=True)
+class Scale:
+    """How a number becomes degC: (number x 10^exponent - zero) x factor.
+
+    Attributes
+    ----------
+    exponent : int
+    zero : float
+        0 degC in the unit.
+    factor : float
+        K per unit.
+    """
+
+    exponent: int
+    zero: float = 0.0
+    factor: float = 1.0
+
+    def celsius(self, number: float) -> float:
+        """Return the temperature, degC."""
+        shifted = number * 10.0**self.exponent if self.exponent >= 0 else number / 10.0**-self.exponent
+        return (shifted - self.zero) * self.factor
+
+
+def scale_of(unit: int, digits: int = 0) -> Scale:
+    """Return how numbers in a unit become degC; ``digits`` is the number of decimal digits of a whole number.
 
     Raises
     ------
     InstrumentError
         Not a unit of temperature.
+    ProtocolError
+        An impossible number of digits.
     """
-    prefix = (unit >> 24 ^ 0x80) - 0x80  # power of ten, signed
-    if unit & 0x00FFFFFF == CELSIUS:
-        return 10.0**prefix, 0.0
-    if unit & 0x00FFFFFF == KELVIN:
-        return 10.0**prefix, -ZERO_CELSIUS
-    raise InstrumentError(
-        f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}) or K (0x{KELVIN:08X}), with a prefix. "
-        "If the code is wrong, state the unit in the setting 'unit'"
-    )
+    if not 0 <= digits <= MOST_DIGITS:
+        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MOST_DIGITS} decimal digits; found {digits}")
+    exponent = (unit >> 24 ^ 0x80) - 0x80 - digits  # the prefix is signed
+    if unit & 0x00FFFFFF not in _ZEROS:
+        raise InstrumentError(
+            f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}), K (0x{KELVIN:08X}) or degF "
+            f"(0x{FAHRENHEIT:08X}), with a prefix. If the code is wrong, state the unit in the setting 'unit'"
+        )
+    return Scale(exponent, *_ZEROS[unit & 0x00FFFFFF])
 
 
 def flag_of(status: int, value: float) -> str:
-    """Return the flag of an input: a broken thermocouple or resistor overloads it above, a short below."""
-    if status & POSITIVE:
-        return OPEN
-    if status & NEGATIVE:
-        return SHORTED
-    return OUT_OF_RANGE if status & NOT_VALID or not math.isfinite(value) else GOOD
+    """Return the flag of an input: beyond its range, or its sensor faulty (broken, shorted or missing)."""
+    if status & (OVER | UNDER):
+        return OUT_OF_RANGE
+    if status & FAULTY_SENSOR:
+        return FAULTY
+    return GOOD if math.isfinite(value) else OUT_OF_RANGE

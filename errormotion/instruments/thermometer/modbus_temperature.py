@@ -27,7 +27,7 @@ class ModbusTemperature(Thermometer):
         id="modbus_temperature",
         kind="thermometer",
         summary="Temperatures in Modbus registers (ADAM-6018, 16-channel loggers, any map): TCP, RTU, RTU over TCP",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.thermometer.modbus:SimulatedModbus",
     )
     Settings: ClassVar[type[ModbusSettings]] = ModbusSettings

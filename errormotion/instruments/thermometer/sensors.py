@@ -17,7 +17,9 @@ Position = tuple[Length, Length, Length]
 
 GOOD = ""
 OPEN, SHORTED, OUT_OF_RANGE, NO_ANSWER, NOT_READ = "open", "shorted", "out of range", "no answer", "not read"
-FLAGS = (GOOD, OPEN, SHORTED, OUT_OF_RANGE, NO_ANSWER, NOT_READ)
+FAULTY = "faulty"
+"""Open or shorted: the device does not distinguish them."""
+FLAGS = (GOOD, OPEN, SHORTED, FAULTY, OUT_OF_RANGE, NO_ANSWER, NOT_READ)
 
 
 class ThermometerSettings(PluginSettings):
@@ -49,8 +51,8 @@ class Thermometer(Driver):
     Attributes
     ----------
     flags : dict of str to str
-        Of the last reading: empty for a good temperature, else ``open``, ``shorted``, ``out of range``, ``no answer``
-        (all of them, when `read` has failed), or ``not read`` before the first reading.
+        Of the last reading: empty for a good temperature, else ``open``, ``shorted``, ``faulty`` (one of the two),
+        ``out of range``, ``no answer`` (all of them, when `read` has failed), or ``not read`` before the first reading.
     """
 
     settings: ThermometerSettings

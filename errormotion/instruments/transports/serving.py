@@ -169,7 +169,13 @@ def _nothing() -> None:
 
 
 class TcpServer(Server):
-    """Listens where `placed` says, else on a free port of loopback; one connection at a time."""
+    """Listens where `placed` says, else on a free port of loopback; one connection at a time.
+
+    Attributes
+    ----------
+    connections : int
+        Connections accepted so far.
+    """
 
     def __init__(
         self, name: str, on_data: Callable[[bytes], None], on_connection: Callable[[], None] | None = None
@@ -185,6 +191,7 @@ class TcpServer(Server):
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._line: socket.socket | None = None
         self._connected = threading.Event()
+        self.connections = 0
         self.url = f"tcp://{reachable_at(host, self._listener.getsockname()[1])}"
 
     @property
@@ -229,6 +236,7 @@ class TcpServer(Server):
                 line, _ = self._listener.accept()
                 line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._line = line
+                self.connections += 1
                 self._on_connection()
                 self._connected.set()
                 continue

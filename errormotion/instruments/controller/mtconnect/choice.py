@@ -3,50 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.mtconnect.codec import DataItem, Device
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
 
+TIME_SERIES = "TIME_SERIES"
+_SINGLE_VALUES = ("VALUE", "DISCRETE")
+"""Representations of one value at a time; sets, tables and time series are only used where the settings name them."""
 _ACTUAL = ("ACTUAL", "")
 _COMMANDED = ("COMMANDED", "PROGRAMMED", "TARGET")
 _SPEEDS = ("ROTARY_VELOCITY", "SPINDLE_SPEED")
 _WHOLE_POSITION = {"position": _ACTUAL, "commanded_position": _COMMANDED}
+_PERCENT = "PERCENT"
+"""Of a feed or spindle speed: an override, not the speed."""
+_MOST_NAMED = 8  # data items in a message
+_RANKS: Mapping[str, int] = {"MACHINE": 0, "": 1, "WORK": 3}
+"""Order of coordinate systems; those of other types, such as BASE, are before WORK."""
 
 
-def _any(_: DataItem) -> bool:
-    return True
+@dataclass
+class Choice:
+    """What reports each quantity.
+
+    Attributes
+    ----------
+    items : dict of str to DataItem
+        By quantity: `settings.KEYS`, and whole positions where the axes have none of their own.
+    unclear : dict of str to str
+        Quantities that several items report equally well, and what to state in the settings.
+    """
+
+    items: dict[str, DataItem]
+    unclear: dict[str, str] = field(default_factory=dict)
 
 
-def choose(device: Device, settings: MTConnectSettings) -> Mapping[str, DataItem]:
-    """Return data items by quantity: `settings.KEYS`, and whole positions where the axes have none of their own.
+def choose(device: Device, settings: MTConnectSettings) -> Choice:
+    """Return the data items by quantity.
 
     Quantities without a data item are missing. An item in ``settings.items`` comes first; then type, subtype, the
-    name of the component, and machine before work coordinates decide.
+    name of the component, and machine before work coordinates decide. Items in percent are overrides, and items of
+    several values at once do not compete.
 
     Raises
     ------
     InstrumentError
-        A setting names an item or spindle that is not there, or several items fit: all are named.
+        A setting names an item or spindle that is not there, or an item of keys and values.
     """
-    chosen = {key: _named(device, key, item) for key, item in settings.items.items()}
+    choice = Choice({key: _named(device, key, item) for key, item in settings.items.items()})
     for axis, name in zip("XYZ", settings.axes, strict=True):
         for key, sub_types in _WHOLE_POSITION.items():
-            fits = _on(name, "Linear")
-            _add(chosen, device, f"{key}.{axis}", ("POSITION",), sub_types, fits)
+            _add(choice, device, f"{key}.{axis}", ("POSITION",), sub_types, _linear_axis(device, name))
     for key, sub_types in _WHOLE_POSITION.items():
-        if not any(f"{key}.{axis}" in chosen for axis in "XYZ"):
-            _add(chosen, device, key, ("PATH_POSITION",), sub_types)
-    _add(chosen, device, "spindle_speed", _SPEEDS, _ACTUAL, _spindle(device, settings))
-    if speed := chosen.get("spindle_speed"):
-        _add(chosen, device, "spindle_load", ("LOAD",), _ACTUAL, lambda item: item.component_id == speed.component_id)
-    _add(chosen, device, "feed", ("PATH_FEEDRATE",), _ACTUAL)
-    _add(chosen, device, "mode", ("CONTROLLER_MODE",), ("",))
-    _add(chosen, device, "program", ("PROGRAM",), ("", "ACTIVE", "MAIN"))
-    _add(chosen, device, "execution", ("EXECUTION",), ("",))
-    _add(chosen, device, "estop", ("EMERGENCY_STOP",), ("",))
-    _add(chosen, device, "availability", ("AVAILABILITY",), ("",), lambda item: item.component == "Device")
-    return chosen
+        if not any(f"{key}.{axis}" in choice.items or f"{key}.{axis}" in choice.unclear for axis in "XYZ"):
+            _add(choice, device, key, ("PATH_POSITION",), sub_types)
+    rotates = _spindle(device, settings)
+    _add(choice, device, "spindle_speed", _SPEEDS, _ACTUAL, lambda item: item.units != _PERCENT and rotates(item))
+    if speed := choice.items.get("spindle_speed"):
+        of_spindle = _of_component(speed.component_id)
+        _add(choice, device, "spindle_load", ("LOAD",), _ACTUAL, of_spindle)
+    _add(choice, device, "feed", ("PATH_FEEDRATE",), _ACTUAL, lambda item: item.units != _PERCENT)
+    _add(choice, device, "mode", ("CONTROLLER_MODE",), ("",))
+    _add(choice, device, "program", ("PROGRAM",), ("", "ACTIVE", "MAIN"))
+    _add(choice, device, "execution", ("EXECUTION",), ("",))
+    _add(choice, device, "estop", ("EMERGENCY_STOP",), ("",))
+    _add(choice, device, "availability", ("AVAILABILITY",), ("",), lambda item: item.component == "Device")
+    return choice
 
 
 def _named(device: Device, key: str, name: str) -> DataItem:
@@ -55,13 +78,31 @@ def _named(device: Device, key: str, name: str) -> DataItem:
         raise InstrumentError(
             f"'{key}': the device '{device.name}' has no data item '{name}'; it has {', '.join(sorted(device.items))}"
         )
+    if item.representation not in (*_SINGLE_VALUES, TIME_SERIES):
+        raise InstrumentError(
+            f"'{key}': the data item '{name}' is a {item.representation} of keys and values; name one that has a value"
+        )
     return item
+
+
+def _any(_: DataItem) -> bool:
+    return True
 
 
 def _on(name: str, component: str) -> Callable[[DataItem], bool]:
     return lambda item: (
         item.component == component and name.upper() in (item.component_name.upper(), item.native_name.upper())
     )
+
+
+def _linear_axis(device: Device, name: str) -> Callable[[DataItem], bool]:
+    """Return whether an item is of an axis: the one of this name, else the first of several, such as Z1 for Z."""
+    fits = _on(name, "Linear")
+    return fits if any(fits(item) for item in device.items.values()) else _on(f"{name}1", "Linear")
+
+
+def _of_component(component_id: str) -> Callable[[DataItem], bool]:
+    return lambda item: item.component_id == component_id
 
 
 def _spindle(device: Device, settings: MTConnectSettings) -> Callable[[DataItem], bool]:
@@ -77,30 +118,40 @@ def _spindle(device: Device, settings: MTConnectSettings) -> Callable[[DataItem]
 
 
 def _add(
-    chosen: dict[str, DataItem],
+    choice: Choice,
     device: Device,
     key: str,
     types: Sequence[str],
     sub_types: Sequence[str],
     fits: Callable[[DataItem], bool] = _any,
 ) -> None:
-    """Add the data item that fits best, if any; refuse to choose among several."""
-    if key in chosen:
+    """Add the data item that fits best, if any; where several do equally well, none."""
+    if key in choice.items:
         return
     for sub_type in sub_types:
         for kind in types:
             found = [
                 item
                 for item in device.items.values()
-                if item.type == kind and item.sub_type == sub_type and item.category != "CONDITION" and fits(item)
+                if item.type == kind
+                and item.sub_type == sub_type
+                and item.category != "CONDITION"
+                and item.representation in _SINGLE_VALUES
+                and fits(item)
             ]
-            found = [item for item in found if item.coordinate_system != "WORK"] or found
+            best = min((_rank(item) for item in found), default=0)
+            found = [item for item in found if _rank(item) == best]
             if len(found) > 1:
-                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found)
-                raise InstrumentError(
-                    f"Several data items report '{key}': {names}. State which one in the settings: "
+                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found[:_MOST_NAMED])
+                choice.unclear[key] = (
+                    f"Several data items report '{key}': {names}. It is unknown until the settings state which one: "
                     f'items = {{ "{key}" = "{found[0].id}" }}'
                 )
-            if found:
-                chosen[key] = found[0]
                 return
+            if found:
+                choice.items[key] = found[0]
+                return
+
+
+def _rank(item: DataItem) -> int:
+    return _RANKS.get(item.coordinate_system, 2)

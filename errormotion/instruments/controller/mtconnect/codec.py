@@ -1,21 +1,24 @@
 """The XML of MTConnect agents (ANSI/MTC1.4, parts 1 and 2): what a device has, what was observed, what went wrong.
 
-Names count without their namespaces, so that all versions from 1.2 to 2.x are read alike. A document with a document
-type is refused before anything in it is expanded: entities, external or nested, never come to be.
+Names count without their prefixes, so that all versions from 1.1 to 2.x are read alike.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
-from xml.etree import ElementTree
 
 from errormotion.errors import ProtocolError
+from errormotion.instruments.controller.mtconnect.xml import Element, parse_tree
 
 UNAVAILABLE = "UNAVAILABLE"
+_OBJECT, _WORK = "OBJECT", "WORK"
+_MOST_DIGITS = 20  # of a sequence number or instance id: 64 bit
+_MOST_TIME = 64  # characters
+_NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]{1,4})?", re.ASCII)
 LEVELS = ("Normal", "Warning", "Fault", "Unavailable")
 """Elements of a condition."""
 
@@ -76,7 +79,11 @@ class Header:
 
 @dataclass(frozen=True)
 class DataItem:
-    """A data item of a device, and its component: its element, names and id."""
+    """A data item of a device, and its component: its element, names and id.
+
+    ``coordinate_system`` is ``MACHINE``, ``WORK`` (from version 2.0 on a coordinate system of type OBJECT), empty where
+    the device does not state it, ``UNKNOWN`` where it refers to one that it does not have, or the type of another one.
+    """
 
     id: str
     category: str
@@ -89,6 +96,7 @@ class DataItem:
     component_name: str = ""
     native_name: str = ""
     component_id: str = ""
+    representation: str = "VALUE"
 
     @property
     def scale(self) -> float:
@@ -160,10 +168,12 @@ class Observation:
         """Return the values of a list such as ``1.5 2 3`` times ``scale``; one NaN where it is unavailable."""
         if self.value.upper() == UNAVAILABLE:
             return [math.nan]
-        try:
-            return [float(word) * scale for word in self.value.split()] or [math.nan]
-        except ValueError:
-            raise ProtocolError(f"The data item '{self.item}': expected a number; found '{self.value[:40]}'") from None
+        found = []
+        for word in self.value.split():
+            if not _NUMBER.fullmatch(word) or math.isinf(float(word)):
+                raise ProtocolError(f"The data item '{self.item}': expected a number; found '{self.value[:40]}'")
+            found.append(float(word) * scale)
+        return found or [math.nan]
 
 
 @dataclass(frozen=True)
@@ -184,8 +194,8 @@ def parse(data: bytes) -> Document:
     ProtocolError
         No XML, not of MTConnect, a document type, a header or an observation without what belongs to it.
     """
-    root = _tree(data)
-    kind = _local(root)
+    root = parse_tree(data)
+    kind = root.name
     header = _header(root)
     match kind:
         case "MTConnectDevices":
@@ -196,46 +206,16 @@ def parse(data: bytes) -> Document:
         case "MTConnectError":
             return Document(header, errors=_errors(root))
         case _:
-            raise ProtocolError(f"Expected a document of MTConnect (devices, streams or an error); found <{kind}>")
+            raise ProtocolError(f"Expected a document of MTConnect (devices, streams or an error); found <{kind[:40]}>")
 
 
-class _NoDoctype(ElementTree.TreeBuilder):
-    def doctype(self, name: str, *_: str | None) -> None:
-        """Refuse a document type: no document of MTConnect has one, and all entities are made there."""
-        raise ProtocolError(f"Expected a document of MTConnect without document type; found '{name[:40]}'")
-
-
-def _tree(data: bytes) -> ElementTree.Element:
-    parser = ElementTree.XMLParser(target=_NoDoctype())
-    try:
-        parser.feed(data)
-        root: Any = parser.close()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the others: unknown encodings
-        raise ProtocolError(f"Expected XML; it cannot be parsed ({error}); it starts with {data[:60]!r}") from None
-    if not isinstance(root, ElementTree.Element):
-        raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
-    return root
-
-
-def _local(element: ElementTree.Element) -> str:
-    return element.tag.rpartition("}")[2]
-
-
-def _child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
-    return next((child for child in element if _local(child) == name), None)
-
-
-def _whole(element: ElementTree.Element, name: str, default: int | None = None) -> int:
+def _whole(element: Element, name: str, default: int | None = None) -> int:
     text = element.get(name)
-    if text is None and default is not None:
+    if not text and default is not None:
         return default
-    try:
-        value = int(text or "")
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise ProtocolError(f"<{_local(element)}>: expected a number '{name}'; found {text!r}")
-    return value
+    if not (text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS):
+        raise ProtocolError(f"<{element.name}>: expected a number '{name}'; found '{text[:40]}'")
+    return int(text)
 
 
 def parse_time(text: str) -> float:
@@ -246,6 +226,8 @@ def parse_time(text: str) -> float:
     ProtocolError
         No such time.
     """
+    if len(text) > _MOST_TIME:
+        raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'")
     try:
         time = datetime.fromisoformat(text.partition("@")[0].strip())
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
@@ -253,91 +235,112 @@ def parse_time(text: str) -> float:
         raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'") from None
 
 
-def _header(root: ElementTree.Element) -> Header:
-    header = _child(root, "Header")
+def _header(root: Element) -> Header:
+    header = root.child("Header")
     if header is None:
-        raise ProtocolError(f"Expected a document of MTConnect; found <{_local(root)[:40]}> without a header")
+        raise ProtocolError(f"Expected a document of MTConnect; found <{root.name[:40]}> without a header")
     return Header(
         instance=_whole(header, "instanceId"),
-        created=parse_time(header.get("creationTime", "")),
+        created=parse_time(header.get("creationTime")),
         first=_whole(header, "firstSequence", 0),
         last=_whole(header, "lastSequence", 0),
         next=_whole(header, "nextSequence", 0),
         buffer=_whole(header, "bufferSize", 0),
-        version=header.get("version", ""),
-        sender=header.get("sender", ""),
+        version=header.get("version"),
+        sender=header.get("sender"),
     )
 
 
-def _devices(root: ElementTree.Element) -> Iterator[Device]:
-    for devices in root:
-        if _local(devices) != "Devices":
+def _devices(root: Element) -> Iterator[Device]:
+    for devices in root.children:
+        if devices.name != "Devices":
             continue
-        for device in devices:
-            if _local(device) != "Device":  # an agent describes itself as well
+        for device in devices.children:
+            if device.name != "Device":  # an agent describes itself as well
                 continue
-            description = _child(device, "Description")
-            about = {} if description is None else description.attrib
-            items = {item.id: item for item in _items(device)}
+            about = device.child("Description") or Element("Description", {})
             yield Device(
-                name=device.get("name", ""),
-                uuid=device.get("uuid", ""),
-                manufacturer=about.get("manufacturer", ""),
-                model=about.get("model", ""),
-                serial_number=about.get("serialNumber", ""),
-                items=items,
+                name=device.get("name"),
+                uuid=device.get("uuid"),
+                manufacturer=about.get("manufacturer"),
+                model=about.get("model"),
+                serial_number=about.get("serialNumber"),
+                items={item.id: item for item in _items(device)},
             )
 
 
-def _items(device: ElementTree.Element) -> Iterator[DataItem]:
+def _items(device: Element) -> Iterator[DataItem]:
     """Yield the data items of a device; those of a component are in its ``DataItems``."""
+    systems = {each.get("id"): each.get("type") for each in device.walk() if each.name == "CoordinateSystem"}
     waiting = [device]
     while waiting:
         component = waiting.pop()
-        for part in component:
-            match _local(part):
+        for part in component.children:
+            match part.name:
                 case "DataItems":
-                    yield from (_item(item, component) for item in part if _local(item) == "DataItem")
+                    yield from (_item(item, component, systems) for item in part.children if item.name == "DataItem")
                 case "Components":
-                    waiting.extend(part)
+                    waiting.extend(part.children)
 
 
-def _item(item: ElementTree.Element, component: ElementTree.Element) -> DataItem:
+def _item(item: Element, component: Element, systems: Mapping[str, str]) -> DataItem:
     if not item.get("id") or not item.get("type"):
-        raise ProtocolError(f"Expected data items with id and type; found {dict(item.attrib)}")
+        raise ProtocolError(f"Expected data items with id and type; found {str(item.attributes)[:200]}")
+    coordinates = item.get("coordinateSystem")
+    if reference := item.get("coordinateSystemIdRef"):  # from version 2.0 on
+        kind = systems.get(reference, "UNKNOWN")
+        coordinates = _WORK if kind == _OBJECT else kind
     return DataItem(
-        id=item.get("id", ""),
-        category=item.get("category", ""),
-        type=item.get("type", ""),
-        sub_type=item.get("subType", ""),
-        name=item.get("name", ""),
-        units=item.get("units", "") or item.get("nativeUnits", ""),
-        coordinate_system=item.get("coordinateSystem", ""),
-        component=_local(component),
-        component_name=component.get("name", ""),
-        native_name=component.get("nativeName", ""),
-        component_id=component.get("id", ""),
+        id=item.get("id"),
+        category=item.get("category"),
+        type=item.get("type"),
+        sub_type=item.get("subType"),
+        name=item.get("name"),
+        units=item.get("units") or item.get("nativeUnits"),
+        coordinate_system=coordinates,
+        component=component.name,
+        component_name=component.get("name"),
+        native_name=component.get("nativeName"),
+        component_id=component.get("id"),
+        representation=item.get("representation") or "VALUE",
     )
 
 
-def _observations(root: ElementTree.Element) -> Iterator[Observation]:
-    for element in root.iter():
+def _observations(root: Element) -> Iterator[Observation]:
+    for element in root.walk():
         item = element.get("dataItemId")
-        if item is None:
+        if not item:
             continue
-        level = _local(element) if _local(element) in LEVELS else ""
+        level = element.name if element.name in LEVELS else ""
         yield Observation(
             item=item,
             sequence=_whole(element, "sequence"),
-            time=parse_time(element.get("timestamp", "")),
-            value="".join(element.itertext()).strip(),
+            time=parse_time(element.get("timestamp")),
+            value=_value(element),
             level=level,
-            type=element.get("type", "") if level else "",
-            code=element.get("nativeCode", "") if level else "",
+            type=element.get("type") if level else "",
+            code=element.get("nativeCode") if level else "",
         )
 
 
-def _errors(root: ElementTree.Element) -> dict[str, str]:
-    found = {each.get("errorCode", ""): " ".join("".join(each.itertext()).split()) for each in root.iter()}
+def _value(element: Element) -> str:
+    """Return the text of an observation; of a set or table ``key=text`` of each entry."""
+    entries = [each for each in element.children if each.name == "Entry"]
+    if not entries:
+        return element.text.strip()
+    return " ".join(f"{each.get('key')}={_row(each)}" for each in entries)
+
+
+def _row(entry: Element) -> str:
+    cells = [f"{each.get('key')}={each.text.strip()}" for each in entry.children if each.name == "Cell"]
+    return f"{{{' '.join(cells)}}}" if cells else entry.text.strip()
+
+
+def _errors(root: Element) -> dict[str, str]:
+    found = {each.get("errorCode"): _words(each) for each in root.walk()}
     found.pop("", None)
     return found or {"UNKNOWN": "error without a code"}
+
+
+def _words(element: Element) -> str:
+    return " ".join(" ".join((element.text, *(each.text for each in element.children))).split())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.controller.mtconnect.choice import choose
+from errormotion.instruments.controller.mtconnect.choice import TIME_SERIES, choose
 from errormotion.instruments.controller.mtconnect.codec import (
     UNAVAILABLE,
     DataItem,
@@ -69,13 +69,15 @@ class MTConnect(Driver):
     ----------
     lost, restarts : int
         Observations that were overwritten unread, and restarts of the agent, both since the driver was made.
+    unclear : mapping of str to str
+        Quantities that several data items report equally well, and what to state in the settings; they are unknown.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
         id="mtconnect",
         kind="controller",
         summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.controller.mtconnect:SimulatedAgent",
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
@@ -94,11 +96,12 @@ class MTConnect(Driver):
         self.restarts = 0
         self._instance: int | None = None
         self._next: int | None = None
-
+        self._held = 0  # observations that the agent keeps
         self._started_at: float | None = None
         self._restarted = False  # while no client was connected
         self._device = Device("", "")
         self._items: Mapping[str, DataItem] = {}
+        self.unclear: Mapping[str, str] = {}
 
     @property
     def items(self) -> Mapping[str, DataItem]:
@@ -120,7 +123,7 @@ class MTConnect(Driver):
 
     def configure(self, settings: MTConnectSettings) -> None:
         """Use other settings from now on."""
-        self._items = choose(self._device, settings)
+        self._choose(settings)
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
@@ -237,7 +240,8 @@ class MTConnect(Driver):
     # ------------------------------------------------------------------ sequence numbers
 
     def _from(self) -> dict[str, str]:
-        return {"from": str(self._next), "count": str(self.settings.count)}
+        count = min(self.settings.count, self._held or self.settings.count)  # an agent refuses more than it holds
+        return {"from": str(self._next), "count": str(count)}
 
     def _continued(self, document: Document) -> Observed | None:
         """Return the observations of an answer; None where the sequence numbers must be determined again."""
@@ -250,7 +254,8 @@ class MTConnect(Driver):
     def _taken(self, document: Document, lost: int, *, restarted: bool) -> Observed:
         first = 0 if self._next is None else self._next
         fresh = tuple(each for each in document.observations if each.sequence >= first)
-        self._next = max(document.header.next, first)
+        after = fresh[-1].sequence + 1 if fresh else first  # for an agent that does not state the next number
+        self._next = max(document.header.next or after, first)
         self._count(lost)
         return Observed(fresh, self._next, lost, restarted)
 
@@ -262,7 +267,7 @@ class MTConnect(Driver):
             header = document.header
             assert self._next is not None
             again = self._notice(document)
-            if again or self._next > header.next:  # a restart also shows in the numbers
+            if again or self._next > _end(document):  # a restart also shows in the numbers
                 restarted = True
                 self._next = header.first
             elif header.first > self._next:
@@ -303,8 +308,12 @@ class MTConnect(Driver):
         return self._started_at
 
     def _number(self, key: str, values: Mapping[str, Observation | None]) -> float:
-        observation = values.get(key)
-        return math.nan if observation is None else observation.number(self._items[key].scale)
+        """Return a quantity in SI; of a time series the last of its values."""
+        observation, item = values.get(key), self._items.get(key)
+        if observation is None or item is None:
+            return math.nan
+        found = observation.numbers(item.scale)
+        return found[-1] if item.representation == TIME_SERIES else found[0]
 
     def _position(self, key: str, values: Mapping[str, Observation | None]) -> tuple[list[float], float]:
         """Return X, Y, Z, and when they last changed, s since 1970."""
@@ -335,6 +344,7 @@ class MTConnect(Driver):
         except ProtocolError as error:
             status = f" (HTTP status {answer.status})" if answer.status != 200 else ""
             raise ProtocolError(f"{self.address}/{request}{status}: {error}") from None
+        self._held = document.header.buffer
         if refused:
             self._refuse(document, request)
         return document
@@ -357,11 +367,26 @@ class MTConnect(Driver):
         document = self._query("probe")
         self._instance = document.header.instance
         self._device = self._one(document)
-        self._items = choose(self._device, self.settings)
-        for item in self._items.values():
+        self._choose(self.settings)
+        self._start(document)
+
+    def _choose(self, settings: MTConnectSettings) -> None:
+        """Assign the data items, and report what could not be assigned."""
+        choice = choose(self._device, settings)
+        for key, item in choice.items.items():
             if item.category == "SAMPLE":
                 _ = item.scale  # unknown units are reported now
-        self._start(document)
+            if key.startswith("position") and item.coordinate_system not in ("MACHINE", ""):
+                log.warning(
+                    "%s: '%s' is in the coordinate system %s, not of the machine: '%s'",
+                    self.address,
+                    key,
+                    item.coordinate_system,
+                    item.id,
+                )
+        for text in choice.unclear.values():
+            log.warning("%s: %s", self.address, text)
+        self._items, self.unclear = choice.items, choice.unclear
 
     def _connect(self) -> HttpTransport:
         return HttpTransport(
@@ -374,6 +399,13 @@ class MTConnect(Driver):
         if before is not None and before != self._instance:
             self.restarts += 1
             self._next, self._restarted = None, True
+
+
+def _end(document: Document) -> int:
+    """Return the number that follows the newest observation of the agent."""
+    header = document.header
+    newest = document.observations[-1].sequence if document.observations else -1
+    return header.next or max(header.last, newest) + 1
 
 
 def _text(observation: Observation | None) -> str:

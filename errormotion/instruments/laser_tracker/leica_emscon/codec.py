@@ -20,7 +20,8 @@ from typing import Any
 from errormotion.errors import ProtocolError
 
 HEADER = struct.Struct("<iI")
-MAX_PACKET_BYTES = 1 << 20  # 4 points per millisecond for 7 s
+MAX_PACKET_BYTES = 1 << 16
+"""Longest packet: 712 points with covariances; 1000 points per second come in at least 3 packets per second."""
 NAME = "64s"
 
 # ---------------------------------------------------------------------- types of packets
@@ -30,9 +31,9 @@ UNUSED_TYPES = frozenset({4, 5, 11})  # of probes with six freedoms: ignored
 
 # ---------------------------------------------------------------------- commands
 
-GET_SYSTEM_STATUS, SET_UNITS, INITIALIZE = 1, 5, 7
+GET_SYSTEM_STATUS, SET_UNITS, GET_UNITS, INITIALIZE = 1, 5, 6, 7
 SET_ENVIRONMENT, GET_ENVIRONMENT, SET_REFRACTION, GET_REFRACTION = 20, 21, 22, 23
-SET_MODE, SET_COORDINATES, SET_STATIONARY, SET_CONTINUOUS_TIME = 24, 26, 28, 30
+SET_MODE, SET_COORDINATES, GET_COORDINATES, SET_STATIONARY, SET_CONTINUOUS_TIME = 24, 26, 27, 28, 30
 SET_REFLECTOR, GET_REFLECTOR, GET_REFLECTORS, SET_SEARCH = 40, 41, 42, 43
 SET_SYSTEM_SETTINGS, GET_SYSTEM_SETTINGS, START_MEASUREMENT, STOP_MEASUREMENT = 47, 48, 49, 52
 GO_POSITION, FIND_REFLECTOR, UNKNOWN, GET_DIRECTION, GO_BIRD_BATH2 = 55, 63, 64, 66, 95
@@ -41,7 +42,7 @@ GET_TRACKER_INFO, GO_AND_MEASURE, GET_METEO_STATION = 132, 135, 139
 METRE, RADIAN, CELSIUS, MILLIBAR, RELATIVE = 0, 0, 0, 0, 0
 SPHERICAL = 7  # counterclockwise: azimuth, zenith angle, distance
 STATIONARY, CONTINUOUS_TIME = 0, 1
-NO_REGION = 10
+SPHERE = 0  # region, where none is used: headers up to 3.6 have 0 and 1 only, newer ones also 10, not applicable
 INITIALISED = 5  # tracker processor
 METEO_OFF, METEO_READ, METEO_REFRACTION = 0, 1, 2
 
@@ -91,6 +92,7 @@ def _unpack_name(data: bytes) -> str:
 _AIR = "d:temperature d:pressure d:humidity"
 _PLACE = "d:val1 d:val2 d:val3"
 _REFRACTION = "d:ifm d:adm"
+_UNITS = "I:length I:angle I:temperature I:pressure I:humidity"
 _SYSTEM = (
     "I:meteo i:transformation i:orientation i:keep_last i:unsolicited i:reflector_position i:try_mode i:level i:camera"
 )
@@ -119,7 +121,8 @@ COMMANDS: Mapping[int, Command] = {
             "",
             "I:last I:processor I:laser I:adm i:major i:minor i:build I:meteo i:flags i:serial_number",
         ),
-        (SET_UNITS, "SetUnits", "I:length I:angle I:temperature I:pressure I:humidity", ""),
+        (SET_UNITS, "SetUnits", _UNITS, ""),
+        (GET_UNITS, "GetUnits", "", _UNITS),
         (INITIALIZE, "Initialize", "", ""),
         (SET_ENVIRONMENT, "SetEnvironmentParams", _AIR, ""),
         (GET_ENVIRONMENT, "GetEnvironmentParams", "", _AIR),
@@ -127,6 +130,7 @@ COMMANDS: Mapping[int, Command] = {
         (GET_REFRACTION, "GetRefractionParams", "", _REFRACTION),
         (SET_MODE, "SetMeasurementMode", "I:mode", ""),
         (SET_COORDINATES, "SetCoordinateSystemType", "I:kind", ""),
+        (GET_COORDINATES, "GetCoordinateSystemType", "", "I:kind"),
         (SET_STATIONARY, "SetStationaryModeParams", "i:milliseconds i:use_adm", ""),
         (SET_CONTINUOUS_TIME, "SetContinuousTimeModeParams", "i:milliseconds i:count i:use_region I:region", ""),
         (SET_REFLECTOR, "SetReflector", "i:number", ""),

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.driver import Driver
-from errormotion.instruments.laser_tracker.leica_emscon import codec, statuses
-from errormotion.instruments.laser_tracker.leica_emscon.codec import Packet
-from errormotion.instruments.laser_tracker.leica_emscon.link import Event, Link, RefusedError
+from errormotion.instruments.laser_tracker.leica_emscon import codec, configuration, results, statuses
+from errormotion.instruments.laser_tracker.leica_emscon.link import Event, RefusedError
+from errormotion.instruments.laser_tracker.leica_emscon.session import EmSconSession
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
 from errormotion.instruments.laser_tracker.leica_emscon.streaming import points
 from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError, Reflector, polar
-from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 from errormotion.plugins.readings import Environment, Measurement
 
-MILLIBAR = 100.0  # Pa
-METEO = {"manual": codec.METEO_OFF, "read": codec.METEO_READ, "refraction": codec.METEO_REFRACTION}
 MEASURING_TIMEOUT_FACTOR = 20.0
 """Allowed duration of a measurement beyond the timeout, in measuring times: the tracker repeats measurements."""
 
 __all__ = ["Event", "LeicaEmScon"]
 
 
-class LeicaEmScon(Driver):
+class LeicaEmScon(EmSconSession):
     """A Leica laser tracker: LT or AT901 with an interferometer, or AT4xx with an absolute distance meter.
 
     Lengths are in m, angles in rad, positions in the tracker's own frame: neither the station orientation nor the
@@ -46,16 +41,9 @@ class LeicaEmScon(Driver):
         id="leica_emscon",
         kind="laser_tracker",
         summary="Leica laser trackers (LT, AT901, AT4xx) behind an emScon server, TCP",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
-    Settings: ClassVar[type[EmSconSettings]] = EmSconSettings
-    settings: EmSconSettings
-    _connection: Link | None = None
-    _streaming = False
-    _refraction = math.nan
-    _resets = 0
-    _last: tuple[float, float, float] | None = None
 
     # ------------------------------------------------------------------ identity and state
 
@@ -75,19 +63,9 @@ class LeicaEmScon(Driver):
         return self.settings.tracker != "AT4xx"
 
     @property
-    def beam_broken(self) -> bool:
-        """Whether the beam has lost its reflector, as far as the tracker has reported."""
-        return self._link.broken
-
-    @property
     def dead_path(self) -> int:
         """Number of times the distance was lost or set again since opening; 0 where distances are absolute."""
         return self._link.breaks + self._resets if self.distance_is_displacement else 0
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Messages of the tracker that were not requested, oldest first: broken beams, changes of its status."""
-        return tuple(self._link.events)
 
     def identify(self) -> Identity:
         """Request the identity of the tracker and of its weather station."""
@@ -109,16 +87,11 @@ class LeicaEmScon(Driver):
 
     def environment(self) -> Environment:
         """Return the air that the tracker uses: of its weather station, or as set."""
-        return _environment(self._query(codec.GET_ENVIRONMENT).values)
+        return results.environment(self._query(codec.GET_ENVIRONMENT).values)
 
     def set_environment(self, environment: Environment) -> None:
         """Set the state of the air; without effect where the weather station sets it."""
-        self._query(
-            codec.SET_ENVIRONMENT,
-            temperature=environment.temperature,
-            pressure=environment.pressure / MILLIBAR,
-            humidity=environment.humidity,
-        )
+        configuration.set_environment(self._link, environment)
 
     def refraction(self) -> float:
         """Return the index by which the tracker divides the optical path."""
@@ -129,8 +102,7 @@ class LeicaEmScon(Driver):
 
     def set_refraction(self, index: float) -> None:
         """Set the index, of interferometer and absolute distance meter alike."""
-        self._query(codec.SET_REFRACTION, ifm=float(index), adm=float(index))
-        self._link.stale_refraction = True
+        configuration.set_refraction(self._link, index)
 
     def reflectors(self) -> tuple[Reflector, ...]:
         """Return the reflectors that are defined in the tracker."""
@@ -232,6 +204,7 @@ class LeicaEmScon(Driver):
         self._not_streaming()
         goal = None if target is None else polar(target)
 
+        radius = self.settings.search_radius
         always_moves = goal is not None and self.settings.tracker == "AT4xx"
         found = Measurement(reason="beam broken", dead_path=self.dead_path)
         for attempt in range(self.settings.reacquire + 1):
@@ -241,7 +214,7 @@ class LeicaEmScon(Driver):
                         break
                     self._reacquire(goal)
                 found = self._measure(goal if always_moves else None)
-                if found.valid and goal is not None and not always_moves and not self._near(found, goal):
+                if found.valid and goal is not None and not always_moves and not results.is_near(found, goal, radius):
                     self._go(goal)
                     found = self._measure(None)
             except BeamBrokenError as error:
@@ -286,8 +259,10 @@ class LeicaEmScon(Driver):
         if self._link.broken:
             self._reacquire()
         link, failed, delivered = self._link, False, 0
+        if link.stale_units:
+            configuration.verify(link)
         self._query(codec.SET_MODE, mode=codec.CONTINUOUS_TIME)
-        self._query(codec.SET_CONTINUOUS_TIME, milliseconds=self.settings.interval, region=codec.NO_REGION)
+        self._query(codec.SET_CONTINUOUS_TIME, milliseconds=self.settings.interval, region=codec.SPHERE)
         self._streaming = True
         try:
             link.early.clear()
@@ -316,16 +291,10 @@ class LeicaEmScon(Driver):
         else:
             self.find_reflector(0.0)
 
-    def _near(self, found: Measurement, goal: tuple[float, float, float]) -> bool:
-        """Whether a measurement points to within the search radius of a position."""
-        angle = math.hypot(
-            found.angles[1] - goal[1],
-            math.remainder(found.angles[0] - goal[0], math.tau) * math.sin(goal[1]),
-        )
-        return angle * goal[2] <= self.settings.search_radius
-
     def _measure(self, goal: tuple[float, float, float] | None) -> Measurement:
         link, settings = self._link, self.settings
+        if link.stale_units:
+            configuration.verify(link)
         if link.stale_refraction:
             self.refraction()
         number, values = codec.START_MEASUREMENT, {}
@@ -340,52 +309,18 @@ class LeicaEmScon(Driver):
                 ),
                 settings.timeout + MEASURING_TIMEOUT_FACTOR * settings.measuring_time,
                 "a measurement",
+                number,
             )
         except RefusedError as error:
             if error.status not in statuses.NO_TARGET and not link.broken:
                 raise
-            return Measurement(reason=_reason(error.status), dead_path=self.dead_path)
+            return Measurement(reason=results.reason(error.status), dead_path=self.dead_path)
         if packet.kind == codec.ERROR or packet.status != statuses.OK:
-            return Measurement(reason=_reason(packet.status), dead_path=self.dead_path)
-        return self._result(packet.values)
+            return Measurement(reason=results.reason(packet.status), dead_path=self.dead_path)
+        self._last = results.polar_position(packet.values)
+        return results.measurement(packet.values, self._refraction, self.dead_path)
 
-    def _result(self, values: Any) -> Measurement:
-        azimuth, zenith, distance = (float(values[f"val{k}"]) for k in (1, 2, 3))
-        self._last = (azimuth, zenith, distance)
-        spread = [float(values[f"std{k}"]) for k in (3, 1, 2)]
-        return Measurement(
-            distance,
-            (azimuth, zenith),
-            (spread[0], spread[1], spread[2]),
-            _environment(values),
-            self._refraction,
-            valid=True,
-            dead_path=self.dead_path,
-        )
-
-    # ------------------------------------------------------------------ connection
-
-    @property
-    def _link(self) -> Link:
-        if self._connection is None or self._transport is None:
-            self.transport  # noqa: B018 - raises where it is not open
-            raise InstrumentError(f"The connection to {self.address} is closed; open it again")
-        return self._connection
-
-    def _query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
-        return self._link.query(number, limit=limit, **values)
-
-    def _query_optional(self, number: int) -> dict[str, Any]:
-        try:
-            return dict(self._query(number).values)
-        except RefusedError as error:
-            if error.status not in (statuses.NOT_IMPLEMENTED, 27):
-                raise
-            return {}
-
-    def _not_streaming(self) -> None:
-        if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
+    # ------------------------------------------------------------------ settings
 
     def configure(self, settings: EmSconSettings) -> None:
         """Configure the server: units, coordinates, weather station, measuring time, search radius, reflector.
@@ -396,56 +331,7 @@ class LeicaEmScon(Driver):
             The tracker refuses, or the reflector is not defined.
         """
         self._not_streaming()
-        self._query(
-            codec.SET_UNITS,
-            length=codec.METRE,
-            angle=codec.RADIAN,
-            temperature=codec.CELSIUS,
-            pressure=codec.MILLIBAR,
-            humidity=codec.RELATIVE,
-        )
-        self._query(codec.SET_COORDINATES, kind=codec.SPHERICAL)
-        system = dict(self._query(codec.GET_SYSTEM_SETTINGS).values)
-        system |= {"meteo": METEO[settings.meteo], "transformation": 0, "orientation": 0, "unsolicited": 1}
-        self._query(codec.SET_SYSTEM_SETTINGS, **system)
-        initialised = self._query(codec.GET_SYSTEM_STATUS).values["processor"] == codec.INITIALISED
-        if settings.initialise == "always" or (settings.initialise == "if_needed" and not initialised):
-            self._query(codec.INITIALIZE, limit=settings.initialise_timeout)
-        if settings.meteo == "manual":
-            self.set_environment(Environment(settings.temperature, settings.pressure, settings.humidity))
-        if settings.refraction_index is not None:
-            self.set_refraction(settings.refraction_index)
-        self._query(codec.SET_MODE, mode=codec.STATIONARY)
-        self._query(codec.SET_STATIONARY, milliseconds=round(1000 * settings.measuring_time), use_adm=1)
-        milliseconds = round(1000 * settings.motion_timeout / 2)
-        self._query(codec.SET_SEARCH, radius=settings.search_radius, milliseconds=milliseconds)
+        configuration.configure(self._link, settings)
         if settings.reflector is not None:
             self.set_reflector(settings.reflector)
-        self._link.stale_refraction = True
         self.settings = settings
-
-    def _connect(self) -> Transport:
-        return open_transport(
-            self.address, simulator=self.info.simulator, recorder=self._record, timeout=self.settings.timeout
-        )
-
-    def _start_session(self) -> None:
-        self._last, self._resets = None, 0
-        self._streaming = False
-        self._connection = Link(self.transport, self.settings.timeout, self.settings.busy_timeout)
-        self.configure(self.settings)
-
-    def _end_session(self) -> None:
-        link, self._connection = self._connection, None
-        if link is not None and self._streaming:
-            self._streaming = False
-            with suppress(InstrumentError):
-                link.query(codec.STOP_MEASUREMENT)
-
-
-def _environment(values: Any) -> Environment:
-    return Environment(float(values["temperature"]), MILLIBAR * float(values["pressure"]), float(values["humidity"]))
-
-
-def _reason(status: int) -> str:
-    return f"status {status}: {statuses.result_text(status)}"

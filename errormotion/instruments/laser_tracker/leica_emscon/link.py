@@ -15,6 +15,9 @@ from errormotion.instruments.laser_tracker.leica_emscon.codec import (
     COMMAND,
     COMMANDS,
     ERROR,
+    GET_COORDINATES,
+    GET_SYSTEM_STATUS,
+    GET_UNITS,
     HEADER,
     POINTS,
     REFLECTOR,
@@ -29,6 +32,8 @@ from errormotion.instruments.transports import Transport
 BUSY_INTERVAL = 0.1  # s between two requests to a busy server
 MAX_EVENTS = 1000  # largest number of stored events
 MAX_EARLY_PACKETS = 100  # largest number of stored packets of points
+MARKERS = (GET_SYSTEM_STATUS, GET_UNITS, GET_COORDINATES)
+"""Commands whose answer shows that the answers to all earlier ones have arrived; they change nothing."""
 
 
 class RefusedError(InstrumentError):
@@ -64,6 +69,10 @@ class Event:
 class Link:
     """One connection to an emScon server.
 
+    An answer carries the number of its command, but answers to two commands of one number look alike, and results of
+    measurements carry none. After a timeout a marker is therefore exchanged ahead of the next command: a server works
+    on one command at a time, so that the answer to the marker, other than "busy", is behind whatever was late.
+
     Parameters
     ----------
     transport : Transport
@@ -80,8 +89,8 @@ class Link:
         Whether the beam has lost its reflector, as far as the server has reported.
     breaks : int
         Number of broken beams.
-    stale_refraction : bool
-        Whether the refraction index may have changed since it was last read.
+    stale_refraction, stale_units : bool
+        Whether the refraction index, and units or coordinates, may have changed since they were last read.
     """
 
     def __init__(self, transport: Transport, timeout: float, busy_timeout: float) -> None:
@@ -90,11 +99,17 @@ class Link:
         self._busy_timeout = busy_timeout
         self._lost = ""
         self._waiting = bytearray()
+        self._owed: set[int] = set()  # commands whose answer was late
         self.events: deque[Event] = deque(maxlen=MAX_EVENTS)
         self.early: deque[Packet] = deque(maxlen=MAX_EARLY_PACKETS)
         self.broken = False
         self.breaks = 0
-        self.stale_refraction = True
+        self.stale_refraction = self.stale_units = True
+
+    @property
+    def url(self) -> str:
+        """Address, for messages."""
+        return self._transport.url
 
     def query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
         """Send a command and return its answer; retry while the server is busy.
@@ -103,8 +118,10 @@ class Link:
         ------
         RefusedError
             The server refuses.
-        InstrumentTimeoutError, ProtocolError
-            No answer in time, or an invalid one: the connection must be opened again.
+        InstrumentTimeoutError
+            No answer in time; it is not taken for the answer to a later command.
+        ProtocolError
+            An invalid answer: the connection must be opened again.
         """
         return next(self.query_all(number, limit=limit, **values))
 
@@ -119,6 +136,14 @@ class Link:
     ) -> Iterator[Packet]:
         """Send a command and yield its answers; ``total(first)`` states how many there are, see `ask`."""
         allowed = self._timeout if limit is None else limit
+        self._check()
+        if self._owed:
+            self._resynchronise()
+        yield from self._exchange(number, allowed, total, values)
+
+    def _exchange(
+        self, number: int, allowed: float, total: Callable[[Packet], int], values: dict[str, Any]
+    ) -> Iterator[Packet]:
         end = time.monotonic() + self._busy_timeout
         while True:
             self._check()
@@ -135,25 +160,56 @@ class Link:
         for _ in range(total(packet) - 1):
             yield self._answer(number, allowed)
 
-    def _answer(self, number: int, limit: float) -> Packet:
-        return self.await_packet(
-            lambda packet: packet.kind in (COMMAND, ERROR) and packet.command == number, limit, COMMANDS[number].name
-        )
-
-    def await_packet(self, wanted: Callable[[Packet], bool], limit: float, what: str) -> Packet:
-        """Return the next packet that fulfils ``wanted``; record the others.
+    def _resynchronise(self) -> None:
+        """Exchange a marker, and ignore what arrives before its answer.
 
         Raises
         ------
         InstrumentTimeoutError
-            No such packet within ``limit`` s. As it may arrive later, the connection can no longer be used.
+            No answer to the marker; the next command tries again, with another marker.
+        InstrumentError
+            The server stays busy, or no marker is left: the connection must be opened again.
+        """
+        marker = next((each for each in MARKERS if each not in self._owed), None)
+        if marker is None:
+            self._lost = "no answer to several commands"
+            self._check()
+            return
+        try:
+            next(self._exchange(marker, self._timeout, lambda _: 1, {}))
+        except InstrumentTimeoutError as error:
+            raise InstrumentTimeoutError(
+                f"{error}, after another command had no answer. Check the server, or close the connection and open it "
+                "again"
+            ) from None
+        except RefusedError as error:
+            if error.status == statuses.BUSY:
+                raise
+        self._owed.clear()
+        self.early.clear()
+
+    def _answer(self, number: int, limit: float) -> Packet:
+        return self.await_packet(
+            lambda packet: packet.kind in (COMMAND, ERROR) and packet.command == number,
+            limit,
+            COMMANDS[number].name,
+            number,
+        )
+
+    def await_packet(self, wanted: Callable[[Packet], bool], limit: float, what: str, number: int) -> Packet:
+        """Return the next packet that fulfils ``wanted``, to command ``number``; record the others.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No such packet within ``limit`` s. It may arrive later, and is then ignored.
         """
         end = time.monotonic() + limit
         while True:
             packet = self.next_packet(max(end - time.monotonic(), 0.0))
             if packet is None:
-                self._lost = f"no answer to {what} within {limit:g} s"
-                raise InstrumentTimeoutError(f"{self._transport.url}: {self._lost}")
+                self._owed.add(number)
+                raise InstrumentTimeoutError(f"{self._transport.url}: no answer to {what} within {limit:g} s")
             if wanted(packet):
                 return packet
             if packet.kind in POINTS:
@@ -208,6 +264,8 @@ class Link:
                 self.broken = False
             elif packet.status == statuses.REFRACTION_CHANGED:
                 self.stale_refraction = True
+            elif packet.status in statuses.FRAME_CHANGED:
+                self.stale_units = True
             self._remember("change", packet.status, statuses.CHANGES.get(packet.status, "unknown change"))
         elif packet.kind == ERROR:
             if packet.command == UNKNOWN:  # not related to a command: an error of the tracker itself

@@ -1,7 +1,7 @@
 """What the numbers of an emScon server mean, in words.
 
-Numbers are those of the interface's version 3.8. Errors of the tracker's own processor have further numbers that its
-manual lists; they are shown as they come.
+Numbers are those of the interface's C definitions 3.6 and newer. Errors of the tracker's own processor have further
+numbers that its manual lists; they are shown as they come.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ RESULTS: Mapping[int, str] = {
     NOT_IMPLEMENTED: "the command is not implemented in this tracker",
     3: "wrong parameter",
     23: "wrong current reflector",
+    24: "no centre of a circle found",
+    25: "no centre of a sphere found",
     26: "no tracker processor found",
     27: "no weather station found",
     28: "no point has been measured yet",
@@ -32,6 +34,8 @@ RESULTS: Mapping[int, str] = {
     30: "no absolute distance meter",
     31: "no level",
     32: "wrong firmware of the tracker processor",
+    33: "the server's database was not found",
+    34: "the licence has expired",
     35: "the command is not possible in the present mode",
     36: "an unknown error",
     NO_DISTANCE: "no distance is set: the interferometer has lost its count",
@@ -39,10 +43,18 @@ RESULTS: Mapping[int, str] = {
     NOT_INITIALISED: "the tracker is not initialised",
     40: "a module has not started",
     41: "a module did not answer in time",
+    42: "a module's data could not be read",
+    43: "a module's data could not be written",
     44: "not in the camera's position",
+    45: "the tracker processor has service firmware",
+    46: "the tracker is controlled by another system",
     56: "no such compensation",
     57: "temperature, pressure or humidity outside the range",
+    58: "a compensation is running",
     59: "an internal process is running",
+    60: "no copy protection dongle found",
+    61: "a module is not activated",
+    62: "a module has a wrong version",
     90: "nothing to import",
     94: "no temperature from the weather station",
     95: "no pressure from the weather station",
@@ -63,6 +75,7 @@ RESULTS: Mapping[int, str] = {
     10015: "the sensor does not answer its controller",
     10016: "no battery in the sensor",
     10017: "the compensator is not allowed",
+    10018: "the sensor has reached its working temperature",
     10019: "not level enough to initialise",
     10020: "the distance meter has a fault",
     10021: "the target recognition has a fault",
@@ -74,6 +87,9 @@ NO_TARGET = frozenset({NO_DISTANCE, NOT_READY, NO_RESULT, SYSTEM_NOT_READY})
 #: Messages of a server about itself that were not requested.
 MEASURE_NOT_READY, MEASURE_BUSY, MEASURE_READY = 25, 26, 27
 REFRACTION_CHANGED, ENVIRONMENT_CHANGED, DISTANCE_SET, UNITS_CHANGED, COORDINATES_CHANGED = 3, 2, 0, 6, 12
+SYSTEM_SETTINGS_CHANGED = 8
+FRAME_CHANGED = frozenset({UNITS_CHANGED, COORDINATES_CHANGED, SYSTEM_SETTINGS_CHANGED})
+"""What positions are expressed in may have changed."""
 CHANGES: Mapping[int, str] = {
     DISTANCE_SET: "distance set",
     1: "laser warmed up",
@@ -83,7 +99,9 @@ CHANGES: Mapping[int, str] = {
     5: "parameters of the distance meter changed",
     UNITS_CHANGED: "units changed",
     7: "reflector changed",
-    8: "system settings changed",
+    SYSTEM_SETTINGS_CHANGED: "system settings changed",
+    9: "temperature range changed",
+    10: "camera parameters changed",
     11: "compensation changed",
     COORDINATES_CHANGED: "coordinates changed",
     15: "station orientation changed",

@@ -1,12 +1,14 @@
 """Protocol of the LJ-X8000A: requests, replies, and the layout of its high-speed stream. Little-endian throughout.
 
-Facts marked (m) are from memory; each is one line to correct. A request is a 16-byte head and a payload that starts
-with its opcode; a reply has its return code at byte 17, the active program at 24 and its data from 28 on.
+The sources are on the page of the device, docs/reference/devices/keyence_ljx.md; facts marked (m) have none. A request
+is a 16-byte head and a payload that starts with its opcode. A reply has the length of its body at byte 12, the command
+that it answers at 16, its return code at 17, the active program at 24 and its data from 28 on.
 
 A profile of the stream is a header of six words (reserved, trigger count, encoder count, three reserved), the heights
-with 20 bits each from the least significant bit on, padded to a word, where switched on the intensities with 10 bits
-each, padded to a word, and the sum of all words before it. The bulk of it is done by the compiled functions of
-`kernels`; this module holds the facts and the small cases.
+with 20 bits each from the least significant bit on, where switched on the intensities with 10 bits each, and the sum
+of all words before it. The intensities follow the last height without padding, at bit 20 n; the room for heights and
+for intensities is each rounded up to a word. The bulk of it is done by the compiled functions of `kernels`; this module
+holds the facts and the small cases.
 """
 
 from __future__ import annotations
@@ -35,19 +37,27 @@ GET_COUNTS, GET_TEMPERATURE, GET_STATUS = 0x4B, 0x4C, 0x65
 
 REQUEST_HEAD = 16
 REPLY_HEAD = 28
-RETURN_CODE, PROGRAM = 17, 24  # positions in a reply
-MAX_REPLY_BYTES = 3 << 20  # (m)
+BODY_LENGTH, COMMAND, RETURN_CODE, PROGRAM = 12, 16, 17, 24  # positions in a reply
+BODY = 16  # position at which the body of a reply starts
+MAX_REPLY_BYTES = 3000 * 1024
+"""Longest reply, bytes: the receive buffer of the maker's Linux library."""
 FROM_NEXT = 2  # argument of PREPARE_STREAM: start with the next profile
 PROGRAMS = 16
 
 LENGTH = 1e-8  # m: unit of the Z unit, of X start and of the X pitch
 TEMPERATURE = 0.01  # degC
 
-RETURN_CODES: Mapping[int, str] = {  # (m)
+RETURN_CODES: Mapping[int, str] = {
+    0x21: "another model of controller",
+    0x31: "unknown command",
+    0x32: "wrong length of the command",
+    0x41: "not possible in this mode or state of the controller",
+    0x42: "parameter out of range, such as the number of a program",
     0x80: "not possible in this mode",
-    0x81: "not possible while its settings are being written",
+    0x81: "not possible with the present setting of batch measurement, or no such start position",
     0xA0: "no connection for the stream",
-    0xA1: "the stream is running already, or was not prepared",
+    0xA1: "the stream is running already",
+    0xA2: "another command code was expected, or the stream was not prepared",
     0xA3: "another start code was expected",
     0xA4: "the profiles to be sent have been deleted",
 }
@@ -79,11 +89,12 @@ def parse_request(frame: bytes) -> tuple[int, bytes, str]:
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply: return code (0 = done), active program, data."""
+    """A reply: return code (0 = done), active program, data, answered command (0: the device states none)."""
 
     code: int
     program: int
     data: bytes
+    command: int = 0
 
     def unpack(self, layout: str, place: int = 0) -> tuple[Any, ...]:
         """Return what ``struct`` reads from the data; ProtocolError where they are too short."""
@@ -106,17 +117,27 @@ def reply_length(head: bytes) -> int:
 
 
 def parse_reply(frame: bytes) -> Reply:
-    """Return a reply taken apart; ProtocolError where its length is wrong."""
+    """Return a reply taken apart; ProtocolError where one of its two lengths is wrong.
+
+    A body length of 0 is accepted: the maker's client does not read it.
+    """
     if len(frame) < REPLY_HEAD or reply_length(frame[:4]) != len(frame):
         raise ProtocolError(f"Expected a reply; found {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")
-    return Reply(frame[RETURN_CODE], frame[PROGRAM], frame[REPLY_HEAD:])
+    body: int = struct.unpack_from("<I", frame, BODY_LENGTH)[0]
+    if body not in (0, len(frame) - BODY):
+        raise ProtocolError(
+            f"A reply of {len(frame)} bytes has a body of {len(frame) - BODY}; found the length {body} at byte "
+            f"{BODY_LENGTH}: {frame[:REPLY_HEAD].hex(' ')}"
+        )
+    return Reply(frame[RETURN_CODE], frame[PROGRAM], frame[REPLY_HEAD:], frame[COMMAND])
 
 
-def reply(data: bytes = b"", *, code: int = 0, program: int = 0) -> bytes:
+def reply(data: bytes = b"", *, code: int = 0, program: int = 0, command: int = 0) -> bytes:
     """Return the bytes of a reply."""
     head = bytearray(REPLY_HEAD)
     struct.pack_into("<I", head, 0, REPLY_HEAD + len(data) - 4)
-    head[RETURN_CODE], head[PROGRAM] = code, program
+    struct.pack_into("<I", head, BODY_LENGTH, REPLY_HEAD + len(data) - BODY)
+    head[COMMAND], head[RETURN_CODE], head[PROGRAM] = command, code, program
     return bytes(head) + data
 
 
@@ -211,12 +232,12 @@ class StreamLayout:
 
     @property
     def intensity_words(self) -> int:
-        """Words that the intensities of a profile take."""
+        """Words by which intensities lengthen a profile. They start at bit ``HEIGHT_BITS * points`` of its data."""
         return -(-self.points * INTENSITY_BITS // WORD_BITS) if self.with_intensity else 0
 
     @property
     def words(self) -> int:
-        """Words of a whole profile, header and checksum included."""
+        """Words of a whole profile, header and checksum included; heights and intensities are each rounded up."""
         return HEADER_WORDS + self.height_words + self.intensity_words + 1
 
     @property

@@ -1,4 +1,4 @@
-"""Decoder of a stream: joins split data, checks profiles, follows the trigger count, fills gaps."""
+"""Decoder of a stream: joins split data, checks profiles, follows the trigger count, fills short gaps."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ Array = np.ndarray[Any, Any]
 WORD = 4
 UNSYNCHRONISED_PROFILES = 8
 """Amount of data without a valid profile after which the stream ends with an error, in profiles."""
+PIECE = 1 << 16
+"""Data decoded at once, bytes: longer data are decoded piece by piece, so that the effort grows with their length."""
 
 
 class StreamEndedError(InstrumentError):
@@ -31,11 +33,15 @@ class StreamEndedError(InstrumentError):
 
 
 class StreamDecoder:
-    """Turns the bytes of one stream, however they are split, into profiles without gaps, still packed.
+    """Turns the bytes of one stream, however they are split, into profiles, still packed.
 
     A chunk's values are (n, words) uint32 and its reasons 0, or LOST or GARBLED where there is no profile. They are
-    LOST where the trigger count jumps between valid profiles, GARBLED where damaged bytes are between them. After
-    damaged bytes the next position is searched at which checksum and trigger count are right.
+    LOST where the trigger count jumps between valid profiles, GARBLED where damaged bytes are between them. A gap of
+    more than `kernels.MAX_FILLED_PROFILES` profiles brings no rows; the trigger counts on both sides of it show its
+    length. After damaged bytes the next position is searched at which checksum and trigger count are right.
+
+    Memory: a chunk holds at most ``MAX_FILLED_PROFILES + 1`` times the received bytes, and is built from a copy of
+    itself; between two calls at most ``UNSYNCHRONISED_PROFILES`` profiles and ``PIECE`` bytes are kept.
 
     Parameters
     ----------
@@ -51,6 +57,7 @@ class StreamDecoder:
         self._rest = b""
         self._trigger = -1  # expected next count; -1: any
         self._searching = False
+        self._searched = 0  # bytes of the rest at which no profile starts
         self.first_trigger = 0
         self.stray_bytes = 0
 
@@ -60,54 +67,68 @@ class StreamDecoder:
         Its ``end`` is a ProtocolError where many bytes contain no profile, or the trigger count is
         inconsistent; a StreamEndedError where the profiler ends the stream.
         """
-        self._rest += data
         values: list[Array] = []
         reasons: list[Array] = []
         end: InstrumentError | None = None
+        for start in range(0, len(data), PIECE):
+            self._rest += data[start : start + PIECE]
+            end = self._decode(values, reasons)
+            if end is not None:
+                break
+        return self._chunk(values, reasons, end)
+
+    def _decode(self, values: list[Array], reasons: list[Array]) -> InstrumentError | None:
+        """Append the complete profiles of the rest; return why nothing follows, if so."""
         while True:
             if self._searching and not self._found():
                 if len(self._rest) > UNSYNCHRONISED_PROFILES * self._size * WORD:
-                    end = ProtocolError(
+                    return ProtocolError(
                         f"No profile of {self._size} words with a right checksum in {len(self._rest)} bytes: were "
                         "settings changed during the stream? Start the stream again"
                     )
-                break
+                return None
             words = np.frombuffer(self._rest, dtype="<u4", count=len(self._rest) // WORD)
             aheads = np.empty(words.size // self._size, dtype=np.int64)
             n, why = kernels.follow(words, self._size, self._trigger, aheads)
             if n:
                 self._take(words[: n * self._size].reshape(n, self._size), aheads[:n], values, reasons)
                 self._rest = self._rest[n * self._size * WORD :]
+            if why == kernels.MORE:
+                return None
             if why == kernels.DAMAGED:
-                self._searching = True
+                self._searching, self._searched = True, 0
             elif why == kernels.LEAP:
                 count = int(words[n * self._size + TRIGGER_WORD])
-                end = ProtocolError(
+                return ProtocolError(
                     f"The trigger count jumps from {self._trigger - 1} to {count}: was it reset, or the profiler "
                     "restarted? Start the stream again"
                 )
-            if why == kernels.NOTICE:
-                if len(self._rest) < NOTIFY_WORDS * WORD:
-                    break
-                end = self._notice()
-            if end is not None or why == kernels.MORE:
-                break
-        return self._chunk(values, reasons, end)
+            elif len(self._rest) < NOTIFY_WORDS * WORD:
+                return None
+            elif (end := self._notice()) is not None:
+                return end
 
     def _found(self) -> bool:
-        """Skip to the next valid profile; False where there is none yet."""
+        """Skip to the next valid profile; False where there is none yet. No byte is searched twice."""
+        room = self._size * WORD
+        while self._searched + room <= len(self._rest):
+            part = self._rest[self._searched : self._searched + 2 * room - 1]
+            if (place := self._first_profile(part)) >= 0:
+                self.stray_bytes += self._searched + place
+                self._rest = self._rest[self._searched + place :]
+                return True
+            self._searched += len(part) - room + 1
+        return False
+
+    def _first_profile(self, data: bytes) -> int:
+        """Return the first byte of data at which a valid profile starts; -1: none."""
         places = []
         for shift in range(WORD):
-            rest = self._rest[shift:]
-            words = np.frombuffer(rest, dtype="<u4", count=len(rest) // WORD)
+            words = np.frombuffer(data[shift:], dtype="<u4", count=(len(data) - shift) // WORD)
             place = kernels.search(words, self._size, self._trigger)
             if place >= 0:
                 places.append(place * WORD + shift)
-        if not places:
-            return False
-        self.stray_bytes += min(places)
-        self._rest = self._rest[min(places) :]
-        return True
+        return min(places, default=-1)
 
     def _take(self, profiles: Array, aheads: Array, values: list[Array], reasons: list[Array]) -> None:
         if self._trigger < 0:
@@ -115,12 +136,18 @@ class StreamDecoder:
         self._trigger = (int(profiles[-1, TRIGGER_WORD]) + 1) & 0xFFFFFFFF
         why = GARBLED if self._searching else LOST
         self._searching = False
+        aheads = np.where(aheads > kernels.MAX_FILLED_PROFILES, 0, aheads)
         if not aheads.any():
             values.append(profiles)
             reasons.append(np.zeros(len(profiles), dtype=np.uint8))
             return
         places = np.arange(len(profiles)) + np.cumsum(aheads)
         filled = np.zeros((places[-1] + 1, self._size), dtype=np.uint32)
+        rows = np.arange(len(filled))
+        following = np.searchsorted(places, rows)  # the received profile at a row, or the next one
+        filled[:, TRIGGER_WORD] = (profiles[following, TRIGGER_WORD].astype(np.int64) + rows - places[following]) & (
+            0xFFFFFFFF
+        )
         filled[places] = profiles
         missing = np.full(len(filled), LOST, dtype=np.uint8)
         missing[: places[0]] = why
@@ -157,8 +184,7 @@ class HeightDecoder:
 
     def intensities(self, profiles: Array, reasons: Array, intensities: Array) -> None:
         """Unpack the intensities of profiles into (n, point)."""
-        first = self._layout.words - 1 - self._layout.intensity_words
-        kernels.unpack_intensities(profiles, first, reasons, intensities)
+        kernels.unpack_intensities(profiles, reasons, intensities)
 
     def encoder(self, readings: Array, reasons: Array) -> Array:
         """Return encoder counts of the next profiles (n,), float64, corrected for the overflow of their 32 bits.

@@ -23,12 +23,15 @@ from errormotion.instruments.line_profiler.keyence_ljx.codec import (
     Reply,
     StreamLayout,
 )
+from errormotion.instruments.line_profiler.keyence_ljx.commands import CommandLine
 from errormotion.instruments.line_profiler.keyence_ljx.settings import LJXSettings
 from errormotion.instruments.transports import Transport
 from errormotion.plugins import Identity, InstrumentInfo
 from errormotion.plugins.readings import Profiles
 
 if TYPE_CHECKING:
+    from errormotion.instruments.line_profiler.keyence_ljx.blocks import SpacedRows
+    from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder
     from errormotion.instruments.streaming import Reader
     from errormotion.instruments.transports.lines import ManyLines
 
@@ -75,7 +78,7 @@ class KeyenceLJX(Driver):
     settings: LJXSettings
     name = "keyence_ljx"
     _reader: Reader | None = None
-    _lost: InstrumentError | None = None
+    _commands: CommandLine | None = None
     _notice_pending = False  # a stream was stopped, and its notice has not arrived
 
     @property
@@ -163,26 +166,18 @@ class KeyenceLJX(Driver):
         Raises
         ------
         InstrumentError
-            The profiler refuses, or an earlier reply failed, so that replies cannot be assigned.
+            The profiler refuses, or the connection is lost: replies can no longer be assigned to requests.
         InstrumentTimeoutError
-            It does not answer.
+            It does not answer. A reply that comes later is skipped.
         ProtocolError
             The bytes are not a reply.
         """
-        transport = self.transport
-        if self._lost is not None:
-            raise InstrumentError(f"The connection to {self.name} is lost ({self._lost}); close and open it again")
-        try:
-            transport.write(codec.request(opcode, arguments, generation=self.settings.generation))
-            head = transport.read_exactly(4, self.settings.timeout)
-            rest = transport.read_exactly(codec.reply_length(head) - len(head), self.settings.timeout)
-            reply = codec.parse_reply(head + rest)
-        except InstrumentError as error:
-            self._lost = error
-            raise
-        if reply.code:
-            raise codec.refusal(opcode, reply.code)
-        return reply
+        return self._line().command(opcode, arguments)
+
+    def _line(self) -> CommandLine:
+        if self._commands is None:
+            self._commands = CommandLine(self.transport, self.name, self.settings.generation, self.settings.timeout)
+        return self._commands
 
     # ------------------------------------------------------------------ measuring
 
@@ -201,7 +196,7 @@ class KeyenceLJX(Driver):
             with closing(self._stream(1, lambda: refused.extend(self._refusals()))) as stream:
                 return np.asarray(next(stream).heights[0])
         except InstrumentTimeoutError as error:
-            if self._lost is not None:  # it does not answer commands either
+            if not self._line().answers:  # it does not answer commands either
                 raise
             raise InstrumentTimeoutError(self._untriggered(refused)) from error
 
@@ -210,7 +205,7 @@ class KeyenceLJX(Driver):
         try:
             self.trigger()
         except InstrumentError as error:
-            if self._lost is not None:
+            if not self._line().answers:
                 raise
             return [error]
         return []
@@ -241,7 +236,9 @@ class KeyenceLJX(Driver):
         Yields
         ------
         Profiles
-            ``values`` (point, block) in m. Profiles that the trigger count shows missing are NaN and counted.
+            ``values`` (point, block) in m. Profiles that the trigger count shows missing are NaN and counted. What
+            remains of a gap at the end of a block is counted there and skipped: ``first`` and ``trigger`` of the next
+            block are those of the next profile.
 
         Raises
         ------
@@ -256,6 +253,7 @@ class KeyenceLJX(Driver):
 
     def _stream(self, block: int | None, on_start: Callable[[], None] | None = None) -> Generator[Profiles]:
         """Yield blocks as `stream`; ``on_start`` is called once the profiler streams."""
+        from errormotion.instruments.line_profiler.keyence_ljx.blocks import SpacedRows
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder, StreamDecoder
         from errormotion.instruments.streaming import Reader
 
@@ -267,7 +265,9 @@ class KeyenceLJX(Driver):
         follow = StreamDecoder(layout, late_notice=self._notice_pending)
         limit = max(SMALLEST_QUEUE, 2 * size, round(QUEUE_SECONDS * self.rate))
         lines: ManyLines = self.transport  # type: ignore[assignment]
+        timeout = self.settings.timeout
         self._reader = reader = Reader(lines.line(STREAM), follow, name=self.name, limit=limit, overrun=LOST)
+        rows = SpacedRows(lambda values, reasons: reader.fill(values, reasons, timeout), BATCH_PROFILES, layout.words)
         try:
             self.command(codec.START_STREAM, struct.pack("<Ii", codec.PREPARE_STREAM, layout.start_code))
             if on_start is not None:
@@ -276,7 +276,7 @@ class KeyenceLJX(Driver):
             while True:
                 if self._reader is not reader:
                     raise InstrumentError(f"{self.name}: this stream was closed; start another one")
-                parts = self._block(reader, unpack, layout, size)
+                parts, skipped = self._block(rows, unpack, layout, size)
                 yield Profiles(
                     first=first,
                     rate=self.rate,
@@ -285,11 +285,14 @@ class KeyenceLJX(Driver):
                     trigger=follow.first_trigger + first + np.arange(size),
                     **parts,
                 )
-                first += size
+                first += size + skipped
         finally:
             self._stop()
 
-    def _block(self, reader: Reader, unpack: Any, layout: StreamLayout, size: int) -> dict[str, Any]:
+    def _block(
+        self, rows: SpacedRows, unpack: HeightDecoder, layout: StreamLayout, size: int
+    ) -> tuple[dict[str, Any], int]:
+        """Return the parts of the next block, and the number of lost profiles skipped after it."""
         heights = np.empty((size, layout.points))
         intensity = np.empty((size, layout.points), dtype=np.uint16) if layout.with_intensity else None
         encoder = np.empty(size)
@@ -299,18 +302,20 @@ class KeyenceLJX(Driver):
         for start in range(0, size, BATCH_PROFILES):
             part = slice(start, min(start + BATCH_PROFILES, size))
             n = part.stop - part.start
-            reader.fill(packed[:n], reasons[:n], self.settings.timeout)
+            rows.fill(packed[:n], reasons[:n])
             unpack.heights(packed[:n], reasons[:n], heights[part], counts)
             encoder[part] = unpack.encoder(packed[:n, ENCODER_WORD], reasons[:n])
             if intensity is not None:
                 unpack.intensities(packed[:n], reasons[:n], intensity[part])
-        return {
+        skipped = rows.skip_gap()
+        parts = {
             "values": heights.T,
             "intensity": intensity,
             "encoder": encoder,
-            "dropped": int(counts[LOST]) // layout.points,
+            "dropped": int(counts[LOST]) // layout.points + skipped,
             "invalid": {name: int(count) for name, count in zip(REASONS, counts, strict=True) if count},
         }
+        return parts, skipped
 
     def _stop(self) -> None:
         """Stop the stream and its thread; a profiler that does not confirm this must be opened again."""
@@ -325,9 +330,9 @@ class KeyenceLJX(Driver):
             ended = reader.finish(QUIET_INTERVAL, self.settings.timeout)
             self._notice_pending = ended is None
             if ended is not None and not isinstance(ended, StreamEndedError):
-                self._lost = ended
+                self._line().lost = ended
         except InstrumentError as error:
-            self._lost = error
+            self._line().lost = error
         finally:
             reader.abandon()
 
@@ -345,12 +350,12 @@ class KeyenceLJX(Driver):
         )
 
     def _start_session(self) -> None:
-        self._lost, self._notice_pending = None, False
+        self._commands, self._notice_pending = None, False
         try:
             self.command(codec.STOP_STREAM)  # an earlier connection may have left it streaming
             self._notice_pending = True
         except InstrumentError:
-            if self._lost is not None:  # else there was no stream to stop
+            if not self._line().answers:  # else there was no stream to stop
                 raise
         self.configure(self.settings)
 

@@ -20,6 +20,8 @@ Array = np.ndarray[Any, Any]
 LOWEST = SMALLEST_HEIGHT - SENTINELS
 MAX_GAP_PROFILES = 1 << 16
 """Profiles: a trigger count that leaps further did not come from lost profiles."""
+MAX_FILLED_PROFILES = 64
+"""Longest gap of which each lost profile is a row, profiles; a longer gap is a leap of the trigger count."""
 
 MORE, NOTICE, DAMAGED, LEAP = range(4)  # why `follow` stops
 
@@ -152,14 +154,13 @@ def _field(words: Array, bit: int, width: int) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
-def unpack_intensities(profiles: Array, first: int, reasons: Array, intensities: Array) -> None:
-    """Unpack intensities: two in 20 bits, the first of them in the upper half.
+def unpack_intensities(profiles: Array, reasons: Array, intensities: Array) -> None:
+    """Unpack intensities: two in 20 bits, the first of them in the upper half, without padding after the heights.
 
     Parameters
     ----------
     profiles : ndarray, uint32, (n, words)
-    first : int
-        Word at which they start.
+        Whole profiles with intensities.
     reasons : ndarray, uint8, (n,)
         Not 0 where there is no profile.
     intensities : ndarray, uint16, (n, point)
@@ -170,16 +171,17 @@ def unpack_intensities(profiles: Array, first: int, reasons: Array, intensities:
         if reasons[row]:
             intensities[row] = 0
             continue
-        words = profiles[row, first:]
+        words = profiles[row, HEADER_WORDS:]
         for i in range(points):
             intensities[row, i] = _field(words, _intensity_bit(i, points), 10)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def _intensity_bit(i: int, points: int) -> int:
+    first = 20 * points
     if i % 2 == 1:
-        return 10 * (i - 1)
-    return 10 * (i + 1) if i + 1 < points else 10 * i
+        return first + 10 * (i - 1)
+    return first + (10 * (i + 1) if i + 1 < points else 10 * i)  # the last of an odd number: an assumption
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
@@ -210,7 +212,6 @@ def pack(raws: Array, intensities: Array, trigger: int, encoder: int, words: Arr
     words[TRIGGER_WORD + 1] = np.uint32(encoder & 0xFFFFFFFF)
     for i in range(raws.size):
         _put(words[HEADER_WORDS:], 20 * i, raws[i] & 0xFFFFF)
-    first = HEADER_WORDS + (20 * raws.size + 31) // 32
     for i in range(intensities.size):
-        _put(words[first:], _intensity_bit(i, intensities.size), intensities[i] & 0x3FF)
+        _put(words[HEADER_WORDS:], _intensity_bit(i, intensities.size), intensities[i] & 0x3FF)
     words[-1] = _sum(words, 0, words.size - 1)

@@ -67,28 +67,43 @@ def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
         raise InstrumentError(
             f"{path} has heights only: set 'x_pitch' and 'y_pitch', the distances of its columns and rows"
         )
+    heights = _in_metres(_cleared(_csv_rows(path, settings.delimiter), settings), unit)
+    n, points = heights.shape
+    return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
+
+
+def _csv_rows(path: Path, delimiter: str) -> Array:
+    """Return the cells of a CSV file, (row, column); NaN where empty. A delimiter at the end adds no column."""
     rows: list[list[float]] = []
+    lines: list[tuple[int, bool]] = []  # number of the line, and whether it ends with a delimiter
+    number = 0
     try:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
-                text = line.strip("\r\n")
-                if not text.strip() or text.startswith("#"):
+                if not line.strip() or line.startswith("#"):
                     continue
-                row = [float(cell) if cell.strip() else np.nan for cell in text.split(settings.delimiter)]
-                if rows and len(row) != len(rows[0]):
-                    raise InstrumentError(
-                        f"{path}, line {number}: expected {len(rows[0])} cells as in the lines before; found {len(row)}"
-                    )
-                rows.append(row)
+                cells = [cell.strip() for cell in line.strip("\r\n").split(delimiter)]
+                rows.append([float(cell) if cell else np.nan for cell in cells])
+                lines.append((number, len(cells) > 1 and not cells[-1]))
+    except UnicodeDecodeError as error:
+        raise InstrumentError(
+            f"{path}, after line {number}: byte {error.object[error.start]:#x} is not UTF-8"
+        ) from None
     except ValueError as error:
-        raise InstrumentError(f"{path}, line {len(rows) + 1} of heights: {error}") from None
+        raise InstrumentError(f"{path}, line {number}: {error}") from None
     except OSError as error:
         raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
     if not rows:
         raise InstrumentError(f"{path}: expected heights; found none")
-    heights = _in_metres(_cleared(np.array(rows), settings), unit)
-    n, points = heights.shape
-    return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
+    longest = max(map(len, rows))
+    if all(ended for row, (_, ended) in zip(rows, lines, strict=True) if len(row) == longest):
+        rows = [row[: longest - 1] for row in rows]
+    for row, (number, _) in zip(rows, lines, strict=True):
+        if len(row) != len(rows[0]):
+            raise InstrumentError(
+                f"{path}, line {number}: expected {len(rows[0])} cells as in the lines before; found {len(row)}"
+            )
+    return np.array(rows)
 
 
 def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:

@@ -5,8 +5,8 @@ the value: ``MS,01`` is answered by ``MS,01,+01.2345``. A refusal is ``ER,comman
 has eight characters: a sign and seven digits with their point, or one of three texts that mean no value. The text
 does not state whether it is in mm or um: that is a setting of the controller, its smallest displayed unit.
 
-Formats, modes and error codes are those of the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6). Facts marked (m) are
-from memory; each is one line to correct.
+Formats, modes and errors of the LK-G3000 are those of the maker's manual (LK-G-M-NO5-E, pages 5-5 and 5-6), errors of
+the LK-G5000 those that clients of others list. Facts marked (m) are from memory; each is one line to correct.
 """
 
 from __future__ import annotations
@@ -31,17 +31,19 @@ ABSENT, ABOVE, BELOW, GARBLED = range(1, 5)
 _TEXTS: Mapping[str, int] = {NO_VALUE: ABSENT, OVER: ABOVE, UNDER: BELOW}
 _NUMBER = re.compile(r"[+-](?=.{7}\Z)[0-9]+\.([0-9]+)")
 
-COMMAND_ERROR, STATE_ERROR, LENGTH_ERROR, COUNT_ERROR, PARAMETER_ERROR = "00", "01", "20", "21", "22"
-TIMEOUT_ERROR, OTHER_ERROR = "88", "99"
-ERRORS: Mapping[str, str] = {
-    COMMAND_ERROR: "unknown command; check the setting 'controller'",
-    STATE_ERROR: "not possible in this mode: measuring and setting are different modes",
-    LENGTH_ERROR: "wrong length of the command",
-    COUNT_ERROR: "wrong number of parameters",
-    PARAMETER_ERROR: "a parameter is out of range; check the setting 'output'",
-    TIMEOUT_ERROR: "timeout in the controller; retry",
-    OTHER_ERROR: "another error; see the display of the controller",
-}
+#: Error "not possible in this mode": of the LK-G3000 and of the LK-G5000.
+STATE_ERRORS = ("01", "51")
+_MEANINGS = (
+    (("00", "50"), "unknown command; check the setting 'controller'"),
+    (STATE_ERRORS, "not possible in this mode: measuring and setting are different modes"),
+    (("20", "60"), "wrong length of the command"),
+    (("21", "61"), "wrong number of parameters"),
+    (("22", "62"), "a parameter is out of range; check the setting 'output'"),
+    (("88",), "timeout in the controller; retry"),
+    (("99",), "another error; see the display of the controller"),
+)
+#: Meanings of errors. The LK-G3000 counts them from 00 (its manual), the LK-G5000 from 50 (clients of others).
+ERRORS: Mapping[str, str] = {code: meaning for codes, meaning in _MEANINGS for code in codes}
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
     REASONS,
     SETTING,
     SIGNS,
-    STATE_ERROR,
+    STATE_ERRORS,
     check_rate,
     decode,
     encode,
@@ -128,7 +128,8 @@ class KeyenceLK(Driver):
                 raise
             self._enter(MEASURING)
         if settings.set_up == "set":
-            self._query(CONTROLLERS[settings.controller].zero_off_request(settings.output))
+            request = CONTROLLERS[settings.controller].zero_off_request(settings.output)
+            self._query(request, header=request.split(",")[0])  # whether the output follows in the answer is not known
         self.settings = settings
 
     def read(self) -> float:
@@ -217,7 +218,7 @@ class KeyenceLK(Driver):
         for _ in range(MAX_LATE_LINES):
             line = self.transport.read_until(LINE_END, limit=MAX_LINE_BYTES)
             text = line.removesuffix(LINE_END).decode("ascii", errors="replace")
-            if text.endswith((mode, f"{ERROR},{mode},{STATE_ERROR}")):  # an error where it was in this mode already
+            if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):  # it was so already
                 self._synchronised = True
                 return
             if error_code(mode, text) is not None:

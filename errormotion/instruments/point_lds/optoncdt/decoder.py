@@ -22,16 +22,31 @@ class StreamDecoder:
     ----------
     measuring_range : float
         m.
+    highest : int
+        Last raw value of the measuring range.
     counter : bool
         Whether each sample brings its counter.
+    counter_first : bool
+        Whether the counter precedes the distance.
     from_zero : bool
         Whether the first sample has counter 0; else it is taken as it comes.
     """
 
-    def __init__(self, measuring_range: float, *, counter: bool, from_zero: bool = False) -> None:
+    def __init__(
+        self,
+        measuring_range: float,
+        *,
+        highest: int,
+        counter: bool,
+        counter_first: bool = False,
+        from_zero: bool = False,
+    ) -> None:
         self._range = measuring_range
+        self._highest = highest
         self._counter = counter
+        self._counter_first = counter_first
         self._rest = b""
+        self._waiting = np.empty(0, dtype=np.uint32)  # values that those behind them have to confirm
         self._after_text = False
         self._next = 0
         self._state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
@@ -50,9 +65,12 @@ class StreamDecoder:
         text = np.empty(buffer.size, dtype=np.uint8)
         used, n_values, n_text, self._after_text = kernels.split(buffer, values, text, self._after_text)
         self._rest = buffer[used:].tobytes()
-        raws = np.empty(n_values + 1, dtype=np.int32)
-        numbers = np.empty(n_values + 1, dtype=np.int64)
-        count = kernels.assemble(values[:n_values], self._counter, self._state, raws, numbers)
+        found = np.concatenate([self._waiting, values[:n_values]])
+        waiting = int(kernels.look_ahead(self._counter, self._counter_first))
+        self._waiting = found[max(found.size - waiting, 0) :]
+        raws = np.empty(found.size + 1, dtype=np.int32)
+        numbers = np.empty(found.size + 1, dtype=np.int64)
+        count = kernels.assemble(found, self._counter, self._counter_first, self._state, raws, numbers)
         return Chunk(*self._convert(raws[:count], numbers[:count]), text[:n_text].tobytes())
 
     def _convert(self, raws: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any]) -> tuple[Any, Any]:
@@ -65,11 +83,11 @@ class StreamDecoder:
                 "the sensor was restarted, or the data are not samples; start the stream again"
             )
         distances, reasons = np.empty(size), np.empty(size, dtype=np.uint8)
-        kernels.convert(raws, numbers, self._next, self._range, distances, reasons)
+        kernels.convert(raws, numbers, self._next, self._range, self._highest, distances, reasons)
         self._next += size
         return distances, reasons
 
     def warm_up(self) -> None:
         """Compile everything now, so that the first samples find it ready."""
-        trial = StreamDecoder(1.0, counter=self._counter)
+        trial = StreamDecoder(1.0, highest=self._highest, counter=self._counter)
         trial(encode_value(1000) + encode_value(0, first=False))

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.point_lds.optoncdt.codec import (
+from errormotion.instruments.point_lds.optoncdt.codec import LOST, OFFSET, OVERRUN, REASONS, SCALE
+from errormotion.instruments.point_lds.optoncdt.commands import (
     LINE_END,
-    LOST,
-    OFFSET,
-    OVERRUN,
     PROMPT,
-    REASONS,
-    SCALE,
-    parse_reply,
-    rate_text,
-    text_of,
+    Layout,
+    RefusedCommandError,
+    parse_info,
+    parse_layout,
+    reported_range,
 )
+from errormotion.instruments.point_lds.optoncdt.dialogue import Dialogue
+from errormotion.instruments.point_lds.optoncdt.models import MODELS
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings
 from errormotion.instruments.streaming import count_reasons
 from errormotion.instruments.transports import Transport, open_transport
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
 
 Sync = Literal["NONE", "MASTER", "SLAVE"]
-ON_FOR = "operating time"  # (m)
 BLOCK_SECONDS = 0.5
 QUEUE_SECONDS = 2.0
 SMALLEST_QUEUE = 4096
@@ -65,7 +64,11 @@ class OptoNCDT(Driver):
     reasons: tuple[str, ...] = REASONS
     lost: tuple[int, ...] = (LOST, OVERRUN)
     _reader: Reader | None = None
-    _lost: InstrumentError | None = None
+    _dialogue: Dialogue
+    _range: float | None = None  # as the sensor reports it
+    _refused: list[str]
+    _layout = Layout(())
+    _termination = "TERMOFF"
 
     @property
     def rate(self) -> float:
@@ -74,23 +77,33 @@ class OptoNCDT(Driver):
 
     @property
     def measuring_range(self) -> tuple[float, float]:
-        """Lowest and highest reading, m."""
-        return 0.0, self.settings.range
+        """Lowest and highest reading, m; InstrumentError while the range is unknown."""
+        return 0.0, self._known_range
 
     @property
     def mid_range(self) -> float:
-        """The reading in the middle of the range, m."""
-        return self.settings.range / 2
+        """The reading in the middle of the range, m; InstrumentError while the range is unknown."""
+        return self._known_range / 2
 
     @property
     def encoding(self) -> dict[str, Any]:
         """Encoding that stores readings without loss: the 16-bit numbers of the wire."""
         return {
             "dtype": "uint16",
-            "scale_factor": SCALE * self.settings.range,
-            "add_offset": -OFFSET * self.settings.range,
+            "scale_factor": SCALE * self._known_range,
+            "add_offset": -OFFSET * self._known_range,
             "_FillValue": 65535,
         }
+
+    @property
+    def _known_range(self) -> float:
+        known = self.settings.range if self._range is None else self._range
+        if known is None:
+            raise InstrumentError(
+                f"The range of the {self.info.id} at {self.address} is unknown before it is opened: "
+                "open it first, or state 'range' in its settings"
+            )
+        return known
 
     @property
     def stray_bytes(self) -> int:
@@ -99,42 +112,50 @@ class OptoNCDT(Driver):
 
     def identify(self) -> Identity:
         """Request the identity of the sensor (GETINFO)."""
-        facts = self._facts()
-        facts.pop(ON_FOR, None)
+        facts = parse_info(self.command("GETINFO"))
+        refused = {"refused commands": ", ".join(self._refused)} if self._refused else {}
         return Identity(
             manufacturer="Micro-Epsilon",
             model=facts.get("name", "unknown"),
             serial_number=facts.get("serial", "unknown"),
             firmware=facts.get("version", ""),
             simulated=self.transport.simulated,
-            details={"address": self.address, **facts},
+            details={"address": self.address, **facts, **refused},
         )
-
-    def _facts(self) -> dict[str, str]:
-        parts = [line.partition(":") for line in self.command("GETINFO")]
-        return {key.strip().lower(): value.strip() for key, mark, value in parts if mark}
-
-    def on_for(self) -> float:
-        """Return the operating time that the sensor reports, s; 0 where it reports none."""
-        stated = re.match(r"([\d.]+)", self._facts().get(ON_FOR, ""))
-        return float(stated[1]) if stated else 0.0
 
     def configure(self, settings: OptoSettings) -> None:
         """Compare settings with the line and the sensor, and send them.
 
+        Nothing is stored in the sensor, and `close` restores what it had.
+
         Raises
         ------
         InstrumentError
-            The rate does not fit through the baud rate; another model or range answers; the sensor refuses.
+            The rate does not fit through the baud rate; another model or range answers; the sensor refuses, or sends
+            other values than the distance and the counter.
         """
         settings.line_speed(self.address)
         self._refuse_while_streaming()
-        self._check_sensor(settings)
-        self.command(f"MEASRATE {rate_text(settings.rate)}")
-        self.command("MASTERMV NONE")  # no offset: distances count from the start of the range
-        self.command(f"OUTADD_RS422 {'COUNTER' if settings.counter else 'NONE'}")  # (m)
-        self.command("LASERPOW FULL")
-        self.settings = settings
+        measured = self._check_sensor(settings)
+        model, dialogue = MODELS[settings.model], self._open_dialogue
+        dialogue.set(f"MEASRATE {model.rate_word(settings.rate)}")
+        for command in model.cleared:
+            dialogue.set(command.format(termination=self._termination_of(command.split(" ", 1)[0])))
+        self._refused = []
+        for command in model.optional:
+            try:
+                dialogue.set(command)
+            except RefusedCommandError:
+                self._refused.append(command)
+        dialogue.set(f"OUTADD_RS422 {'COUNTER' if settings.counter else 'NONE'}")
+        self._layout = parse_layout(self.command("GETOUTINFO_RS422"), counter=settings.counter)
+        if model.synchronises:
+            self._termination = self._termination_of("SYNC")
+        self.settings, self._range, dialogue.timeout = settings, measured, settings.timeout
+
+    def _termination_of(self, name: str) -> str:
+        """Return the termination of the line that the sensor has for a command; TERMOFF where it states none."""
+        return "TERMON" if "TERMON" in self._open_dialogue.remember(name) else "TERMOFF"
 
     def command(self, text: str) -> list[str]:
         """Send a command and return the lines of the answer; works while data are streaming.
@@ -142,18 +163,16 @@ class OptoNCDT(Driver):
         Raises
         ------
         InstrumentError
-            The sensor refuses.
+            The sensor refuses, or is not open.
         InstrumentTimeoutError
-            It does not answer.
+            It does not answer. The next command resynchronises first: a late answer is not taken for another one.
         """
-        if self._lost is not None:
-            raise InstrumentError(f"The connection to {self.name} is lost ({self._lost}); close and open it again")
-        request = text.encode("ascii") + LINE_END
-        timeout = self.settings.timeout
-        if self._reader is not None:
-            return parse_reply(text, self._reader.query(request, timeout))
-        self.transport.write(request)
-        return parse_reply(text, text_of(self.transport.read_until(PROMPT, limit=1 << 24, timeout=timeout)))
+        return self._open_dialogue.command(text)
+
+    @property
+    def _open_dialogue(self) -> Dialogue:
+        self.transport  # noqa: B018 - raises before open
+        return self._dialogue
 
     def read(self) -> float:
         """Return one distance now, m; NaN where the sensor has none."""
@@ -198,20 +217,38 @@ class OptoNCDT(Driver):
     def start(self, block: int, sync: Sync = "NONE") -> None:
         """Start the stream; samples are then read with ``fill``, at most ``block`` at once.
 
-        With ``SLAVE`` no data arrive until the master starts, and the counter of the first sample is 0.
+        With ``SLAVE`` no data arrive until the master starts, and the counter of the first sample is 0. A master is
+        first a slave without pulses, whose counter is reset, and becomes the master last: so its sample 0 is the one of
+        its first pulse, as on the slaves.
         """
         from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
         from errormotion.instruments.streaming import Reader
 
         self._refuse_while_streaming()
-        self.command(f"SYNC {sync}")
-        self.command("RESETCNT COUNTER")  # (m)
-        decoder = StreamDecoder(self.settings.range, counter=self.settings.counter, from_zero=sync != "NONE")
+        model = MODELS[self.settings.model]
+        if model.synchronises:
+            self.command(f"SYNC {'NONE' if sync == 'NONE' else 'SLAVE'} {self._termination}")
+        elif sync != "NONE":
+            raise InstrumentError(
+                f"{self.name}: the {model.name} cannot be synchronised with other sensors; use sensors ILD2300, "
+                "or read them one by one"
+            )
+        self.command("RESETCNT MEASCNT")
+        decoder = StreamDecoder(
+            self._known_range,
+            highest=model.highest,
+            counter=self._layout.counter,
+            counter_first=self._layout.counter_first,
+            from_zero=sync != "NONE",
+        )
         decoder.warm_up()
         limit = max(SMALLEST_QUEUE, 2 * block, round(QUEUE_SECONDS * self.rate))
         self._reader = Reader(self.transport, decoder, name=self.name, limit=limit, overrun=OVERRUN, prompt=PROMPT)
+        self._dialogue.reader = self._reader
         try:
             self.command("OUTPUT RS422")
+            if sync == "MASTER":
+                self.command(f"SYNC MASTER {self._termination}")
         except BaseException:
             self._abandon()
             raise
@@ -241,11 +278,12 @@ class OptoNCDT(Driver):
         reader, self._reader = self._reader, None
         if reader is None:
             return
+        self._dialogue.reader = None
         try:
             reader.stop(b"OUTPUT NONE" + LINE_END, self.settings.timeout if timeout is None else timeout)
         except InstrumentError as error:
             reader.abandon()
-            self._lost = error
+            self._dialogue.lost = error
 
     def _connect(self) -> Transport:
         baudrate = self.settings.line_speed(self.address)
@@ -258,15 +296,24 @@ class OptoNCDT(Driver):
         )
 
     def _start_session(self) -> None:
-        self._lost = None
+        self._range, self._refused = None, []
+        self._dialogue = Dialogue(self.transport, self.settings.timeout)
+        self._dialogue.remember("OUTPUT")  # refused where an earlier user has left half a line
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
-        self.configure(self.settings)
+        try:
+            self.configure(self.settings)
+        except InstrumentError:
+            with suppress(InstrumentError):
+                self._dialogue.restore()
+            raise
 
     def _end_session(self) -> None:
         self.stop()
+        self._dialogue.restore()
 
     def _abandon(self) -> None:
         reader, self._reader = self._reader, None
+        self._dialogue.reader = None
         if reader is not None:
             reader.abandon()
 
@@ -274,15 +321,22 @@ class OptoNCDT(Driver):
         if self._reader is not None:
             raise InstrumentError(f"{self.name} is streaming; close the stream first")
 
-    def _check_sensor(self, settings: OptoSettings) -> None:
-        identity = self.identify()
-        if settings.model not in identity.model.replace(" ", ""):
+    def _check_sensor(self, settings: OptoSettings) -> float:
+        """Compare model and range with the settings; return the measuring range, m."""
+        facts = parse_info(self.command("GETINFO"))
+        name, measured = facts.get("name", "unknown"), reported_range(facts)
+        if not name.replace(" ", "").upper().startswith(settings.model):
             raise InstrumentError(
-                f"The settings state model {settings.model}; the sensor at {self.address} is a '{identity.model}'"
+                f"The settings state model {settings.model}; the sensor at {self.address} is a '{name}'"
             )
-        stated = re.match(r"([\d.]+)\s*mm", str(identity.details.get("range", "")))
-        if stated and not np.isclose(float(stated[1]) * 1e-3, settings.range):
+        stated = settings.range
+        if measured is None and stated is None:
             raise InstrumentError(
-                f"The settings state a range of {settings.range * 1e3:g} mm; the sensor at {self.address} "
-                f"has {stated[1]} mm"
+                f"The sensor at {self.address} reports no measuring range; state 'range' in its settings"
             )
+        if measured is not None and stated is not None and not np.isclose(measured, stated):
+            raise InstrumentError(
+                f"The settings state a range of {stated * 1e3:g} mm; the sensor at {self.address} "
+                f"has {measured * 1e3:g} mm"
+            )
+        return float(stated if measured is None else measured)  # type: ignore[arg-type]

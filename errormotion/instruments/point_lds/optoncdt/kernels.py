@@ -9,18 +9,14 @@ import numpy as np
 
 from errormotion.instruments.point_lds.optoncdt.codec import (
     ABOVE,
-    AFTER_RANGE,
-    BEFORE_RANGE,
     BELOW,
-    ERROR_CODES,
+    ERROR_REASONS,
     FIRST_ERROR_CODE,
-    FIRST_ERROR_REASON,
     GARBLED,
-    HIGHEST,
+    LAST_ERROR_CODE,
     LOST,
     LOWEST,
     MAX_DISTANCE_CODE,
-    NO_PEAK,
     OFFSET,
     SCALE,
     UNKNOWN,
@@ -32,7 +28,7 @@ MASK = 0x3FFFF
 FOLLOWING = 1 << 18  # the value is not the first of its sample
 SUSPECT = 1 << 19  # bytes were discarded right before it: its first byte may be a stray
 GARBLED_RAW = -1
-LAST_ERROR_CODE = max(ERROR_CODES)
+REASON_OF_CODE = np.array(ERROR_REASONS, dtype=np.uint8)
 
 # Positions in the state of `assemble`.
 NUMBER, PENDING, HAS_PENDING, JUMP_RAW, JUMP_AHEAD, HAS_JUMP, ORPHANS, ANCHORED, BASE, DOUBT = range(10)
@@ -90,19 +86,32 @@ def split(data: Array, values: Array, text: Array, after_text: bool) -> tuple[in
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
-def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: Array) -> int:
+def look_ahead(counter: bool, counter_first: bool) -> int:
+    """Return the number of values behind a distance that have to be there before it is believed."""
+    if not counter:
+        return 1
+    return 2 if counter_first else 0
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
+def assemble(values: Array, counter: bool, counter_first: bool, state: Array, raws: Array, numbers: Array) -> int:
     """Pair distances with their counters and number the samples; return how many there are.
 
     A counter that jumps is believed when the next sound sample is further on in the same direction round the 18 bits:
     then samples were lost. Else the jump came from damaged bytes. Two distances that claim one counter are both
-    garbled, and so is a distance behind a counter that had none.
+    garbled, and so is a distance behind a counter that had none. Stray bytes show in the value behind them: a distance
+    that ends its sample is garbled where the next value is suspect or not the first of its sample, and behind a counter
+    also where the value after that is suspect or the first of its sample: a burst of five bytes can pose as one value.
 
     Parameters
     ----------
     values : ndarray, uint32
-        From `split`.
+        From `split`. Where a distance ends its sample, the last values are only looked at, and have to come again:
+        see `look_ahead`.
     counter : bool
         Whether each sample is a distance and a counter, or a distance alone.
+    counter_first : bool
+        Whether the counter precedes the distance.
     state : ndarray, int64, (STATE_SIZE,)
         Kept from call to call; NUMBER is the number of the next sample, BASE the counter of sample 0, ANCHORED whether
         that is known (else the first sample that comes is number 0).
@@ -112,8 +121,13 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
         Receives the samples' numbers since the start of the stream.
     """
     count = 0
-    for value in values:
+    for i in range(values.size - look_ahead(counter, counter_first)):
+        value = values[i]
         suspect = value & SUSPECT != 0
+        if not counter or (counter_first and value & FOLLOWING):
+            suspect = suspect or values[i + 1] & (SUSPECT | FOLLOWING) != 0
+        if counter_first and value & FOLLOWING:
+            suspect = suspect or values[i + 2] & (SUSPECT | FOLLOWING) != FOLLOWING
         raw = np.int64(GARBLED_RAW) if suspect else np.int64(value & MASK)
         if not counter:
             if value & FOLLOWING:
@@ -139,8 +153,14 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
             state[DOUBT] = 1
             continue
         state[HAS_PENDING] = 0
-        raw = np.int64(GARBLED_RAW) if suspect else state[PENDING]
-        reading = np.int64(value & MASK)
+        if counter_first:
+            reading = state[PENDING]
+            if reading == GARBLED_RAW:  # a sample without a position: the next counter shows the gap
+                state[ORPHANS] += 1
+                continue
+        else:
+            reading = np.int64(value & MASK)
+            raw = np.int64(GARBLED_RAW) if suspect else state[PENDING]
         if not state[ANCHORED]:
             if raw == GARBLED_RAW:
                 state[ORPHANS] += 1
@@ -172,7 +192,9 @@ def assemble(values: Array, counter: bool, state: Array, raws: Array, numbers: A
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
-def convert(raws: Array, numbers: Array, first: int, measuring_range: float, distances: Array, reasons: Array) -> None:
+def convert(
+    raws: Array, numbers: Array, first: int, measuring_range: float, highest: int, distances: Array, reasons: Array
+) -> None:
     """Turn numbered raw values into distances on a gapless clock.
 
     Parameters
@@ -183,6 +205,8 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
         Number of the first position of ``distances``.
     measuring_range : float
         Unit of the result.
+    highest : int
+        Last raw value of the measuring range.
     distances : ndarray, float64
         Receives distances from the start of the range, NaN where there is none.
     reasons : ndarray, uint8
@@ -196,7 +220,7 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
             distances[place], reasons[place] = np.nan, LOST
             place += 1
         raw = raws[i]
-        if LOWEST <= raw <= HIGHEST:
+        if LOWEST <= raw <= highest:
             distances[place], reasons[place] = raw * slope - offset, 0
         else:
             distances[place] = np.nan
@@ -207,66 +231,7 @@ def convert(raws: Array, numbers: Array, first: int, measuring_range: float, dis
             elif raw <= MAX_DISTANCE_CODE:
                 reasons[place] = ABOVE
             elif FIRST_ERROR_CODE <= raw <= LAST_ERROR_CODE:
-                reasons[place] = FIRST_ERROR_REASON + raw - FIRST_ERROR_CODE
+                reasons[place] = REASON_OF_CODE[raw - FIRST_ERROR_CODE]
             else:
                 reasons[place] = UNKNOWN
         place += 1
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
-def quantise(distances: Array, measuring_range: float, raws: Array) -> None:
-    """Turn distances into what the sensor sends: 16 bits inside the measuring range, error codes outside.
-
-    Parameters
-    ----------
-    distances : ndarray, float64
-        From the start of the range; NaN: nothing in the beam.
-    measuring_range : float
-        In the same unit.
-    raws : ndarray, int32
-        Receives the values.
-    """
-    slope, offset = 1 / (SCALE * measuring_range), OFFSET / SCALE
-    for i in range(distances.size):
-        x = distances[i] * slope + offset
-        if np.isnan(x):
-            raws[i] = NO_PEAK
-        elif x < LOWEST:
-            raws[i] = BEFORE_RANGE
-        elif x > HIGHEST:
-            raws[i] = AFTER_RANGE
-        else:
-            raws[i] = np.int32(x + 0.5)
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
-def encode(raws: Array, first: int, counter: bool, data: Array) -> int:
-    """Write samples as bytes; return how many.
-
-    Parameters
-    ----------
-    raws : ndarray, int32
-        Values of 18 bits; a negative one is a sample that is not sent.
-    first : int
-        Counter of the first.
-    counter : bool
-        Whether each distance is followed by its counter.
-    data : ndarray, uint8
-        Receives the bytes; room for 6 a sample.
-    """
-    n = 0
-    for i in range(raws.size):
-        raw = raws[i]
-        if raw < 0:
-            continue
-        data[n] = raw & 0x3F
-        data[n + 1] = 0x40 | raw >> 6 & 0x3F
-        data[n + 2] = 0x80 | raw >> 12 & 0x3F
-        n += 3
-        if counter:
-            number = first + i
-            data[n] = number & 0x3F
-            data[n + 1] = 0x40 | number >> 6 & 0x3F
-            data[n + 2] = 0xC0 | number >> 12 & 0x3F
-            n += 3
-    return n

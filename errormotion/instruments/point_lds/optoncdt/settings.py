@@ -9,7 +9,8 @@ from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Frequency, Length, Time
 from errormotion.errors import InstrumentError
-from errormotion.instruments.point_lds.optoncdt.codec import MODELS, check_line
+from errormotion.instruments.point_lds.optoncdt.codec import check_line
+from errormotion.instruments.point_lds.optoncdt.models import MODELS
 from errormotion.instruments.transports import parse_address
 from errormotion.plugins import PluginSettings
 
@@ -20,7 +21,6 @@ class SensorSettings(PluginSettings):
     """What the sensors of one frame have in common."""
 
     model: Literal["ILD1420", "ILD2300"] = Field(default="ILD2300", description="sensor family")
-    range: Length = Field(default=2e-3, description="measuring range")
     rate: Frequency = Field(default=20e3, description="measuring rate; one of the model's")
     baudrate: int | None = Field(
         default=None,
@@ -37,12 +37,14 @@ class SensorSettings(PluginSettings):
     def _check_model(self) -> None:
         """Check rate, range and baud rate against the model; ValueError states what it offers."""
         model = MODELS[self.model]
-        if not any(math.isclose(self.rate, rate, rel_tol=1e-6) for rate in model.rates):
-            known = ", ".join(f"{rate / 1000:g}" for rate in model.rates)
-            raise ValueError(f"the {self.model} measures at {known} kHz; found {self.rate / 1000:g} kHz")
-        if not any(math.isclose(self.range, length, rel_tol=1e-6) for length in model.ranges):
+        try:
+            model.rate_word(self.rate)
+        except InstrumentError as error:
+            raise ValueError(str(error)) from None
+        stated = self.stated_range
+        if stated is not None and not any(math.isclose(stated, length, rel_tol=1e-6) for length in model.ranges):
             known = ", ".join(f"{length * 1000:g}" for length in model.ranges)
-            raise ValueError(f"the {self.model} has ranges of {known} mm; found {self.range * 1000:g} mm")
+            raise ValueError(f"the {self.model} has ranges of {known} mm; found {stated * 1000:g} mm")
         if self.baudrate is not None and self.baudrate not in model.baudrates:
             known = ", ".join(str(rate) for rate in model.baudrates)
             raise ValueError(f"the {self.model} has the baud rates {known}; found {self.baudrate}")
@@ -50,8 +52,13 @@ class SensorSettings(PluginSettings):
             self._check_line(self.baudrate)
 
     @property
+    def stated_range(self) -> float | None:
+        """The measuring range that the settings state, m; None where it is left to the sensor."""
+        return None
+
+    @property
     def with_counter(self) -> bool:
-        """Whether each distance is followed by the sample counter."""
+        """Whether each distance comes with the sample counter."""
         return True
 
     def line_speed(self, address: str) -> int | None:
@@ -80,9 +87,15 @@ class SensorSettings(PluginSettings):
 class OptoSettings(SensorSettings):
     """Settings of one sensor."""
 
+    range: Length | None = Field(default=None, description="measuring range; default: as the sensor reports")
     counter: bool = Field(default=True, description="send the sample counter, which shows lost samples")
 
     @property
+    def stated_range(self) -> float | None:
+        """The measuring range that the settings state, m; None where it is left to the sensor."""
+        return self.range
+
+    @property
     def with_counter(self) -> bool:
-        """Whether each distance is followed by the sample counter."""
+        """Whether each distance comes with the sample counter."""
         return self.counter

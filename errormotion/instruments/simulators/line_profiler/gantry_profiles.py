@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import BenchError, InstrumentError
-from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
+from errormotion.instruments.simulators.line_profiler.keyence_ljx_wire import ProfileLayout
 from errormotion.instruments.simulators.line_profiler.profile_sources import Clock, Lines
 from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 from errormotion.instruments.transports import Address
@@ -109,7 +109,7 @@ class GantryProfiles:
         """Have one profile taken where the axis is."""
         self._triggers.release()
 
-    def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
+    def lines(self, layout: ProfileLayout) -> Iterator[Lines | None]:
         """Yield the profiles of what the machine runs, and of what it will be commanded to run."""
         after = self._began
         path = None
@@ -134,7 +134,7 @@ class GantryProfiles:
     def _last(self) -> float:
         return self._times[-1] if self._times else self._began
 
-    def _commanded(self, layout: StreamLayout) -> Iterator[Lines]:
+    def _commanded(self, layout: ProfileLayout) -> Iterator[Lines]:
         """Yield a profile for each trigger by command that has come."""
         from errormotion.twin.sensors.profiler import Profiler
 
@@ -150,7 +150,7 @@ class GantryProfiles:
             self._times += times.tolist()
             yield Lines(np.array([self._counted(places[0])]), heights, times)
 
-    def _along(self, path: Path, layout: StreamLayout, after: float) -> Iterator[Lines]:
+    def _along(self, path: Path, layout: ProfileLayout, after: float) -> Iterator[Lines]:
         """Yield the profiles on a path after a time."""
         from errormotion.twin.sensors.profiler import Profiler
         from errormotion.twin.table import CHUNK

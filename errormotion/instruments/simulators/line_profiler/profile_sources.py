@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
+from errormotion.instruments.simulators.line_profiler.keyence_ljx_wire import ProfileLayout
 
 Array = np.ndarray[Any, Any]
 
@@ -47,7 +47,7 @@ class Feed(Protocol):
     def begin(self) -> None:
         """Start a stream; InstrumentError where that cannot be now."""
 
-    def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
+    def lines(self, layout: ProfileLayout) -> Iterator[Lines | None]:
         """Yield the profiles of a stream when they are due; None where nothing is to come for now."""
 
     def trigger(self) -> None:
@@ -146,7 +146,7 @@ class FreeRunning:
         self._first += self._taken or self._sent
         self._sent = self._taken = 0
 
-    def lines(self, layout: StreamLayout) -> Iterator[Lines | None]:
+    def lines(self, layout: ProfileLayout) -> Iterator[Lines | None]:
         """Yield profiles without end."""
         clock = Clock(self._pace)
         while True:

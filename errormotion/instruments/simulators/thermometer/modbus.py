@@ -1,4 +1,4 @@
-"""A thermometer with Modbus on the virtual machine: a server of `pymodbus` behind a cable that can fail."""
+"""A thermometer with Modbus on the virtual machine, on a network connection or a serial line that can fail."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from pydantic import ValidationError
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.thermometer.register_values import to_registers, words_of
 from errormotion.instruments.simulators.thermometer.temperatures import Inputs, Unplugging
-from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings, encode_number
+from errormotion.instruments.thermometer.registers import ModbusSettings
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.modbus.client import framing_of
-from errormotion.instruments.transports.modbus.codec import crc16
-from errormotion.instruments.transports.modbus.serving import ModbusServer
+from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
+from errormotion.instruments.transports.serving import TcpServer
 
 FAILURE = 4  # Modbus exception: server device failure
 _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order", "scale", "offset", "open_from")
@@ -25,8 +26,9 @@ class SimulatedModbus(SimulatedDevice):
 
     Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``map``, ``type``,
     ``function``, ``first``, ``stride``, ``word_order``, ``byte_order``, ``scale``, ``offset``, ``open_from``,
-    ``thermocouples`` (joined by commas) as in the driver's settings; ``sensors`` (names of the twin's sensors, joined
-    by commas), ``open`` and ``shorted`` (numbers of inputs, from 0), ``unit`` (1), ``code`` (of the exception reply).
+    ``thermocouples`` (joined by commas) as in the settings of the instrument; ``sensors`` (names of the twin's
+    sensors, joined by commas), ``open`` and ``shorted`` (numbers of inputs, from 0), ``unit`` (1), ``code`` (of the
+    exception reply).
 
     Further faults: ``exception`` (a reply that refuses), ``unit`` (the answer of another device), ``short`` (the
     answer breaks off), ``unplugged`` (see `simulators.thermometers`; old
@@ -46,22 +48,17 @@ class SimulatedModbus(SimulatedDevice):
         self._code = address.whole("code", FAILURE, 11)
         self._unit = address.whole("unit", 1, 255)
         self._device: ModbusServer | None = None
+        self._connections = 0
         super().__init__(address, line_end=b"", default_name="thermometer")
         try:
             self._inputs = Inputs(self.world.machine, address)
             self._settings = _settings(address, self._inputs.names)
             self._device = ModbusServer(
-                self.name, self._framing, self._unit, self._blocks(), self._registers, self.reply
+                self._framing, self._unit, self._settings.function, self._blocks(), self._registers
             )
         except BaseException:
             self.close()
             raise
-
-    def close(self) -> None:
-        """End the device, and its server."""
-        super().close()
-        if self._device is not None:
-            self._device.close()
 
     def reply(self, data: bytes) -> None:
         """Send an answer, damaged where that is due."""
@@ -71,7 +68,7 @@ class SimulatedModbus(SimulatedDevice):
             place = _UNIT_POSITION[self._framing]
             data = data[:place] + bytes((data[place] ^ 2,)) + data[place + 1 :]
             if self._framing == "rtu":
-                data = data[:-2] + crc16(data[:-2])
+                data = data[:-2] + checksum(data[:-2])
         elif self.fault.hits("short", self._answers):
             data = data[: len(data) // 2]
         super().reply(data)
@@ -79,26 +76,31 @@ class SimulatedModbus(SimulatedDevice):
     def _on_data(self, data: bytes) -> None:
         if self._unplugging.keeps_from(self._answers, self._server):
             return
-        if self._device is not None:
-            self._device.handle_request(data)
+        if self._device is None:
+            return
+        if isinstance(self._server, TcpServer) and self._server.connections != self._connections:
+            self._connections = self._server.connections
+            self._device.reset()
+        for answer in self._device.receive(data):
+            self.reply(answer)
+        if self._device.lost:
+            self._server.disconnect()
 
     def _blocks(self) -> dict[int, int]:
         """Return the registers that the device has: those of its channels, and what lies between."""
         addresses = self._settings.addresses
         first = min(addresses)
-        return {first: max(addresses) + SIZES[self._settings.type] - first}
+        return {first: max(addresses) + words_of(self._settings.type) - first}
 
-    def _registers(self, function: int) -> dict[int, int] | int:
+    def _registers(self) -> dict[int, int] | int:
         """Return the registers now, or the code of a refusal."""
-        if function != self._settings.function:
-            return 1
         if self.fault.hits("exception", self._answers):
             return self._code
         found: dict[int, int] = {}
         far = self.fault.hits("out_of_range", self._answers)
         readings = self._inputs.temperatures(self.world.time, self._rng)
         for i, (address, temperature) in enumerate(zip(self._settings.addresses, readings, strict=True)):
-            words = self._settings.words(i, temperature)
+            words = self._code_words((temperature - _each(self._settings.offset, i)) / _each(self._settings.scale, i))
             if far or i in self._inputs.open:
                 words = self._no_sensor()
             elif i in self._inputs.shorted:
@@ -114,7 +116,15 @@ class SimulatedModbus(SimulatedDevice):
         return self._code_words(self._settings.open_from if self._settings.open_from is not None else 1 << 40)
 
     def _code_words(self, number: float) -> list[int]:
-        return encode_number(number, self._settings.type, self._settings.word_order, self._settings.byte_order)
+        settings = self._settings
+        return to_registers(number, settings.type, word_order=settings.word_order, byte_order=settings.byte_order)
+
+
+def _each(value: float | tuple[float, ...], i: int) -> float:
+    """Return the value of one channel, where one holds for all or there is one for each."""
+    if not isinstance(value, tuple):
+        return value
+    return value[i if len(value) > 1 else 0]
 
 
 def _settings(address: Address, names: tuple[str, ...]) -> ModbusSettings:

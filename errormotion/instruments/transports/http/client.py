@@ -1,17 +1,15 @@
 """Requests to an HTTP server, one after another on one connection that is opened again when the server closes it.
 
-Only GET, bodies of a limited size, and streams of many parts are available. Each answer has a time limit, each body a
-size limit. Sessions are recorded and played back like those of
-every other transport; the end of a connection is recorded as a frame without bytes.
+Only GET, bodies of a limited size, and streams of many parts are available. Each answer, and each part of a stream,
+has a time limit from its first byte to its last; each line, head and body has a size limit. Sessions are recorded and
+played back like those of every other transport; the end of a connection is recorded as a frame without bytes.
 """
 
 from __future__ import annotations
 
-import http.client
-import io
+import math
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +19,17 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.transports import load_simulator
 from errormotion.instruments.transports.address import Address, parse_address
 from errormotion.instruments.transports.base import CHUNK, Transport
+from errormotion.instruments.transports.http.answer import Head, Input, Lines, header_fields
 from errormotion.instruments.transports.recording import Recorder, ReplayTransport
 from errormotion.instruments.transports.tcp import TcpTransport
 
 PORT = 80
 MAX_BODY_BYTES = 16 << 20
 """Default limit of the size of a body, bytes."""
-_MAX_LINE_BYTES = 4096
+_MOST_BLANK_LINES = 16
+"""Between two parts of a stream."""
+_MOST_DIGITS = 12
+"""Of the size of a part."""
 _ANSWER_TIMEOUTS = 10.0
 """Time limit of a complete answer, in multiples of the time limit without data."""
 
@@ -110,30 +112,21 @@ class HttpTransport(Transport):
         Raises
         ------
         InstrumentTimeoutError
-            No answer, or an answer that takes too long.
+            No answer, or one that is not complete within ten times the time limit without data.
         ProtocolError
             The answer is not HTTP, or its body is larger than ``limit``.
         InstrumentError
             The connection is lost.
         """
-        response = self._response(path, query, keep=True)
+        response, source = self._response(path, query, keep=True)
         try:
-            body = response.read(limit + 1)
-            if len(body) > limit:
-                raise ProtocolError(f"{self.url}: the answer to '{path}' is larger than {limit} bytes")
-            if response.length:
-                raise ProtocolError(
-                    f"{self.url}: the answer to '{path}' is cut off, {response.length} bytes before its end"
-                )
-        except http.client.HTTPException as error:
-            self._disconnect()
-            raise ProtocolError(f"{self.url}: the answer to '{path}' is cut off: {error!r}") from None
+            body = response.body(limit)
         except BaseException:
             self._disconnect()
             raise
-        if response.will_close:
+        if response.closes or source.waiting:  # bytes after the answer: the next one would not be the right one
             self._disconnect()
-        return Answer(response.status, response.headers.get_content_type(), body)
+        return Answer(response.status, _content_type(response), body)
 
     def parts(
         self, path: str, query: Mapping[str, str] | None = None, *, limit: int = MAX_BODY_BYTES
@@ -145,57 +138,45 @@ class HttpTransport(Transport):
 
         Raises
         ------
-        InstrumentTimeoutError, ProtocolError, InstrumentError
+        InstrumentTimeoutError
+            As of `get`; each part must be complete within ten times the time limit after its first line.
+        ProtocolError, InstrumentError
             As of `get`, while the stream is read. When the server ends the stream, the iterator ends.
         """
-        response = self._response(path, query, keep=False)
+        response, source = self._response(path, query, keep=False)
         try:
-            boundary = response.headers.get_boundary()
-            if response.headers.get_content_maintype() != "multipart" or not boundary:
-                body = response.read(limit + 1)
-                if len(body) > limit:
-                    raise ProtocolError(f"{self.url}: the answer to '{path}' is larger than {limit} bytes")
-                yield body
+            boundary = _boundary(response)
+            if not boundary:
+                yield response.body(limit)
                 return
-            while (part := self._part(response, boundary, limit)) is not None:
+            lines = Lines(response, self.url)
+            while (part := self._part(source, lines, boundary, limit)) is not None:
                 yield part
-        except http.client.HTTPException as error:
-            raise ProtocolError(f"{self.url}: the stream of '{path}' is damaged: {error!r}") from None
         finally:
             self._disconnect()
 
-    def _part(self, response: http.client.HTTPResponse, boundary: str, limit: int) -> bytes | None:
+    def _part(self, source: Input, lines: Lines, boundary: bytes, limit: int) -> bytes | None:
         """Return the next part of a stream; None when it is over."""
-        line = self._text_line(response)
-        while line == "":  # the end of the part before
-            line = self._text_line(response)
-        if line is None or line == f"--{boundary}--":
+        source.deadline = math.inf  # between two parts only the time limit without data counts
+        for _ in range(_MOST_BLANK_LINES + 1):  # the end of the part before
+            line = lines.line()
+            if line != b"":
+                break
+        if line is None or line == b"--" + boundary + b"--":
             return None
-        if line != f"--{boundary}":
-            raise ProtocolError(f"{self.url}: expected the boundary '--{boundary}' of a part; found {line[:80]!r}")
-        size: int | None = None
-        while line := self._text_line(response):
-            name, _, value = line.partition(":")
-            if name.strip().lower() == "content-length":
-                size = int(value) if value.strip().isascii() and value.strip().isdigit() else None
+        if line != b"--" + boundary:
+            raise ProtocolError(
+                f"{self.url}: expected the boundary {b'--' + boundary!r} of a part; found {line[:80]!r}"
+            )
+        source.deadline = self._deadline()
+        text = header_fields(lines.line, self.url).get("content-length", "")
+        size = int(text) if text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS else None
         if size is None or size > limit:
             raise ProtocolError(f"{self.url}: expected a part of 0 to {limit} bytes; found {size}")
-        body = response.read(size)
-        if len(body) < size:
-            return None
-        return body
+        return lines.block(size)
 
-    def _text_line(self, response: http.client.HTTPResponse) -> str | None:
-        """Return the next line without its end; None at the end of the stream."""
-        line = response.readline(_MAX_LINE_BYTES)
-        if not line:
-            return None
-        if not line.endswith(b"\n"):
-            raise ProtocolError(f"{self.url}: expected a header line of a part; found {line[:80]!r}")
-        return line.decode("latin-1").strip()
-
-    def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> http.client.HTTPResponse:
-        """Send a request and return the answer, its header read."""
+    def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> tuple[Head, Input]:
+        """Send a request and return the answer, its head read, and the bytes that follow it."""
         target = quote(path) + (f"?{urlencode(query)}" if query else "")
         host = f"{self.target.host}:{self.target.port}" if self.target.port else self.target.host
         request = (
@@ -204,28 +185,32 @@ class HttpTransport(Transport):
         ).encode("ascii")
         while True:
             fresh = self._fresh
-            response = http.client.HTTPResponse(_Wire(self, keep))  # type: ignore[arg-type]
+            source = Input(self._next_bytes, self.url, self.timeout)
+            source.deadline = self._deadline()
             try:
                 self.write(request)
-                response.begin()
-            except InstrumentTimeoutError:
-                self._disconnect()
-                raise
-            except (_EndedError, http.client.RemoteDisconnected):
+                response = Head(source, self.url)
+            except (_EndedError, EOFError):
                 self._disconnect()
                 if fresh:
                     raise InstrumentError(
                         f"The connection to {self.url} is lost: the server closed it without an answer"
                     ) from None
                 continue  # the server had closed an idle connection
-            except http.client.HTTPException as error:
-                self._disconnect()
-                raise ProtocolError(f"{self.url}: expected an HTTP answer; found {str(error)[:100]!r}") from None
             except BaseException:
                 self._disconnect()
                 raise
             self._fresh = False
-            return response
+            return response, source
+
+    def _deadline(self) -> float:
+        return time.monotonic() + _ANSWER_TIMEOUTS * self.timeout
+
+    def _next_bytes(self, timeout: float) -> bytes:
+        try:
+            return self.read(CHUNK, timeout)
+        except _EndedError:
+            return b""
 
     # ------------------------------------------------------------------ the line beneath
 
@@ -292,38 +277,16 @@ class _EndedError(InstrumentError):
     """The server has closed the connection."""
 
 
-class _Wire:
-    """A replacement of a socket for the standard library."""
-
-    def __init__(self, transport: HttpTransport, whole: bool) -> None:
-        self._transport = transport
-        self._whole = whole
-
-    def makefile(self, *_: Any) -> io.BufferedReader:
-        return io.BufferedReader(_Bytes(self._transport, self._whole))
+def _content_type(response: Head) -> str:
+    return response.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-class _Bytes(io.RawIOBase):
-    """Bytes of one answer; with ``whole`` all must arrive within a time limit."""
-
-    def __init__(self, transport: HttpTransport, whole: bool) -> None:
-        self._transport = transport
-        self._end = time.monotonic() + _ANSWER_TIMEOUTS * transport.timeout if whole else float("inf")
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        left = self._end - time.monotonic()
-        if left <= 0:
-            raise InstrumentTimeoutError(f"{self._transport.url}: the answer was not complete within the time limit")
-        try:
-            data = self._transport.read(min(len(buffer), CHUNK), min(left, self._transport.timeout))
-        except _EndedError:
-            return 0
-        buffer[: len(data)] = data
-        return len(data)
-
-    def close(self) -> None:
-        with suppress(ValueError):
-            super().close()
+def _boundary(response: Head) -> bytes:
+    """Return the boundary between the parts; empty where the answer is not of many parts."""
+    if not _content_type(response).startswith("multipart/"):
+        return b""
+    for word in response.headers["content-type"].split(";")[1:]:
+        key, _, value = word.partition("=")
+        if key.strip().lower() == "boundary":
+            return value.strip().strip('"').encode("latin-1")
+    return b""

@@ -1,148 +1,209 @@
-"""The device end of a Modbus line: a server of `pymodbus`, unchanged, in a thread of its own."""
+"""The device's end of a Modbus line: requests of registers in, answers out.
+
+After the Modbus application protocol V1.1b3 (PDUs, exceptions), the guide to Modbus messaging on TCP/IP V1.0b (MBAP)
+and the guide to Modbus over serial line V1.02 (RTU). It shares no code with the client.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import logging
-import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from typing import Any
+import struct
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Literal
 
-from pymodbus.constants import ExcCodes
-from pymodbus.framer import FramerType
-from pymodbus.server import ModbusTcpServer
-from pymodbus.simulator import DataType, SimData, SimDevice
+READ_FUNCTIONS = (3, 4)
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
+MAX_REGISTERS = 125
+MAX_RTU_BYTES = 256
+PARTIAL_LIFETIME = 0.5
+"""Silence on a serial line after which a request that is not complete is dropped, s.
 
-from errormotion.instruments.transports.modbus.codec import Framing
+A serial line ends a frame after 3.5 characters of silence (4 ms at 9600 baud). Connections on loopback do not keep such
+times, so that a frame ends by its length and this limit only drops remains.
+"""
 
-logging.getLogger("pymodbus").addHandler(logging.NullHandler())
-CHUNK = 4096
+_MBAP = 7  # bytes of the header, the unit included
+_LENGTHS = (2, 254)  # smallest and largest value of its length field: unit, function, at most 252 bytes of data
+_DIRECT_UNITS = (0, 255)  # address a TCP device whatever its unit
+_BROADCAST = 0  # of a serial line: never answered
+# Bytes of an RTU request by function, checksum included: fixed, or (fixed part, position of a count of further bytes).
+_RTU_SIZES: Mapping[int, int | tuple[int, int]] = {
+    **dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8),
+    **dict.fromkeys((7, 11, 12, 17), 4),
+    **dict.fromkeys((15, 16), (9, 6)),
+    **dict.fromkeys((20, 21), (5, 2)),
+    22: 10,
+    23: (13, 10),
+    24: 6,
+    43: 7,
+}
+
+
+def checksum(data: bytes) -> bytes:
+    """Return the CRC of a serial frame, low byte first (guide to serial line, appendix B)."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc, carry = crc >> 1, crc & 1
+            if carry:
+                crc ^= 0xA001
+    return struct.pack("<H", crc)
 
 
 class ModbusServer:
-    """A Modbus server that accepts and returns bytes, over a connection on loopback.
-
-    The simulator forwards the bytes between the server and the client, and can damage them.
+    """Answers requests of registers, however their bytes are split or joined.
 
     Parameters
     ----------
-    name : str
-        For the thread.
     framing : str
         ``tcp`` or ``rtu``.
     unit : int
-        Address of the device; requests to others are not answered.
+        Address of the device. Requests to others are not answered; on TCP those to 0 and 255 are.
+    function : int
+        3 (holding registers) or 4 (input registers); every other function is refused with exception 1.
     blocks : mapping of int to int
-        Existing register blocks: first register to number of registers.
+        Existing register blocks: first register to number of registers. Others are refused with exception 2.
     registers : callable
-        Returns registers by number, or the code of an exception reply; called at each request with its function.
-    on_answer : callable
-        Called with the bytes that the server sends.
+        Returns all registers by number, or the code of an exception; called at each accepted request.
 
     Attributes
     ----------
-    address : (str, int)
-        Host and port at which the server listens.
+    lost : bool
+        A header states an impossible length, so that the start of the next request is unknown: the connection is to be
+        closed. ``reset`` clears it.
     """
 
     def __init__(
         self,
-        name: str,
-        framing: Framing,
+        framing: Literal["tcp", "rtu"],
         unit: int,
-        blocks: Mapping[int, int],
-        registers: Callable[[int], Mapping[int, int] | int],
-        on_answer: Callable[[bytes], None],
-    ) -> None:
-        self._framing, self._unit, self._blocks, self._registers = framing, unit, dict(blocks), registers
-        self._on_answer = on_answer
-        self._loop = asyncio.new_event_loop()
-        self._writer: asyncio.StreamWriter | None = None
-        self._thread = threading.Thread(target=self._run, name=f"sim-modbus-{name}", daemon=True)
-        self._ready = threading.Event()
-        self._failure: BaseException | None = None
-        self._end: asyncio.Event | None = None
-        self.address = ("127.0.0.1", 0)
-        self._thread.start()
-        self._ready.wait()
-        if self._failure is not None:
-            self._thread.join()
-            raise self._failure
-
-    def handle_request(self, data: bytes) -> None:
-        """Pass a request to the server, which answers by ``on_answer``."""
-        unit = data[0] if self._framing == "rtu" else data[6] if len(data) > 6 else self._unit
-        if unit == self._unit:
-            with suppress(RuntimeError):  # closed meanwhile
-                self._loop.call_soon_threadsafe(self._write, data)
-
-    def close(self) -> None:
-        """End the server and its thread; idempotent."""
-        if self._thread.is_alive() and self._end is not None:
-            with suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._end.set)
-            if self._thread is not threading.current_thread():
-                self._thread.join()
-
-    def _write(self, data: bytes) -> None:
-        if self._writer is not None:
-            self._writer.write(data)
-
-    def _run(self) -> None:
-        try:
-            self._loop.run_until_complete(self._serve())
-        except BaseException as error:  # noqa: BLE001 - raised in the constructor
-            self._failure = error
-        finally:
-            self._loop.close()
-            self._ready.set()
-
-    async def _serve(self) -> None:
-        self._end = asyncio.Event()
-        data = [
-            SimData(first, values=[0] * count, datatype=DataType.REGISTERS) for first, count in self._blocks.items()
-        ]
-        server: Any = ModbusTcpServer(  # Any: its shutdown() has no types
-            SimDevice(self._unit, simdata=data, action=self._act),
-            framer=FramerType.RTU if self._framing == "rtu" else FramerType.SOCKET,
-            address=self.address,
-        )
-        await server.serve_forever(background=True)
-        try:
-            self.address = server.transport.sockets[0].getsockname()
-            reader, self._writer = await asyncio.open_connection(*self.address)
-            listening = asyncio.create_task(self._listen(reader))
-            self._ready.set()
-            await self._end.wait()
-            listening.cancel()
-            self._writer.close()
-            with suppress(OSError):
-                await self._writer.wait_closed()
-        finally:
-            await server.shutdown()
-            await asyncio.sleep(0)
-
-    async def _listen(self, reader: asyncio.StreamReader) -> None:
-        while data := await reader.read(CHUNK):
-            self._on_answer(data)
-
-    async def _act(
-        self,
         function: int,
-        start: int,
-        address: int,  # noqa: ARG002 - the server's signature
-        count: int,  # noqa: ARG002
-        current: list[int],
-        new: list[int] | list[bool] | None,
-    ) -> ExcCodes | None:
-        """Copy the present registers to those that the server reads."""
-        if new is not None:
-            return ExcCodes.ILLEGAL_FUNCTION
-        found = self._registers(function)
-        if isinstance(found, int):
-            return ExcCodes(found)
-        for register, value in found.items():
-            if 0 <= register - start < len(current):
-                current[register - start] = value
+        blocks: Mapping[int, int],
+        registers: Callable[[], Mapping[int, int] | int],
+    ) -> None:
+        self._framing, self._unit, self._function = framing, unit, function
+        self._blocks, self._registers = dict(blocks), registers
+        self._rest = b""
+        self._last = 0.0  # time of the last bytes, s
+        self.lost = False
+
+    def reset(self) -> None:
+        """Forget the bytes of an incomplete request, as for a new connection."""
+        self._rest, self.lost = b"", False
+
+    def receive(self, data: bytes) -> Iterator[bytes]:
+        """Yield the answers to the requests that the next bytes complete."""
+        now = time.monotonic()
+        if self._framing == "rtu" and now - self._last > PARTIAL_LIFETIME:
+            self._rest = b""
+        self._last = now
+        self._rest += data
+        split = self._split_tcp if self._framing == "tcp" else self._split_rtu
+        while (frame := split()) is not None:
+            if answer := self._answer_tcp(frame) if self._framing == "tcp" else self._answer_rtu(frame):
+                yield answer
+
+    # ------------------------------------------------------------------ TCP
+
+    def _split_tcp(self) -> bytes | None:
+        """Return the next whole request; None where there is none yet."""
+        if self.lost or len(self._rest) < _MBAP - 1:
+            return None
+        length = int.from_bytes(self._rest[4:6], "big")
+        if not _LENGTHS[0] <= length <= _LENGTHS[1]:
+            self._rest, self.lost = b"", True
+            return None
+        size = _MBAP - 1 + length
+        if len(self._rest) < size:
+            return None
+        frame, self._rest = self._rest[:size], self._rest[size:]
+        return frame
+
+    def _answer_tcp(self, frame: bytes) -> bytes:
+        transaction, protocol, _, unit = struct.unpack_from(">HHHB", frame)
+        if protocol or unit not in (self._unit, *_DIRECT_UNITS):
+            return b""
+        pdu = self.respond(frame[_MBAP:])
+        return struct.pack(">HHHB", transaction, 0, 1 + len(pdu), unit) + pdu
+
+    # ------------------------------------------------------------------ RTU
+
+    def _split_rtu(self) -> bytes | None:
+        """Return the next request with a right checksum; None where there is none yet. Other bytes are dropped."""
+        while len(self._rest) >= 2:
+            size = self._rtu_size(self._rest)
+            if size is None:
+                size = next(self._checked_sizes(), 0) or self._next_known()
+                if not size:
+                    self._rest = self._rest[-MAX_RTU_BYTES:]
+                    return None
+            elif size > len(self._rest):
+                return None
+            if _is_frame(self._rest[:size]):
+                frame, self._rest = self._rest[:size], self._rest[size:]
+                return frame
+            self._rest = self._rest[1:]
         return None
+
+    @staticmethod
+    def _rtu_size(data: bytes) -> int | None:
+        """Return the size of the request that starts data, as far as known; None for an unknown function."""
+        size = _RTU_SIZES.get(data[1])
+        if not isinstance(size, tuple):
+            return size
+        fixed, place = size
+        return fixed + (data[place] if len(data) > place else 1)
+
+    def _checked_sizes(self) -> Iterator[int]:
+        """Yield the sizes at which the bytes so far are a request of an unknown function with a right checksum."""
+        for size in range(4, min(len(self._rest), MAX_RTU_BYTES) + 1):
+            if _is_frame(self._rest[:size]):
+                yield size
+
+    def _next_known(self) -> int:
+        """Drop what precedes the next whole request of a known function; return that request's size, 0 without one."""
+        for start in range(1, len(self._rest) - 3):
+            size = self._rtu_size(self._rest[start:])
+            if size is not None and _is_frame(self._rest[start : start + size]):
+                self._rest = self._rest[start:]
+                return size
+        return 0
+
+    def _answer_rtu(self, frame: bytes) -> bytes:
+        if frame[0] != self._unit or self._unit == _BROADCAST:
+            return b""
+        body = frame[:1] + self.respond(frame[1:-2])
+        return body + checksum(body)
+
+    # ------------------------------------------------------------------ PDU
+
+    def respond(self, pdu: bytes) -> bytes:
+        """Return the answer to a request without its framing.
+
+        The order of the checks is that of sections 6.3 and 6.4: function, number of registers, addresses, reading.
+        """
+        function = pdu[0]
+        found = self._read(function, pdu[1:])
+        if isinstance(found, int):
+            return bytes((function | 0x80, found))
+        return struct.pack(f">BB{len(found)}H", function, 2 * len(found), *found)
+
+    def _read(self, function: int, arguments: bytes) -> list[int] | int:
+        if function != self._function or function not in READ_FUNCTIONS:
+            return ILLEGAL_FUNCTION
+        if len(arguments) != 4:
+            return ILLEGAL_VALUE
+        first, count = struct.unpack(">HH", arguments)
+        if not 1 <= count <= MAX_REGISTERS:
+            return ILLEGAL_VALUE
+        if not any(start <= first and first + count <= start + size for start, size in self._blocks.items()):
+            return ILLEGAL_ADDRESS
+        registers = self._registers()
+        if isinstance(registers, int):
+            return registers
+        return [registers.get(number, 0) for number in range(first, first + count)]
+
+
+def _is_frame(data: bytes) -> bool:
+    return len(data) >= 4 and data[-2:] == checksum(data[:-2])

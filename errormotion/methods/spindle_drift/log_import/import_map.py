@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from errormotion.datasets.text.log_format import TIMESTAMP, Column, Format, LogTable
+from errormotion.datasets.text.dates import TIMESTAMP, is_date
+from errormotion.datasets.text.log_format import Column, Format, LogTable
+from errormotion.datasets.text.log_format import TimeColumn as DateColumns
 from errormotion.datasets.units import Angle, Length, convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.schema import CHANNELS
@@ -27,7 +29,7 @@ def _convertible(target: str) -> AfterValidator:
 
 
 def _time_unit(unit: str) -> str:
-    if unit == TIMESTAMP:
+    if is_date(unit):
         return unit
     try:
         convert(1.0, unit, "s")
@@ -39,8 +41,18 @@ def _time_unit(unit: str) -> str:
 class TimeColumn(LogTable):
     """Column of the time."""
 
-    column: Column
-    unit: Annotated[str, AfterValidator(_time_unit)] = Field(description="a unit such as 's', or 'iso8601'")
+    column: DateColumns
+    unit: Annotated[str, AfterValidator(_time_unit)] = Field(
+        description="a unit such as 's', 'iso8601', or the order of a date such as 'dd.mm.yyyy'"
+    )
+
+    @model_validator(mode="after")
+    def _two_columns_are_dates(self) -> Self:
+        if isinstance(self.column, list) and not is_date(self.unit):
+            raise ValueError(
+                "column: two columns are date and time of day; expected the unit 'iso8601' or 'dd.mm.yyyy'"
+            )
+        return self
 
 
 class Channel(LogTable):
@@ -57,12 +69,12 @@ class Channel(LogTable):
 
     @model_validator(mode="after")
     def _has_a_unit_direction(self) -> Self:
-        if not np.isfinite(self.direction).all() or not 0.99 <= np.linalg.norm(self.direction) <= 1.01:
-            length = float(np.linalg.norm(self.direction))
+        if not 0.99 <= math.hypot(*self.direction) <= 1.01:
+            length = math.hypot(*self.direction)
             raise ValueError(f"direction: expected a vector of length 1; found {self.direction} of length {length:.4g}")
         if (self.origin_uncertainty is None) != (self.direction_uncertainty is None):
             raise ValueError("expected origin_uncertainty and direction_uncertainty together, or neither")
-        if self.scale == 0 or not np.isfinite(self.scale):
+        if self.scale == 0 or not math.isfinite(self.scale):
             raise ValueError(f"scale: expected a number other than 0; found {self.scale}")
         return self
 

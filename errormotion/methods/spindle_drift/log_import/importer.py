@@ -11,8 +11,9 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model
-from errormotion.datasets.text.log_format import TIMESTAMP
-from errormotion.datasets.text.log_reader import Columns, Mistakes, read_columns
+from errormotion.datasets.text.dates import is_date
+from errormotion.datasets.text.log_reader import NOTES, Columns, Place, read_columns
+from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.log_import.import_map import (
@@ -47,7 +48,7 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
     mistakes = Mistakes(log)
-    dates = settings.time.unit == TIMESTAMP
+    dates = settings.time.unit if is_date(settings.time.unit) else ""
     columns = read_columns(_columns_of(settings), "time", settings.format, mistakes, dates=dates)
     _check_times(columns, mistakes)
     _check_magnitudes(columns, settings, mistakes)
@@ -59,9 +60,9 @@ LOG_READERS = {MAP_SCHEMA: read_log}
 """Formats of maps that the method reads."""
 
 
-def _columns_of(settings: ImportMap) -> dict[str, str | int]:
+def _columns_of(settings: ImportMap) -> dict[str, Place]:
     """Return the column of each key of the map."""
-    found: dict[str, str | int] = {"time": settings.time.column}
+    found: dict[str, Place] = {"time": settings.time.column}
     found |= {f"channels.{name}": settings.channels[name].column for name in CHANNELS}
     found |= {f"temperatures.{name}": entry.column for name, entry in settings.temperatures.items()}
     if settings.spindle_speed is not None:
@@ -78,6 +79,7 @@ def _check_times(columns: Columns, mistakes: Mistakes) -> None:
         mistakes.add(
             int(lines[after]),
             f"time: expected more than {t[before]:.9g} of line {int(lines[before])}; found {t[after]:.9g}",
+            "time: expected to increase",
         )
 
 
@@ -109,7 +111,7 @@ def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | Temperature
 def _inside(key: str, values: Array, settings: ImportMap) -> Array:
     """Return a column in the unit of the schema."""
     column = _column(key, settings)
-    if column.unit == TIMESTAMP:
+    if is_date(column.unit):
         return values
     inside = np.asarray(convert(values, column.unit, _ROWS[_VARIABLE[key.partition(".")[0]]].unit))
     return inside * column.scale + column.offset if isinstance(column, Channel) else inside
@@ -149,6 +151,8 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
         "missing_values": json.dumps({key: count for key, count in missing.items() if count}),
     }
     attrs |= {name: value for name, value in (("machine", settings.machine), ("start", columns.start)) if value}
+    if columns.notes:
+        attrs[NOTES] = json.dumps(columns.notes)
     return xr.Dataset(variables, coords, attrs)
 
 

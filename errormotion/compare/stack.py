@@ -1,0 +1,81 @@
+"""Several estimates of the same errors on one grid: what every statistic of a comparison works on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimate of n points with d freedoms each.
+
+    The covariance is block diagonal plus low rank: ``cov(y_i, y_j) = own_i (where i = j) + sum_s F_si F_sj``. An
+    unknown value is NaN, and its rows in ``own`` and ``influence`` are NaN.
+
+    Attributes
+    ----------
+    name : str
+        Of the dataset.
+    value : ndarray, (n, d)
+        m and rad.
+    own : ndarray, (n, d, d)
+        Covariance of what is drawn anew at every point.
+    influence : ndarray, (s, n, d)
+        Effect of one standard uncertainty of each source.
+    source : tuple of str
+        Key of each source: the same key in two estimates is the same draw.
+    """
+
+    name: str
+    value: Array
+    own: Array
+    influence: Array
+    source: tuple[str, ...]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which values are known, (n, d)."""
+        return np.isfinite(self.value)
+
+    def covariance(self) -> Array:
+        """Return the total covariance at every point, (n, d, d)."""
+        total: Array = self.own + np.einsum("sni,snj->nij", self.influence, self.influence)
+        return total
+
+    def scaled(self, weight: float) -> Estimate:
+        """Return the estimate times a number."""
+        return replace(self, value=weight * self.value, own=weight**2 * self.own, influence=weight * self.influence)
+
+
+def difference(a: Estimate, b: Estimate) -> Estimate:
+    """Return a less b: a source that both have, by its key, is one draw and counts with its difference."""
+    keys = tuple(dict.fromkeys((*a.source, *b.source)))
+    return Estimate(
+        name=f"{a.name} - {b.name}",
+        value=a.value - b.value,
+        own=a.own + b.own,
+        influence=gathered(a, keys) - gathered(b, keys),
+        source=keys,
+    )
+
+
+def gathered(estimate: Estimate, keys: Sequence[str]) -> Array:
+    """Return the influence of sources by key, (key, n, d): 0 for a source that the estimate does not have."""
+    rows = dict(zip(estimate.source, estimate.influence, strict=True))
+    nothing = np.where(estimate.known, 0.0, np.nan)
+    return np.array([rows.get(key, nothing) for key in keys]).reshape(len(keys), *estimate.value.shape)
+
+
+def shared(estimates: Sequence[Estimate]) -> list[str]:
+    """Return the keys of the sources that more than one estimate has, in order."""
+    seen: dict[str, int] = {}
+    for estimate in estimates:
+        for key in set(estimate.source):
+            seen[key] = seen.get(key, 0) + 1
+    return [key for key, count in seen.items() if count > 1]

@@ -1,0 +1,210 @@
+"""Changes of an error dataset that carry its covariance along: another reference state, a mean."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets.schemas import DOF, INDEX
+from errormotion.errors import DatasetError
+
+REFERENCE = "reference state"
+"""Group of the sources that a reference state has."""
+
+
+def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
+    """Return the changes of the errors since an instant, or since the mean over an interval.
+
+    The uncertainty of the reference state is one draw for all values: it becomes a source of its own for each freedom
+    that is seen (and for each place, where the errors have further dimensions). The influences of all other sources are
+    differences, so that what the reference state and a value share cancels.
+
+    Parameters
+    ----------
+    ds : Dataset
+        Error dataset over ``time`` and perhaps further dimensions.
+    time : float or tuple of float
+        One of the instants of the dataset, or first and last time of the interval, s. ``time`` of the result counts
+        from it (from the middle of an interval).
+
+    Returns
+    -------
+    Dataset
+        Without the further results of the method, which are relative to its own reference.
+
+    Raises
+    ------
+    DatasetError
+        Errors without ``time``, or along one direction only; no known value in the interval.
+    """
+    _freedoms_over(ds, "time")
+    t = np.asarray(ds["time"].values, dtype=float)
+    first, last = (time, time) if isinstance(time, (int, float)) else time
+    inside = (t >= first - TOLERANCE) & (t <= last + TOLERANCE)
+    axis = ds["EX"].dims.index("time")
+    E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
+    C = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
+    F = np.moveaxis(influence_of(ds), axis + 1, 1)
+    seen = ~np.isnan(E).all(axis=0)
+    inside = inside.reshape(-1, *[1] * (E.ndim - 1)) & (~np.isnan(E) | ~seen).all(axis=-1, keepdims=True)
+    used = np.broadcast_to(inside[..., 0], E.shape[:-1])
+    count = used.sum(axis=0)
+    if not (count > 0)[seen.any(axis=-1)].all():
+        raise DatasetError(
+            f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
+        )
+    m = np.maximum(count, 1)
+    own = np.nan_to_num(C - np.einsum("s...i,s...j->...ij", F, F))
+    E_ref = np.where(used[..., None], np.nan_to_num(E), 0.0).sum(axis=0) / m[..., None]
+    F_ref = np.where(used[None, ..., None], np.nan_to_num(F), 0.0).sum(axis=1) / m[None, ..., None]
+    own_ref = np.where(used[..., None, None], own, 0.0).sum(axis=0) / (m**2)[..., None, None]
+    rows = _sources_of(own_ref)  # (part, ..., 6)
+    rows = np.broadcast_to(rows[:, None], (len(rows), *E.shape)).copy()
+    rows[:, used] = 0.0  # values of the reference state share its noise
+    share = used[..., None, None]
+    own = np.where(share, own * (1 - 2 / m)[None, ..., None, None] + own_ref, own)
+    own = np.where(share & (m == 1)[None, ..., None, None], 0.0, own)
+    shifted = F - F_ref[:, None]
+    influence = np.concatenate([shifted, rows])
+    nan = np.isnan(E)
+    influence[:, nan] = np.nan
+    own[nan[..., :, None] | nan[..., None, :]] = np.nan
+    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    zero = (first + last) / 2
+    values = np.moveaxis(E - E_ref, 0, axis)
+    names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
+    return rebuilt(
+        ds,
+        values,
+        np.moveaxis(total, 0, axis),
+        np.moveaxis(influence, 1, axis + 1),
+        names,
+        {"time": ("time", t - zero, dict(ds["time"].attrs))},
+        reference=f"mean of the errors from {first:g} s to {last:g} s",
+        reference_interval=np.array([first - zero, last - zero]),
+        **_started(ds, zero),
+    )
+
+
+def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
+    """Return the mean over a dimension, with the covariance of the mean; values that are NaN are left out.
+
+    Parameters
+    ----------
+    ds : Dataset
+        Error dataset of the six freedoms.
+    dim : str
+        One of its dimensions.
+
+    Raises
+    ------
+    DatasetError
+        No such dimension, or errors along one direction only.
+    """
+    _freedoms_over(ds, dim)
+    axis = ds["EX"].dims.index(dim)
+    E = np.stack([ds[name].values for name in DOF], axis=-1)
+    known = ~np.isnan(E)
+    count = known.sum(axis=axis)
+    weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
+    F = np.nan_to_num(influence_of(ds))
+    own = np.nan_to_num(np.asarray(ds["covariance"].values) - np.einsum("s...i,s...j->...ij", F, F))
+    value = (weight * np.nan_to_num(E)).sum(axis=axis)
+    value[count == 0] = np.nan
+    influence = (weight[None] * F).sum(axis=axis + 1)
+    influence[:, count == 0] = np.nan
+    own = (own * weight[..., :, None] * weight[..., None, :]).sum(axis=axis)
+    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total[np.isnan(value)[..., :, None] | np.isnan(value)[..., None, :]] = np.nan
+    rest = ds.isel({dim: 0}, drop=True).drop_vars(f"{dim}{INDEX}", errors="ignore")
+    return rebuilt(rest, value, total, influence, [], {})
+
+
+TOLERANCE = 1e-9
+"""Rounding of a time, s."""
+
+
+def rebuilt(
+    ds: xr.Dataset,
+    values: Array,
+    covariance: Array,
+    influence: Array,
+    further: Sequence[str],
+    coords: dict[str, Any],
+    **attrs: Any,
+) -> xr.Dataset:
+    """Return an error dataset with other values, in the place of ``ds``; ``further`` sources are of the reference."""
+    dims = ds["EX"].dims
+    kept = ds.drop_vars(
+        [name for name in ds.variables if name not in _KEPT and not _is_place(ds, name, dims)], errors="ignore"
+    ).drop_dims("source", errors="ignore")
+    out = kept.assign({name: (dims, values[..., k], dict(ds[name].attrs)) for k, name in enumerate(DOF)})
+    out["covariance"] = ((*dims, "dof", "dof_"), covariance, dict(ds["covariance"].attrs))
+    if len(influence):
+        out["influence"] = (("source", *dims, "dof"), influence, {"long_name": "of one standard uncertainty"})
+        out = out.assign_coords(_source_coords(ds, further))
+    return out.assign_coords(coords).assign_attrs(**attrs)
+
+
+_KEPT = {*DOF, "covariance", "dof", "dof_"}
+
+
+def _is_place(ds: xr.Dataset, name: Any, dims: Sequence[Any]) -> bool:
+    """Whether a variable says where or when the errors are, or numbers them."""
+    along = set(ds.variables[name].dims) <= set(dims)
+    return along and (name in ds.coords or str(name).endswith(INDEX))
+
+
+def _source_coords(ds: xr.Dataset, further: Sequence[str]) -> dict[str, Any]:
+    size = ds.sizes.get("source", 0)
+
+    def of(name: str, default: list[Any], more: list[Any]) -> list[Any]:
+        return [*(ds[name].values.tolist() if name in ds.coords else default), *more]
+
+    references = of("source_reference", [0] * size, [1] * len(further))
+    return {
+        "source": of("source", [], list(further)),
+        "source_group": ("source", of("source_group", [""] * size, [REFERENCE] * len(further))),
+        "source_id": ("source", of("source_id", [""] * size, [""] * len(further))),
+        "source_reference": ("source", np.array(references, dtype=np.int8)),
+    }
+
+
+def _sources_of(covariance: Array) -> Array:
+    """Return sources (part, ..., 6) whose products sum to covariances (..., 6, 6); one for each rank and place."""
+    flat = covariance.reshape(-1, 6, 6)
+    rows = []
+    for i, matrix in enumerate(flat):
+        scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+        safe = np.where(scale > 0, scale, 1.0)
+        power, vectors = np.linalg.eigh(matrix / np.outer(safe, safe))
+        for size, vector in zip(power, vectors.T, strict=True):
+            if size > 1e-12:
+                row = np.zeros_like(flat[:, 0])
+                row[i] = np.sqrt(size) * vector * safe
+                rows.append(row.reshape(covariance.shape[:-1]))
+    return np.array(rows) if rows else np.zeros((0, *covariance.shape[:-1]))
+
+
+def influence_of(ds: xr.Dataset) -> Array:
+    """Return the influence of an error dataset, (source, ..., 6); without sources where it has none."""
+    if "influence" in ds.variables:
+        return np.asarray(ds["influence"].values, dtype=float)
+    return np.zeros((0, *ds["EX"].shape, 6))
+
+
+def _freedoms_over(ds: xr.Dataset, dim: str) -> None:
+    if "deviation" in ds.variables:
+        raise DatasetError("The errors are known along one direction only; the six freedoms are needed here")
+    if dim not in ds["EX"].dims:
+        raise DatasetError(f"Expected errors over '{dim}'; found {', '.join(map(str, ds['EX'].dims)) or 'no dims'}")
+
+
+def _started(ds: xr.Dataset, seconds: float) -> dict[str, str]:
+    from errormotion.datasets.timing import later
+
+    return {"start": later(ds.attrs["start"], seconds)} if "start" in ds.attrs else {}

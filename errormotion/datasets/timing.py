@@ -1,0 +1,32 @@
+"""Instants: the attribute ``start`` of datasets, ISO 8601 with an offset from UTC."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+from errormotion.errors import DatasetError
+
+
+def later(start: str, seconds: float) -> str:
+    """Return the instant some seconds after another one, in UTC to the microsecond; empty for an empty one.
+
+    Raises
+    ------
+    DatasetError
+        No instant with an offset from UTC.
+    """
+    if not start:
+        return ""
+    try:
+        instant = datetime.fromisoformat(start)
+    except (TypeError, ValueError):
+        instant = datetime.min
+    if instant.tzinfo is None:
+        raise DatasetError(f"start: expected an instant such as 2026-03-01T08:00:00+00:00; found '{start}'")
+    return (instant.astimezone(UTC) + timedelta(seconds=seconds)).isoformat()
+
+
+def between(start: str, end: str) -> float:
+    """Return the seconds from one instant to another; DatasetError as of `later`."""
+    first, last = (datetime.fromisoformat(later(each, 0.0) or "x") for each in (start, end))
+    return (last - first).total_seconds()

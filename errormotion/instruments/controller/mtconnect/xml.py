@@ -1,0 +1,117 @@
+"""XML into a plain tree, with limits on size, depth and number of everything; names without their prefixes.
+
+The parser does not resolve namespaces, so that a long namespace is not copied into each name. A document with a
+document type is refused before anything in it is expanded: entities, external or nested, never come to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from xml.parsers import expat
+
+from errormotion.errors import ProtocolError
+
+MOST_DEPTH = 64
+MOST_ELEMENTS = 200_000
+MOST_ATTRIBUTES = 64  # of one element
+MOST_NAME = 256  # characters of a name, and of a name in an attribute
+_PIECE = 1 << 20  # bytes parsed at once
+
+
+class Element:
+    """An element: name and attributes without prefixes, own text, and children.
+
+    Attributes
+    ----------
+    name, text : str
+    attributes : dict of str to str
+    children : list of Element
+    """
+
+    __slots__ = ("attributes", "children", "name", "text")
+
+    def __init__(self, name: str, attributes: dict[str, str]) -> None:
+        self.name, self.attributes = name, attributes
+        self.text = ""
+        self.children: list[Element] = []
+
+    def get(self, name: str, default: str = "") -> str:
+        """Return an attribute."""
+        return self.attributes.get(name, default)
+
+    def child(self, name: str) -> Element | None:
+        """Return the first child of a name; None without one."""
+        return next((each for each in self.children if each.name == name), None)
+
+    def walk(self) -> Iterator[Element]:
+        """Yield the element and all below it, in the order of the document."""
+        waiting = [self]
+        while waiting:
+            element = waiting.pop()
+            yield element
+            waiting.extend(reversed(element.children))
+
+
+def parse_tree(data: bytes) -> Element:
+    """Return the root of a document.
+
+    Raises
+    ------
+    ProtocolError
+        No XML, a document type, or more than one of the limits of this module.
+    """
+    builder = _Builder()
+    try:
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartElementHandler = builder.start
+        parser.EndElementHandler = builder.end
+        parser.CharacterDataHandler = builder.text
+        parser.StartDoctypeDeclHandler = builder.doctype
+        for place in range(0, len(data), _PIECE):
+            parser.Parse(data[place : place + _PIECE], False)
+        parser.Parse(b"", True)
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the others: unknown encodings
+        raise ProtocolError(f"Expected XML; it cannot be parsed ({error}); it starts with {data[:60]!r}") from None
+    if builder.root is None:
+        raise ProtocolError(f"Expected XML; it starts {data[:60]!r}")
+    return builder.root
+
+
+class _Builder:
+    def __init__(self) -> None:
+        self.root: Element | None = None
+        self._open: list[Element] = []
+        self._pieces: list[list[str]] = []
+        self._count = 0
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if self._count > MOST_ELEMENTS:
+            raise ProtocolError(f"Expected a document of at most {MOST_ELEMENTS} elements")
+        if len(self._open) >= MOST_DEPTH:
+            raise ProtocolError(f"Expected elements nested at most {MOST_DEPTH} deep; found <{name[:40]}> below that")
+        if len(attributes) > MOST_ATTRIBUTES:
+            raise ProtocolError(
+                f"<{name[:40]}>: expected at most {MOST_ATTRIBUTES} attributes; found {len(attributes)}"
+            )
+        if len(name) > MOST_NAME or any(len(key) > MOST_NAME for key in attributes):
+            raise ProtocolError(f"<{name[:40]}>: expected names of at most {MOST_NAME} characters")
+        own = {key: value for key, value in attributes.items() if ":" not in key}  # MTConnect's have no prefix
+        element = Element(name.rpartition(":")[2], own)
+        if self._open:
+            self._open[-1].children.append(element)
+        elif self.root is None:
+            self.root = element
+        self._open.append(element)
+        self._pieces.append([])
+
+    def end(self, _: str) -> None:
+        self._open.pop().text = "".join(self._pieces.pop())
+
+    def text(self, data: str) -> None:
+        if self._pieces:
+            self._pieces[-1].append(data)
+
+    def doctype(self, name: str, *_: object) -> None:
+        raise ProtocolError(f"Expected a document of MTConnect without document type; found '{name[:40]}'")

@@ -1,0 +1,93 @@
+"""What an adapter has stated last: values by key, conditions by key and code, and the times of its clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from errormotion.errors import ProtocolError
+from errormotion.instruments.controller.shdr.codec import UNAVAILABLE, Observed, parse_numbers
+
+MOST_KEYS = 10_000
+MOST_CONDITIONS = 1000
+
+
+class Memory:
+    """Last values of one device of an adapter.
+
+    Attributes
+    ----------
+    values : dict of str to Observed
+        By key.
+    conditions : dict of (str, str) to Observed
+        Warnings and faults that are present, by key and code.
+    started, newest : float
+        Times of the first and of the newest line, s since 1970; NaN where none had a time.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, Observed] = {}
+        self.conditions: dict[tuple[str, str], Observed] = {}
+        self.started = self.newest = math.nan
+
+    def forget(self) -> None:
+        """Forget values and conditions; the clock goes on."""
+        self.values.clear()
+        self.conditions.clear()
+
+    def note(self, observed: Observed) -> None:
+        """Keep a value or condition.
+
+        Raises
+        ------
+        ProtocolError
+            More than `MOST_KEYS` or `MOST_CONDITIONS`.
+        """
+        if not math.isnan(observed.time):
+            self.started = observed.time if math.isnan(self.started) else self.started
+            self.newest = observed.time if math.isnan(self.newest) else max(self.newest, observed.time)
+        if observed.level:
+            self._condition(observed)
+        elif observed.key in self.values or len(self.values) < MOST_KEYS:
+            self.values[observed.key] = observed
+        else:
+            raise ProtocolError(f"Expected at most {MOST_KEYS} keys; '{observed.key[:40]}' is one more")
+
+    def text(self, key: str) -> str:
+        """Return a value; empty where it is unknown."""
+        observed = self.values.get(key)
+        return "" if observed is None or observed.value.upper() == UNAVAILABLE else observed.value
+
+    def numbers(self, key: str) -> list[float]:
+        """Return the numbers of a value; one NaN where it is unknown. ProtocolError where it is none."""
+        observed = self.values.get(key)
+        if observed is None:
+            return [math.nan]
+        try:
+            return parse_numbers(observed.value)
+        except ProtocolError as error:
+            raise ProtocolError(f"key '{key}': {error}") from None
+
+    def reported(self, level: str) -> list[str]:
+        """Return the texts of the conditions of a level, such as ``system 1104: overtravel``."""
+        return [
+            f"{' '.join(filter(None, (each.key, each.code)))}: {each.value}".rstrip(": ")
+            for each in self.conditions.values()
+            if each.level == level
+        ]
+
+    def changed(self, keys: Mapping[str, str] | list[str]) -> float:
+        """Return when the newest of these keys was stated, s since 1970; NaN where none has a time."""
+        times = [self.values[key].time for key in keys if key in self.values]
+        return max((time for time in times if not math.isnan(time)), default=math.nan)
+
+    def _condition(self, observed: Observed) -> None:
+        """Keep or end conditions: a key may have several by code; NORMAL without a code ends all of them."""
+        if observed.level in ("NORMAL", UNAVAILABLE):
+            ended = [each for each in self.conditions if each[0] == observed.key and observed.code in ("", each[1])]
+            for each in ended:
+                del self.conditions[each]
+        elif len(self.conditions) < MOST_CONDITIONS or (observed.key, observed.code) in self.conditions:
+            self.conditions[observed.key, observed.code] = observed
+        else:
+            raise ProtocolError(f"Expected at most {MOST_CONDITIONS} conditions at once")

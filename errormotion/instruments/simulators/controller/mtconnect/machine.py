@@ -1,0 +1,110 @@
+"""What a controller reports of the virtual machine, by the name of the reading."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+EPOCH = datetime(2025, 1, 1, tzinfo=UTC)
+"""What the clock of agents and adapters shows at the world's time 0."""
+UNAVAILABLE = "UNAVAILABLE"
+SERIES_RATE = 100.0
+"""Rate of the values of one observation with several values, Hz."""
+SERIES_LENGTH = 10
+_MM, _PERCENT = 1e3, 1e2
+_MODES = {"automatic": "AUTOMATIC", "mdi": "MANUAL_DATA_INPUT", "manual": "MANUAL", "": UNAVAILABLE}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition.
+
+    Attributes
+    ----------
+    level : str
+        ``Normal``, ``Warning``, ``Fault`` or ``Unavailable``.
+    code, severity, qualifier, text : str
+        Of the controller; empty = not given.
+    """
+
+    level: str
+    code: str = ""
+    severity: str = ""
+    qualifier: str = ""
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Series:
+    """Several values of one observation, evenly spaced; the last one belongs to the time of the observation."""
+
+    values: tuple[str, ...]
+    rate: float = SERIES_RATE
+
+
+Row = Mapping[str, str]
+Value = str | Condition | Series | Mapping[str, str] | Mapping[str, Row]
+
+
+def clock_text(seconds: float) -> str:
+    """Return a time of the world, s, as agents and adapters write it."""
+    return (EPOCH + timedelta(seconds=seconds)).isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def readings(shown: Mapping[str, Any], offset: tuple[float, float, float], alarm: str = "") -> dict[str, Value]:
+    """Return the readings of a controller.
+
+    Parameters
+    ----------
+    shown : mapping
+        What the controller of the world displays.
+    offset : tuple of float
+        Work offset, m: position in work coordinates = position in machine coordinates - offset.
+    alarm : str
+        A further alarm; empty = none.
+
+    Returns
+    -------
+    dict
+        Values in the units of MTConnect: mm, mm/s, 1/min, %.
+    """
+    alarms = [*shown["alarms"], *([alarm] if alarm else [])]
+    mm = {name: [position * _MM for position in shown[f"{name}position"]] for name in ("", "commanded_")}
+    work = [actual - shift * _MM for actual, shift in zip(mm[""], offset, strict=True)]
+    values: dict[str, Value] = {
+        "avail": "AVAILABLE",
+        "estop": "TRIGGERED" if shown["estop"] else "ARMED",
+        "system": Condition("Fault", "1104", text="; ".join(alarms)) if alarms else Condition("Normal"),
+        "normal": Condition("Normal"),
+        "mode": _MODES[shown["mode"]],
+        "execution": "ACTIVE" if shown["running"] or shown["stepping"] else "READY",
+        "program": shown["program"] or UNAVAILABLE,
+        "feed": f"{shown['feed'] * _MM:.4f}",
+        "rpm": f"{shown['spindle_speed']:.1f}",
+        "rpm.commanded": f"{shown['commanded_spindle_speed']:.1f}",
+        "spindle.load": f"{shown['spindle_load'] * _PERCENT:.2f}",
+        "path.work": _vector(work),
+        "path.machine": _vector(mm[""]),
+        "offset": _vector([shift * _MM for shift in offset]),
+        "offsets": {"G54": {name: f"{shift * _MM:.4f}" for name, shift in zip("XYZ", offset, strict=True)}},
+        "variables": {"v100": f"{shown['spindle_speed']:.1f}", "v101": f"{shown['feed'] * _MM:.4f}"},
+    }
+    for i, name in enumerate("XYZ"):
+        values[f"{name}.machine"] = f"{mm[''][i]:.4f}"
+        values[f"{name}.work"] = f"{work[i]:.4f}"
+        values[f"{name}.commanded"] = f"{mm['commanded_'][i]:.4f}"
+        values[f"{name}.series"] = Series((f"{mm[''][i]:.4f}",) * SERIES_LENGTH)
+    return values
+
+
+def reading(values: Mapping[str, Value], source: str) -> Value:
+    """Return the value of one data item: a reading, a constant (``=text``), or nothing known (empty)."""
+    if source.startswith("="):
+        return source[1:]
+    return values[source] if source else UNAVAILABLE
+
+
+def _vector(parts: list[float]) -> str:
+    return " ".join(f"{part:.4f}" for part in parts)

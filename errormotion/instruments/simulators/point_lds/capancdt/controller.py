@@ -1,0 +1,320 @@
+"""A simulated capaNCDT 6200: two ports, and sensors at the beams of the virtual machine."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.simulators.faults import stray_bytes
+from errormotion.instruments.simulators.point_lds.capancdt.commands import (
+    CHANNELS,
+    FULL_SCALE,
+    TIME_OUT,
+    Sensor,
+    Settings,
+    answer,
+)
+from errormotion.instruments.simulators.point_lds.capancdt.frames import (
+    FRAMES_PER_BLOCK,
+    Averaging,
+    block,
+    raw_values,
+    with_functions,
+)
+from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import TcpServer
+
+Array = np.ndarray[Any, Any]
+
+LINE_END = b"\r\n"
+ENDS = b"\r\n"
+LONGEST_COMMAND = 255
+TIME_LIMIT = 10.0
+"""Time after the last character within which a command has to be ended, s."""
+CONNECTION_POLL = 0.02
+"""Interval at which a connection to the data port is looked for, s."""
+ANSWER_DELAY = 0.02
+"""Time for which an answer waits for values that are being sent, s."""
+FIRST_COUNT = 100_000
+"""Counter of the first value: the controller has been on for a while."""
+
+
+class SimulatedCapaNCDT(SimulatedDevice):
+    """A controller; the device's name is the beam of its first sensor, X1 X2 Y1 Y2 or Z.
+
+    While a target is set in the world, all its sensors ride on the stage and look at that. A beam that the machine does
+    not have sends no values until then. The line ``data`` (in ``urls``) has the measured values, from the moment on
+    at which a client is connected to it.
+
+    Further parameters of the address: ``beams`` (of all sensors, joined by commas: 1 to 4 channels), ``ranges``
+    (measuring ranges in um, joined by commas; default that of the machine's frame, 2000), ``serial``, ``left``
+    (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
+    ``password`` (empty), ``frames`` (of a block at most, 256).
+
+    Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (FFFFFF),
+    ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
+    counts answers.
+    """
+
+    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
+    drops_answers = False
+
+    def __init__(self, address: Address) -> None:
+        self._mute = False
+        self._timer: threading.Timer | None = None
+        self._ended = threading.Event()
+        self._streams: tuple[_Channel, ...] = ()
+        self._once = 0  # single frames that are due
+        self._sent = 0  # frames since the connection
+        self._counter = FIRST_COUNT
+        self._values: Array = np.zeros(CHANNELS, dtype=np.int64)
+        self._taken: int | None = None
+        self._averaging = Averaging(0, 2)
+        super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
+        self._mute = self.fault.kind == "silence" and self.fault.from_the_start
+        try:
+            self._set_up(address)
+            self._data = TcpServer(f"{self.name}-data", _ignore)
+        except (InstrumentError, ValueError) as error:
+            super().close()
+            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
+        self._data.start()
+        self.urls = {"data": self._data.url}
+        self.port = int(self._data.url.rsplit(":", 1)[1])
+        self._watch = threading.Thread(target=self._serve, name=f"sim-{self.name}-data", daemon=True)
+        self._watch.start()
+
+    def _set_up(self, address: Address) -> None:
+        beams = [each for each in address.params.get("beams", self.name).split(",") if each]
+        frame = self.world.machine.frame.range * 1e6
+        texts = [each for each in address.params.get("ranges", "").split(",") if each]
+        ranges = [float(text) for text in texts] or [frame]
+        if not 1 <= len(beams) <= CHANNELS or len(ranges) not in (1, len(beams)) or min(ranges) <= 0:
+            raise InstrumentError(f"expected 1 to {CHANNELS} 'beams', and one of 'ranges' (um) for all or for each")
+        ranges = ranges * len(beams) if len(ranges) == 1 else ranges
+        self.serial = int(address.number("serial", 1000 + abs(self.world.seed)))
+        self.sensors = tuple(
+            Sensor(beam, length, 100 * self.serial + number)
+            for number, (beam, length) in enumerate(zip(beams, ranges, strict=True), 1)
+        )
+        self.settings = Settings(password=address.params.get("password", ""))
+        self._time_limit = address.number("time_limit", TIME_LIMIT)
+        self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))
+        self.port = 0
+        for command in address.params.get("left", "").split(";"):
+            if command and (refused := answer(self, command)).startswith("$"):
+                raise InstrumentError(f"'left={command}': {refused}")
+
+    def close(self) -> None:
+        """End the device."""
+        self._ended.set()
+        self._cancel_timer()
+        self._end_streams()
+        self._data.disconnect()
+        self._watch.join()
+        self._data.close()
+        super().close()
+
+    def report_delivered(self, samples: int) -> None:
+        """Take note of how many frames its reader has had."""
+        for stream in self._streams:
+            stream.taken = samples
+
+    # ------------------------------------------------------------------ commands
+
+    def _on_data(self, data: bytes) -> None:
+        self._cancel_timer()
+        for byte in data:
+            character = bytes([byte])
+            if character in (b"\r", b"\n"):
+                command, self._buffer = self._buffer, b""
+                if command.startswith(b"$"):
+                    self._obey(command[1:])
+                continue
+            self._send(character)
+            if character == b"$":
+                self._buffer = character  # what came before is ignored
+            elif self._buffer:
+                self._buffer = (self._buffer + character)[: LONGEST_COMMAND + 1]
+        if self._buffer.startswith(b"$"):
+            self._timer = threading.Timer(self._time_limit, self._time_out)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def _obey(self, command: bytes) -> None:
+        before = (self.settings.trigger, self.settings.sample_time)
+        kind = (self.settings.averaging, self.settings.averaging_number)
+        held = self._data.lock.acquire(timeout=ANSWER_DELAY)  # no value is sent meanwhile, unless its reader stalls
+        try:
+            text = answer(self, command.decode("latin-1"))
+            if kind != (self.settings.averaging, self.settings.averaging_number):
+                self._averaging = self._new_averaging()
+            self._reply(text.encode("latin-1") + LINE_END)
+        finally:
+            if held:
+                self._data.lock.release()
+        if before != (self.settings.trigger, self.settings.sample_time):
+            for stream in self._streams:
+                stream.taken = stream.taken or 0  # the clock goes on where the reader is
+            self._end_streams()  # they start again with the new settings
+
+    def _reply(self, data: bytes) -> None:
+        number, self._answers = self._answers, self._answers + 1
+        if self.fault.kind == "late" and number == self.fault.at:
+            self._hold(data)
+            return
+        self._release()
+        self._send(data)
+
+    def _new_averaging(self) -> Averaging:
+        return Averaging(self.settings.averaging, self.settings.averaging_number)
+
+    def _time_out(self) -> None:
+        self._buffer = b""
+        self._send(TIME_OUT.encode() + LINE_END)
+
+    def _cancel_timer(self) -> None:
+        timer, self._timer = self._timer, None
+        if timer is not None:
+            timer.cancel()
+            if timer is not threading.current_thread():
+                timer.join()
+
+    def _send(self, data: bytes) -> None:
+        if self._mute:
+            return
+        with self._server.lock:
+            for piece in self.fault.pieces(data):
+                self._server.send(piece)
+
+    def measure_once(self) -> None:
+        """Send one frame, where values are not sent all the time."""
+        if self.settings.trigger:
+            self._once += 1
+
+    def latest(self, channel: int) -> int:
+        """Return the last value of a channel, 1 to 4."""
+        return int(self._values[channel - 1])
+
+    # ------------------------------------------------------------------ values
+
+    def _serve(self) -> None:
+        """Start the streams whenever a client is connected and values are due."""
+        while not self._ended.is_set():
+            connected = self._data.await_connection(CONNECTION_POLL)
+            if not connected:
+                self._end_streams()
+                self._once = 0
+            elif not self._streams and (self._once or not self.settings.trigger) and not self._mute:
+                self._start_streams()
+            if connected:
+                self._ended.wait(CONNECTION_POLL)
+
+    def _start_streams(self) -> None:
+        world = self.world
+        known = all(sensor.beam in world.machine.frame.channels for sensor in self.sensors)
+        if not (known or world.stand.target is not None) or world.following:
+            return
+        rate = 1e6 / self.settings.sample_time
+        self._averaging = self._new_averaging()
+        self._sent = 0
+        pending: list[Array] = []
+        self._streams = tuple(_Channel(self, pending, number, each, rate) for number, each in enumerate(self.sensors))
+        with world._change:  # all channels start at the same sample
+            for stream in self._streams:
+                world.start_stream(stream)
+
+    def _end_streams(self) -> None:
+        streams, self._streams = self._streams, ()
+        for stream in streams:
+            stream.ended = True
+            self.world.end_stream(stream)
+
+    def pass_on(self, stream: _Channel, distances: list[Array]) -> None:
+        """Send the frames that the samples of all channels make."""
+        columns = [raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors, strict=True)]
+        frames = np.stack(columns, axis=1)
+        with self._data.lock:
+            if stream not in self._streams or self._ended.is_set():
+                return
+            if self.settings.trigger:
+                frames, self._once = frames[: self._once], 0
+                self._end_with(len(frames))
+            self._deliver(frames)
+
+    def _end_with(self, taken: int) -> None:
+        """End the streams of single frames; the clock goes on behind them."""
+        streams, self._streams = self._streams, ()
+        for each in streams:
+            each.taken, each.ended = taken, True
+
+    def _deliver(self, frames: Array) -> None:
+        fault, first = self.fault, self._sent
+        numbers = first + np.arange(len(frames))
+        active = numbers >= fault.at
+        if fault.kind == "out_of_range":
+            frames[active & ((fault.length == 0) | (numbers < fault.at + fault.length))] = FULL_SCALE
+        if fault.kind in ("silence", "disconnect"):
+            frames = frames[~active]
+        values, channels = with_functions(self._averaging(frames), self.settings)
+        if len(values):
+            self._values[[channel - 1 for channel in channels]] = values[-1]
+        heard = all(self._data.send(piece) for piece in fault.pieces(self._bytes(values, channels, first)))
+        self._sent += len(numbers)
+        if fault.kind == "disconnect" and active.any():
+            self._data.disconnect()
+            heard = False
+        self._mute = self._mute or (fault.kind == "silence" and bool(active.any()))
+        for each in self._streams:
+            each.ended = each.ended or not heard or self._mute
+
+    def _bytes(self, values: Array, channels: tuple[int, ...], first: int) -> bytes:
+        """Return values as blocks, with the faults of the content; each gap starts a new block."""
+        fault, data = self.fault, b""
+        counter, self._counter = self._counter, self._counter + len(values)
+        lost = np.flatnonzero([fault.hits("drop", first + i) for i in range(len(values))])
+        for start, end in zip([0, *(lost + 1)], [*lost, len(values)], strict=True):
+            for i in range(start, end, self._frames):
+                piece = values[i : min(i + self._frames, end)]
+                if any(fault.hits("garbage", first + i + k) for k in range(len(piece))):
+                    data += stray_bytes(self._rng)
+                data += block(piece, channels, self.serial, counter + i)
+        return data
+
+
+class _Channel:
+    """The stream of one channel: a `Stream` of the virtual world.
+
+    ``pending`` is shared by those that start together.
+    """
+
+    sync = "NONE"
+
+    def __init__(
+        self, controller: SimulatedCapaNCDT, pending: list[Array], number: int, sensor: Sensor, rate: float
+    ) -> None:
+        self.channel = sensor.beam
+        self.measuring_range = sensor.range * 1e-6
+        self.rate = rate
+        self.start = self.position = 0
+        self.taken: int | None = None
+        self.ended = False
+        self._controller = controller
+        self._pending = pending
+        self._last = number == len(controller.sensors) - 1
+
+    def push(self, distances: Array) -> None:
+        """Send the next samples, with those of the last channel; may wait for the reader."""
+        self._pending.append(distances)
+        if self._last:
+            complete = self._pending[:]
+            self._pending.clear()
+            self._controller.pass_on(self, complete)
+
+
+def _ignore(data: bytes) -> None:
+    """Nothing is received on the data port."""

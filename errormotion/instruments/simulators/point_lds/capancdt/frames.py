@@ -1,0 +1,85 @@
+"""Measured values of a capaNCDT 6200: distances to raw values, averaging, math functions, blocks."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from errormotion.instruments.simulators.point_lds.capancdt.commands import (
+    CHANNELS,
+    FULL_SCALE,
+    ORDER_NUMBER,
+    Settings,
+)
+
+Array = np.ndarray[Any, Any]
+
+PREAMBLE = 0x4D454153  # MEAS
+HEADER = struct.Struct("<IIIQIHHI")
+FRAMES_PER_BLOCK = 256
+_MATH_SHIFT = 3  # 21 bits of an offset are the 24 bits of a value
+
+
+def raw_values(distances: Array, measuring_range: float) -> Array:
+    """Return distances (m, from the start of the range of so many m) as 24 bits; FFFFFF beyond and without a target."""
+    scaled = np.rint(np.nan_to_num(distances, nan=np.inf) / measuring_range * FULL_SCALE)
+    return np.clip(scaled, 0, FULL_SCALE).astype(np.int64)
+
+
+class Averaging:
+    """Averages of successive frames, over the limits of the pieces in which they come."""
+
+    def __init__(self, kind: int, number: int) -> None:
+        self._kind = kind
+        self._number = number
+        self._past: Array | None = None
+
+    def __call__(self, frames: Array) -> Array:
+        """Return the averages that these frames, shape (frame, channel), complete."""
+        if self._kind not in (1, 2, 3) or not len(frames):
+            return frames
+        n = self._number
+        if self._kind == 2:
+            joined = frames if self._past is None else np.concatenate([self._past, frames])
+            whole = len(joined) // n * n
+            self._past = joined[whole:]
+            return _whole(joined[:whole].reshape(-1, n, frames.shape[1]).mean(axis=1))
+        past = np.repeat(frames[:1], n - 1, axis=0) if self._past is None else self._past
+        joined = np.concatenate([past, frames])
+        self._past = joined[len(joined) - (n - 1) :]
+        windows = np.lib.stride_tricks.sliding_window_view(joined, n, axis=0)
+        averages = windows.mean(axis=-1) if self._kind == 1 else np.median(windows, axis=-1)
+        return _whole(averages)
+
+
+def _whole(values: Array) -> Array:
+    return np.asarray(np.rint(values), dtype=np.int64)
+
+
+def with_functions(frames: Array, settings: Settings) -> tuple[Array, tuple[int, ...]]:
+    """Return the values of all channels that are sent, shape (frame, channel), and their numbers.
+
+    ``frames`` has those of the sensors; a math function takes the position of its channel.
+    """
+    there = frames.shape[1]
+    channels = tuple(each for each in range(1, CHANNELS + 1) if each <= there or each in settings.functions)
+    columns = []
+    for channel in channels:
+        function = settings.functions.get(channel)
+        if function is None:
+            columns.append(frames[:, channel - 1])
+            continue
+        factors = np.array(function.factors[:there])
+        columns.append(np.rint((function.offset << _MATH_SHIFT) + frames @ factors).astype(np.int64))
+    return np.stack(columns, axis=1), channels
+
+
+def block(frames: Array, channels: Sequence[int], serial: int, counter: int) -> bytes:
+    """Return a block: the header and its frames, shape (frame, channel)."""
+    field = sum(1 << 2 * (channel - 1) for channel in channels)
+    width = 4 * len(channels)
+    header = HEADER.pack(PREAMBLE, ORDER_NUMBER, serial, field, 0, width, len(frames), counter & 0xFFFFFFFF)
+    return header + frames.astype("<i4").tobytes()

@@ -1,0 +1,62 @@
+"""Raw values of an optoNCDT and their bytes on RS422."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+BAUD_OVERFLOW = 262075
+NO_PEAK = 262076
+BEFORE_RANGE = 262077
+BEHIND_RANGE = 262078
+NOT_CALCULABLE = 262080
+LASER_OFF = 262082
+FIRST_ERROR = 262073
+"""Values from here on are no distances."""
+
+STEPS = 65520 / 1.02
+"""Raw values per measuring range."""
+RESERVE = 0.01
+"""Reserve before and behind the range, of the range; also what is added before scaling."""
+MASTERED = 0.51
+"""What is added before scaling once a master value is set."""
+
+BITS = 18
+BYTES_OF_VALUE = 3
+BITS_ON_WIRE = 30
+"""Of one value: three bytes with their start and stop bits."""
+
+
+def raw_distances(distances: Array, measuring_range: float, largest: int) -> Array:
+    """Return the raw values of distances from the start of the range, m; error values where there is none."""
+    parts = np.asarray(distances) / measuring_range
+    with np.errstate(invalid="ignore"):
+        raws = np.rint((parts + RESERVE) * STEPS)
+        raws = np.where(raws < 0, BEFORE_RANGE, np.where(raws > largest, BEHIND_RANGE, raws))
+    return np.where(np.isnan(parts), NO_PEAK, raws).astype(np.int64)
+
+
+def mastered(raws: Array, distances: Array, reference: float, master: float, measuring_range: float) -> Array:
+    """Return raw distances as they are sent after mastering: ``reference`` (m) is read as ``master`` (m)."""
+    valid = raws < FIRST_ERROR
+    relative = np.where(valid, (np.asarray(distances) - reference + master) / measuring_range, 0.0)
+    values = np.rint((relative + MASTERED) * STEPS)
+    values = np.where((values < 0) | (values >= FIRST_ERROR), NOT_CALCULABLE, values)
+    return np.where(valid, values, raws).astype(np.int64)
+
+
+def encode(values: Array) -> bytes:
+    """Return the bytes of blocks of values, shape (block, value): L, M and H byte of each.
+
+    Bit 6 of the H byte is clear in the first value of a block and set in the others.
+    """
+    values = np.asarray(values, dtype=np.int64) & (1 << BITS) - 1
+    data = np.empty((*values.shape, BYTES_OF_VALUE), dtype=np.uint8)
+    data[..., 0] = values & 0x3F
+    data[..., 1] = 0x40 | values >> 6 & 0x3F
+    data[..., 2] = 0x80 | values >> 12 & 0x3F
+    data[:, 1:, 2] |= 0x40
+    return data.tobytes()

@@ -1,0 +1,1 @@
+"""Resistance thermometers and thermocouples behind a data acquisition unit with SCPI commands."""

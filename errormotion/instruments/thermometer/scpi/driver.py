@@ -1,0 +1,172 @@
+"""Driver of data acquisition units with SCPI commands (Keysight, Agilent, HP 34970A and its successors)."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.thermometer.scpi import codec
+from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
+from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, Thermometer
+from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import discard_input
+from errormotion.instruments.transports.reconnecting import disconnect_after_timeout, open_reconnecting
+from errormotion.plugins import Identity, InstrumentInfo
+
+MAX_ERRORS = 32
+"""Largest number of entries that are read from the error queue; the units have 10 or 20."""
+MAX_LATE = 32
+"""Largest number of late answers that are discarded until the identity is answered."""
+
+
+class ScpiTemperature(Thermometer):
+    """Resistance thermometers and thermocouples behind a data acquisition unit with SCPI commands.
+
+    Opening sets channels and scan list in the unit (``CONF:TEMP``, ``ROUT:SCAN``), which clears its stored readings and
+    its error queue; with the setting ``setup = false`` only the format of the readings is set. A reading is one scan
+    (``READ?``) whose values carry their channels. After an error the unit is synchronised and set again: late answers
+    are discarded until it answers its identity.
+
+    Parameters
+    ----------
+    address : str
+        ``tcp://host:5025``, ``serial:///dev/ttyUSB0?baudrate=9600``, ``sim://cframe/unit``, ``replay://file``.
+    settings : ScpiSettings, optional
+    record : Path, optional
+        Recording of the session.
+    """
+
+    info: ClassVar[InstrumentInfo] = InstrumentInfo(
+        id="scpi_temperature",
+        kind="thermometer",
+        summary="Pt100 (4-wire) and thermocouples behind an SCPI data acquisition unit (34970A, 34972A, DAQ970A)",
+        status="simulated_only",
+        simulator="errormotion.instruments.simulators.thermometer.scpi:SimulatedScpiUnit",
+    )
+    Settings: ClassVar[type[ScpiSettings]] = ScpiSettings
+    settings: ScpiSettings
+    unit_errors: tuple[str, ...] = ()
+    """Entries of the unit's error queue when it was set last: left by an earlier user or by a reading that failed."""
+    _ready = False
+
+    def identify(self) -> Identity:
+        """Return maker, model, serial number and revision of the unit; InstrumentError for another model."""
+        maker, model, serial, revision = codec.parse_identity(self._query("*IDN?"))
+        if model not in self.settings.models:
+            raise InstrumentError(
+                f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {maker} {model}. Add it "
+                "to 'models' where it has the same commands"
+            )
+        return Identity(
+            manufacturer=maker,
+            model=model,
+            serial_number=serial,
+            firmware=revision,
+            simulated=self.transport.simulated,
+            details={"address": self.address, "inputs": list(self.settings.numbers)},
+        )
+
+    def configure(self, settings: ScpiSettings) -> None:
+        """Use other settings from the next reading on; it sets the unit again."""
+        self.settings = settings
+        self._ready = False
+
+    def errors(self) -> list[str]:
+        """Read the error queue of the unit, which empties it; each entry such as ``-113 Undefined header``."""
+        found = []
+        for _ in range(MAX_ERRORS):
+            number, text = codec.parse_error(self._query("SYST:ERR?"))
+            if not number:
+                break
+            found.append(f"{number} {text}")
+        return found
+
+    def _measure(self) -> dict[str, tuple[float, str]]:
+        if not self._ready:
+            self._prepare()
+        try:
+            readings = self._scanned()
+        except InstrumentError:
+            self._ready = False
+            raise
+        return {
+            name: self._judged(index, readings[number])
+            for index, (name, number) in enumerate(zip(self.channels, self.settings.numbers, strict=True))
+        }
+
+    def _scanned(self) -> dict[int, float]:
+        pairs = codec.parse_readings(self._query("READ?"))
+        found = [channel for channel, _ in pairs]
+        if sorted(found) != sorted(self.settings.numbers):
+            raise ProtocolError(
+                f"{self.address}: expected one reading of each of the channels "
+                f"{codec.channel_list(sorted(self.settings.numbers))}; found {codec.channel_list(found)}"
+            )
+        return dict(pairs)
+
+    def _judged(self, index: int, reading: float) -> tuple[float, str]:
+        """Return temperature (degC) and flag of a reading (degC); above its range a sensor is taken for open."""
+        if math.isinf(reading):
+            return math.nan, OPEN if reading > 0 else OUT_OF_RANGE
+        value = self.settings.corrected(index, reading)
+        return value, GOOD if self.settings.lowest <= value <= self.settings.highest else OUT_OF_RANGE
+
+    def _prepare(self) -> None:
+        """Synchronise with the unit, set it, and report what it refuses."""
+        self._synchronise()
+        self.unit_errors = tuple(self.errors())
+        line, settings = self.transport, self.settings
+        line.write(codec.encode("*CLS"))
+        for command in settings.commands() if settings.setup else settings.format_commands():
+            line.write(codec.encode(command))
+            if refused := self.errors():  # one command at a time: a serial line has no flow control
+                raise InstrumentError(f"{self.address}: the unit refuses '{command}': {'; '.join(refused)}")
+        if not settings.setup:
+            scanned = codec.parse_channels(self._query("ROUT:SCAN?"))
+            if sorted(scanned) != sorted(settings.numbers):
+                raise InstrumentError(
+                    f"{self.address}: expected the scan list {codec.channel_list(sorted(settings.numbers))}; found "
+                    f"{codec.channel_list(scanned)}. Set 'inputs' to it, or 'setup' to true"
+                )
+        self._ready = True
+
+    def _synchronise(self) -> None:
+        """Ask for the identity and discard what comes before it: answers to earlier requests."""
+        answer = self._query("*IDN?")
+        for _ in range(MAX_LATE):
+            try:
+                codec.parse_identity(answer)
+                return
+            except ProtocolError:
+                answer = self._line("*IDN?")
+        raise ProtocolError(f"{self.address}: expected the identity of the unit; found {MAX_LATE} other lines")
+
+    def _query(self, command: str) -> str:
+        line = self.transport
+        discard_input(line)
+        line.write(codec.encode(command))
+        return self._line(command)
+
+    def _line(self, command: str) -> str:
+        line = self.transport
+        try:
+            return codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST))
+        except InstrumentTimeoutError as error:
+            disconnect_after_timeout(line)
+            raise InstrumentTimeoutError(f"'{command}': {error}") from None
+
+    def _connect(self) -> Transport:
+        return open_reconnecting(
+            self.address,
+            simulator=self.info.simulator,
+            record=self._record,
+            timeout=self.settings.timeout,
+            retry=self.settings.retry,
+            baudrate=self.settings.baudrate,
+        )
+
+    def _start_session(self) -> None:
+        self._ready = False
+        self.identify()
+        self._prepare()

@@ -1,0 +1,123 @@
+"""PDOs of CANopen: when a node sends which objects, and where they are in a frame.
+
+Source: CiA 301, objects 0x1800 ff. (communication) and 0x1A00 ff. (mapping).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from errormotion.errors import ProtocolError
+
+COMMUNICATION, MAPPING = 0x1800, 0x1A00
+SYNC_IDENTIFIER = 0x1005
+"""Object with the identifier of SYNC."""
+SYNC = 0x80
+"""Identifier of SYNC where a node does not state it."""
+COB_ID, TRANSMISSION, INHIBIT, EVENT_TIMER = 1, 2, 3, 5
+"""Subindices of the communication objects."""
+MOST_ENTRIES = 64
+"""Objects of one PDO; more than 64 stand for other kinds of PDO."""
+FRAME_BITS = 64
+_INVALID, _EXTENDED = 1 << 31, 1 << 29
+_LARGEST_CYCLIC = 240
+_EVENT = (254, 255)
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """Where an object is in a frame.
+
+    Attributes
+    ----------
+    index, subindex : int
+    offset, bits : int
+        First bit, from the lowest of the first byte on, and number of bits.
+    """
+
+    index: int
+    subindex: int
+    offset: int
+    bits: int
+
+    def data(self, frame: bytes) -> bytes:
+        """Return the bytes of the object, its bits at the lowest ones.
+
+        Raises
+        ------
+        ProtocolError
+            The frame is too short.
+        """
+        if len(frame) * 8 < self.offset + self.bits:
+            found = frame.hex(" ") or "none"
+            raise ProtocolError(f"a PDO with 0x{self.index:04X}:{self.subindex} is too short; found {found}")
+        number = int.from_bytes(frame, "little") >> self.offset & (1 << self.bits) - 1
+        return number.to_bytes(-(-self.bits // 8), "little")
+
+
+@dataclass(frozen=True)
+class TransmitPdo:
+    """A PDO that a node sends.
+
+    Attributes
+    ----------
+    number : int
+        From 1 on.
+    identifier : int
+        Of its frames, 11 bits.
+    transmission : int
+        0: at a SYNC after an event, 1 to 240: at every n-th SYNC, 254 and 255: after an event or the timer.
+    event_timer : float
+        Interval, s; 0: none.
+    mapped : tuple of Mapped
+    """
+
+    number: int
+    identifier: int
+    transmission: int
+    event_timer: float
+    mapped: tuple[Mapped, ...]
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether it is sent at every n-th SYNC."""
+        return 1 <= self.transmission <= _LARGEST_CYCLIC
+
+    @property
+    def timed(self) -> bool:
+        """Whether it is sent at an interval."""
+        return self.transmission in _EVENT and self.event_timer > 0
+
+    def place(self, index: int, subindex: int) -> Mapped | None:
+        """Return where an object is; None where it is not in this PDO."""
+        return next((each for each in self.mapped if (each.index, each.subindex) == (index, subindex)), None)
+
+
+def decode_identifier(number: int) -> int | None:
+    """Return the identifier of a PDO; None where the PDO is switched off, or has one of 29 bits."""
+    return None if number & (_INVALID | _EXTENDED) else number & 0x7FF
+
+
+def decode_mapping(entries: Sequence[int]) -> tuple[Mapped, ...]:
+    """Return where the objects of a PDO are.
+
+    Parameters
+    ----------
+    entries : sequence of int
+        As in 0x1A00 ff.: index, subindex and number of bits, from the highest byte on.
+
+    Raises
+    ------
+    ProtocolError
+        Objects without bits, or more than a frame holds.
+    """
+    mapped: list[Mapped] = []
+    offset = 0
+    for entry in entries:
+        bits = entry & 0xFF
+        if not 0 < bits <= FRAME_BITS - offset:
+            raise ProtocolError(f"the mapping 0x{entry:08X} does not fit a frame of {FRAME_BITS} bits at bit {offset}")
+        mapped.append(Mapped(entry >> 16 & 0xFFFF, entry >> 8 & 0xFF, offset, bits))
+        offset += bits
+    return tuple(mapped)

@@ -1,0 +1,265 @@
+"""SDO uploads of CANopen: the frames of a transfer, and the client that reads an object dictionary entry by entry.
+
+Source: CiA 301 (application layer). A transfer is expedited (up to 4 bytes in one frame) or in segments of 7 bytes.
+
+A node that answers late must not shift later readings: an answer counts only where it has the index and subindex of the
+request. After a timeout the client first reads an entry that it has not read before (`BARRIERS`, in turn) and ignores
+everything until its answer: a server answers in the order of the requests, so that nothing older can follow.
+"""
+
+from __future__ import annotations
+
+import queue
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import cycle
+
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+
+FRAME_BYTES = 8
+LONGEST_TRANSFER = 1024
+"""Longest entry that is read, bytes."""
+LONGEST_TIME = 10
+"""Longest duration of a transfer in segments, in time limits of one answer."""
+MOST_STRAY = 64
+"""Number of frames that are ignored at most while an answer is awaited."""
+BARRIERS = ((0x1001, 0), (0x1018, 1), (0x1000, 0))
+"""Entries that every node has (error register, vendor, device type)."""
+NO_OBJECT, NO_SUBINDEX, TIMED_OUT, GENERAL = 0x06020000, 0x06090011, 0x05040000, 0x08000000
+ABORTS = {
+    0x05030000: "Toggle bit not alternated",
+    0x05040000: "SDO protocol timed out",
+    0x05040001: "Client/server command specifier not valid or unknown",
+    0x05040002: "Invalid block size",
+    0x05040003: "Invalid sequence number",
+    0x05040004: "CRC error",
+    0x05040005: "Out of memory",
+    0x06010000: "Unsupported access to an object",
+    0x06010001: "Attempt to read a write only object",
+    0x06010002: "Attempt to write a read only object",
+    0x06020000: "Object does not exist",
+    0x06040041: "Object cannot be mapped to the PDO",
+    0x06040042: "PDO length exceeded",
+    0x06040043: "General parameter incompatibility",
+    0x06040047: "General internal incompatibility in the device",
+    0x06060000: "Access failed due to a hardware error",
+    0x06070010: "Data type and length code do not match",
+    0x06070012: "Data type does not match, length of service parameter too high",
+    0x06070013: "Data type does not match, length of service parameter too low",
+    0x06090011: "Subindex does not exist",
+    0x06090030: "Value range of parameter exceeded",
+    0x06090031: "Value of parameter written too high",
+    0x06090032: "Value of parameter written too low",
+    0x06090036: "Maximum value is less than minimum value",
+    0x060A0023: "Resource not available",
+    0x08000000: "General error",
+    0x08000020: "Data cannot be transferred or stored to the application",
+    0x08000021: "Data cannot be transferred or stored to the application because of local control",
+    0x08000022: "Data cannot be transferred or stored to the application because of the present device state",
+    0x08000023: "Object dictionary dynamic generation fails or no object dictionary is present",
+    0x08000024: "No data available",
+}
+_UPLOAD, _SEGMENT, _ABORT = 0x40, 0x60, 0x80
+_TOGGLE = 0x10
+
+
+class SdoRefusal(InstrumentError):  # noqa: N818 - that is what it is
+    """A node aborts the transfer.
+
+    Attributes
+    ----------
+    code : int
+        SDO abort code.
+    """
+
+    def __init__(self, code: int, what: str) -> None:
+        self.code = code
+        meaning = f", {ABORTS[code]}" if code in ABORTS else ""
+        super().__init__(f"{what} is refused: Code 0x{code:08X}{meaning}")
+
+
+def upload_request(index: int, subindex: int) -> bytes:
+    """Return the frame that asks for an entry."""
+    return struct.pack("<BHB4x", _UPLOAD, index, subindex)
+
+
+def segment_request(toggle: int) -> bytes:
+    """Return the frame that asks for the next segment; ``toggle`` 0 or 1."""
+    return bytes((_SEGMENT | toggle << 4, 0, 0, 0, 0, 0, 0, 0))
+
+
+def abort_request(index: int, subindex: int, code: int) -> bytes:
+    """Return the frame with which the client ends a transfer."""
+    return struct.pack("<BHBI", _ABORT, index, subindex, code)
+
+
+def upload_reply(frame: bytes, index: int, subindex: int) -> bytes | int | None:
+    """Return what a node answers to a request for an entry.
+
+    Returns
+    -------
+    bytes, int or None
+        The data; or the number of bytes that follow in segments (0: not stated); or None for an answer to another
+        request.
+
+    Raises
+    ------
+    SdoRefusal
+        The node aborts.
+    ProtocolError
+        No answer of this kind.
+    """
+    if len(frame) != FRAME_BYTES:
+        raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
+    command, at, sub, number = struct.unpack("<BHBI", frame)
+    kind = command & 0xE0
+    if kind not in (_UPLOAD, _ABORT):
+        raise ProtocolError(f"{frame.hex(' ')} is no answer to an SDO upload")
+    if (at, sub) != (index, subindex):
+        return None
+    if kind == _ABORT:
+        raise SdoRefusal(number, f"0x{index:04X}:{subindex}")
+    if command & 2:  # expedited; without bit 0 the number of bytes is not stated
+        return frame[4 : 8 - (command >> 2 & 3 if command & 1 else 0)]
+    return number if command & 1 else 0
+
+
+def segment_reply(frame: bytes, toggle: int) -> tuple[bytes, bool] | None:
+    """Return the data of a segment and whether it is the last one; None for an answer to another request.
+
+    Raises
+    ------
+    SdoRefusal
+        The node aborts.
+    ProtocolError
+        No answer of this kind.
+    """
+    if len(frame) != FRAME_BYTES:
+        raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
+    command = frame[0]
+    if command & 0xE0 == _ABORT:
+        at, sub, code = struct.unpack("<HBI", frame[1:])
+        raise SdoRefusal(code, f"0x{at:04X}:{sub}")
+    if command & 0xE0:
+        return None
+    if bool(command & _TOGGLE) != bool(toggle):
+        return None
+    return frame[1 : 8 - (command >> 1 & 7)], bool(command & 1)
+
+
+class SdoClient:
+    """Reads entries of one node's object dictionary.
+
+    Parameters
+    ----------
+    send : callable
+        ``send(frame, reset)`` sends a request, and calls ``reset`` between the frames before it and those after it.
+    timeout : float
+        Time limit of an answer, s.
+
+    Attributes
+    ----------
+    answers : queue.Queue
+        Frames that the node has sent; the receiving thread fills it.
+    late : int
+        Number of answers that were ignored, as they came after their time or belonged to another request.
+    """
+
+    def __init__(self, send: Callable[[bytes, Callable[[], None] | None], None], timeout: float) -> None:
+        self._send = send
+        self.timeout = timeout
+        self.answers: queue.Queue[bytes] = queue.Queue()
+        self.late = 0
+        self._settled = True
+        self._barriers = cycle(BARRIERS)
+
+    def upload(self, index: int, subindex: int) -> bytes:
+        """Return the bytes of an entry.
+
+        Raises
+        ------
+        SdoRefusal
+            The node aborts.
+        InstrumentTimeoutError
+            No answer within the time limit.
+        ProtocolError
+            An answer that is none.
+        """
+        if not self._settled:
+            self._settle((index, subindex))
+        return self._exchange(index, subindex)
+
+    def _settle(self, asked: tuple[int, int]) -> None:
+        """Wait until no answer to an earlier request can follow."""
+        barrier = next(self._barriers)
+        if barrier == asked:
+            barrier = next(self._barriers)
+        with suppress(SdoRefusal):  # an answer as well
+            self._exchange(*barrier)
+
+    def _exchange(self, index: int, subindex: int) -> bytes:
+        was_settled, self._settled = self._settled, False
+        self._send(upload_request(index, subindex), self._forget)
+        end = time.monotonic() + self.timeout
+        for _ in range(MOST_STRAY):
+            try:
+                reply = upload_reply(self._next(end), index, subindex)
+            except SdoRefusal:
+                self._settled = True
+                raise
+            except ProtocolError:
+                if not was_settled:  # an old answer
+                    self.late += 1
+                    continue
+                raise
+            if reply is not None:
+                break
+            self.late += 1
+        else:
+            raise ProtocolError(f"{MOST_STRAY} answers to other requests")
+        data = reply if isinstance(reply, bytes) else self._segments(index, subindex, reply)
+        self._settled = True
+        return data
+
+    def _segments(self, index: int, subindex: int, size: int) -> bytes:
+        """Return the data that follow in segments."""
+        if size > LONGEST_TRANSFER:
+            raise self._ended(index, subindex, f"announced {size} bytes; expected at most {LONGEST_TRANSFER}")
+        data, toggle = b"", 0
+        last = time.monotonic() + LONGEST_TIME * self.timeout
+        while True:
+            self._send(segment_request(toggle), None)
+            found = segment_reply(self._next(min(last, time.monotonic() + self.timeout)), toggle)
+            if found is None:
+                raise self._ended(index, subindex, "a segment of another transfer came")
+            data += found[0]
+            if len(data) > LONGEST_TRANSFER:
+                raise self._ended(index, subindex, f"more than {LONGEST_TRANSFER} bytes came")
+            if found[1]:
+                break
+            if not found[0]:
+                raise self._ended(index, subindex, "a segment without data came")
+            toggle ^= 1
+        if size and len(data) != size:
+            raise ProtocolError(f"0x{index:04X}:{subindex} announced {size} bytes; {len(data)} came")
+        return data
+
+    def _ended(self, index: int, subindex: int, why: str) -> ProtocolError:
+        self._send(abort_request(index, subindex, GENERAL), None)
+        return ProtocolError(f"0x{index:04X}:{subindex}: {why}")
+
+    def _next(self, end: float) -> bytes:
+        try:
+            return self.answers.get(timeout=max(end - time.monotonic(), 0.0))
+        except queue.Empty:
+            raise InstrumentTimeoutError(f"no SDO answer within {self.timeout:g} s") from None
+
+    def _forget(self) -> None:
+        while True:
+            try:
+                self.answers.get_nowait()
+            except queue.Empty:
+                return
+            self.late += 1

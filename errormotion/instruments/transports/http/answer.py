@@ -1,0 +1,285 @@
+"""Answers of an HTTP/1.x server as they come in: head and body, bounded in size and in time (RFC 9112).
+
+Longest line of a head: 8192 bytes, of the head of a part 4096; at most 100 lines of a head or trailer; a chunk size has
+at most 8 digits.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Callable, Mapping
+
+from errormotion.errors import InstrumentTimeoutError, ProtocolError
+
+MOST_LINE_BYTES = 8192
+MOST_PART_LINE_BYTES = 4096
+MOST_HEAD_LINES = 100
+_MOST_INTERIM_ANSWERS = 5  # 1xx, before the final one
+_STATUS_LINE = re.compile(r"HTTP/1\.([01]) ([1-5][0-9][0-9])(?: .*)?")
+_CHUNK_SIZE = re.compile(rb"([0-9A-Fa-f]{1,8})[ \t]*(?:;.*)?")
+
+
+class CutOffError(ProtocolError):
+    """The connection ended within a body in chunks."""
+
+
+Read = Callable[[float], bytes]
+"""``read(timeout)`` returns bytes as soon as there are any, no bytes at the end of the connection."""
+
+
+class Input:
+    """Bytes of one connection, taken apart into lines and blocks.
+
+    Attributes
+    ----------
+    deadline : float
+        Time (`time.monotonic`, s) at which reading fails; infinite: only the time limit without data counts.
+    """
+
+    def __init__(self, read: Read, url: str, timeout: float) -> None:
+        self._read, self._url, self._timeout = read, url, timeout
+        self._buffer = bytearray()
+        self._ended = False
+        self.deadline = math.inf
+
+    @property
+    def waiting(self) -> bool:
+        """Whether bytes have come in that were not used."""
+        return bool(self._buffer)
+
+    def fill(self) -> bool:
+        """Wait for further bytes; False at the end of the connection.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No data within the time limit, or the deadline has passed.
+        """
+        if not self._ended:
+            try:
+                data = self._read(min(max(self.deadline - time.monotonic(), 0.0), self._timeout))
+            except InstrumentTimeoutError:
+                self._check()
+                raise
+            self._check()
+            self._buffer += data
+            self._ended = not data
+        return not self._ended
+
+    def _check(self) -> None:
+        if time.monotonic() >= self.deadline:
+            raise InstrumentTimeoutError(f"{self._url}: the answer was not complete within the time limit") from None
+
+    def line(self) -> bytes | None:
+        """Return the next line without its end; None at the end of the connection."""
+        start = 0
+        while (end := self._buffer.find(b"\n", start)) < 0:
+            start = len(self._buffer)
+            if start > MOST_LINE_BYTES:
+                raise ProtocolError(f"{self._url}: a line longer than {MOST_LINE_BYTES} bytes: {self._start()}")
+            if not self.fill():
+                if self._buffer:
+                    raise ProtocolError(f"{self._url}: the connection ended within a line: {self._start()}")
+                return None
+        if end > MOST_LINE_BYTES:
+            raise ProtocolError(f"{self._url}: a line longer than {MOST_LINE_BYTES} bytes: {self._start()}")
+        return self.some(end + 1).rstrip(b"\r\n")
+
+    def some(self, most: int) -> bytes:
+        """Return up to ``most`` bytes; none at the end of the connection."""
+        if not self._buffer and not self.fill():
+            return b""
+        data = bytes(self._buffer[:most])
+        del self._buffer[:most]
+        return data
+
+    def _start(self) -> str:
+        return repr(bytes(self._buffer[:80]))
+
+
+class Head:
+    """The head of an answer, and the means to read its body.
+
+    Parameters
+    ----------
+    source : Input
+    url : str
+        For messages.
+
+    Attributes
+    ----------
+    status : int
+    headers : mapping of str to str
+        By lower-case name; the last one where a name occurs twice.
+    closes : bool
+        Whether the connection ends with this answer.
+
+    Raises
+    ------
+    ProtocolError
+        No answer of HTTP, or a body of unknown length or coding.
+    EOFError
+        The connection ended before the answer began.
+    """
+
+    def __init__(self, source: Input, url: str) -> None:
+        self._source, self._url = source, url
+        for _ in range(_MOST_INTERIM_ANSWERS + 1):
+            version, self.status = self._status_line()
+            self.headers: Mapping[str, str] = self._fields()
+            if self.status >= 200:
+                break
+        else:
+            raise ProtocolError(f"{url}: expected an HTTP answer; found only preliminary ones")
+        connection = self.headers.get("connection", "").lower()
+        coding = self.headers.get("transfer-encoding", "identity").strip().lower()
+        if coding not in ("identity", "chunked"):
+            raise ProtocolError(f"{url}: expected a body without transfer coding, or in chunks; found '{coding[:40]}'")
+        if (content := self.headers.get("content-encoding", "identity").strip().lower()) != "identity":
+            raise ProtocolError(f"{url}: expected a body that is not compressed; found '{content[:40]}'")
+        self._chunked = coding == "chunked"
+        self._left = self._length()
+        self._first_chunk = True
+        self.closes = (
+            "close" in connection or (version == 0 and "keep-alive" not in connection) or math.isinf(self._left)
+        )
+
+    @property
+    def missing(self) -> int:
+        """Bytes of the body, of stated length, that have not come."""
+        return 0 if self._chunked or math.isinf(self._left) else int(self._left)
+
+    def body(self, limit: int) -> bytes:
+        """Return the whole body.
+
+        Raises
+        ------
+        ProtocolError
+            Larger than ``limit`` bytes, or cut off.
+        """
+        found = bytearray()
+        while data := self.some(limit + 1 - len(found)):
+            found += data
+            if len(found) > limit:
+                raise ProtocolError(f"{self._url}: the answer is larger than {limit} bytes")
+        if self.missing:
+            raise ProtocolError(f"{self._url}: the answer is cut off, {self.missing} bytes before its end")
+        return bytes(found)
+
+    def some(self, most: int) -> bytes:
+        """Return up to ``most`` bytes of the body; none at its end."""
+        if self._left == 0 and not (self._chunked and self._next_chunk()):
+            return b""
+        data = self._source.some(min(most, int(self._left))) if self._left < math.inf else self._source.some(most)
+        if self._chunked and not data:
+            raise CutOffError(f"{self._url}: the answer is cut off within a chunk")
+        self._left -= len(data)
+        return data
+
+    def _next_chunk(self) -> bool:
+        """Read the size of the next chunk; False after the last."""
+        if not self._first_chunk and self._chunk_line() != b"":
+            raise ProtocolError(f"{self._url}: the answer is damaged at the end of a chunk")
+        self._first_chunk = False
+        line = self._chunk_line()
+        if not (found := _CHUNK_SIZE.fullmatch(line)):
+            raise ProtocolError(f"{self._url}: the answer is damaged: expected a chunk size; found {line[:40]!r}")
+        self._left = int(found[1], 16)
+        if not self._left:
+            self._fields()  # the trailer
+            self._chunked = False
+        return self._left > 0
+
+    def _chunk_line(self) -> bytes:
+        line = self._source.line()
+        if line is None:
+            raise CutOffError(f"{self._url}: the answer is cut off between two chunks")
+        return line
+
+    def _length(self) -> float:
+        if self.status in (204, 304) or self._chunked:
+            return 0
+        text = self.headers.get("content-length")
+        if text is None:
+            return math.inf
+        if not re.fullmatch("[0-9]{1,18}", text):
+            raise ProtocolError(f"{self._url}: expected the length of the body; found '{text[:40]}'")
+        return int(text)
+
+    def _status_line(self) -> tuple[int, int]:
+        line = self._source.line()
+        if line is None:
+            raise EOFError
+        found = _STATUS_LINE.fullmatch(line.decode("latin-1"))
+        if not found:
+            raise ProtocolError(f"{self._url}: expected an HTTP answer; found {line[:80]!r}")
+        return int(found[1]), int(found[2])
+
+    def _fields(self) -> dict[str, str]:
+        return header_fields(self._source.line, self._url)
+
+
+def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, str]:
+    """Return the fields of a head up to its empty line, by lower-case name.
+
+    Raises
+    ------
+    ProtocolError
+        More than `MOST_HEAD_LINES`, two different lengths, or the end of the connection.
+    """
+    found: dict[str, str] = {}
+    for _ in range(MOST_HEAD_LINES + 1):
+        line = next_line()
+        if line is None:
+            raise ProtocolError(f"{url}: the connection ended within the head of an answer or part")
+        if not line:
+            return found
+        name, _, value = line.decode("latin-1").partition(":")
+        key, text = name.strip().lower(), value.strip()
+        if key == "content-length" and found.get(key, text) != text:
+            raise ProtocolError(f"{url}: two lengths of the body, '{found[key][:20]}' and '{text[:20]}'")
+        found[key] = text
+    raise ProtocolError(f"{url}: a head of more than {MOST_HEAD_LINES} lines")
+
+
+class Lines:
+    """The body of an answer of many parts: lines and blocks of stated size."""
+
+    def __init__(self, answer: Head, url: str) -> None:
+        self._answer, self._url = answer, url
+        self._buffer = bytearray()
+
+    def line(self) -> bytes | None:
+        """Return the next line without its end; None at the end of the body."""
+        start = 0
+        while (end := self._buffer.find(b"\n", start)) < 0:
+            start = len(self._buffer)
+            if start > MOST_PART_LINE_BYTES:
+                raise ProtocolError(
+                    f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}"
+                )
+            if not self._more(MOST_PART_LINE_BYTES):
+                return None  # what is left of a line belongs to nothing
+        line = bytes(self._buffer[:end]).rstrip(b"\r")
+        del self._buffer[: end + 1]
+        return line
+
+    def block(self, size: int) -> bytes | None:
+        """Return exactly ``size`` bytes; None where the body ends before."""
+        while len(self._buffer) < size:
+            if not self._more(max(MOST_PART_LINE_BYTES, size - len(self._buffer))):
+                return None
+        data = bytes(self._buffer[:size])
+        del self._buffer[:size]
+        return data
+
+    def _more(self, most: int) -> bool:
+        """Wait for bytes; False at the end of the body, or of the connection: an agent may end within a stream."""
+        try:
+            data = self._answer.some(most)
+        except CutOffError:
+            return False
+        self._buffer += data
+        return bool(data)
