@@ -33,6 +33,7 @@ from errormotion.instruments.transports.recording import read_recording
 
 QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
 MAX_STRAY_BYTES = 512  # largest number of bytes discarded after a damaged answer
+MAX_LATE_ANSWERS = 8  # skipped after a timeout
 
 
 class ModbusLine(Transport):
@@ -88,7 +89,7 @@ class ModbusLine(Transport):
         raise AssertionError  # the loop has ended by itself
 
     def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        self._await_late_answer()
+        self._await_late_answer(function, register, count)
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
         end = time.monotonic() + self.timeout
@@ -109,22 +110,41 @@ class ModbusLine(Transport):
             disconnect_after_timeout(self._line)
             raise
 
-    def _await_late_answer(self) -> None:
-        """Discard unread bytes; after a timeout, also what arrives within a further time limit.
+    def _await_late_answer(self, function: int, register: int, count: int) -> None:
+        """Discard unread bytes; after a timeout, make sure that no late answer is taken for the next one.
 
-        An RTU frame has no number: a late answer would be taken for that to the next request.
+        An RTU frame has no number. What arrives within a further time limit is discarded; for what is later still,
+        another number of registers is read, so that the two answers differ in length.
         """
         since, self._unanswered_at = self._unanswered_at, None
         if since is None or self.framing == "tcp":
             discard_input(self._line)
             return
         try:
-            await_quiet(self._line, self.timeout, since)
-        except ProtocolError:
+            try:
+                await_quiet(self._line, self.timeout, since)
+            except ProtocolError:
+                raise
+            except InstrumentError:  # the connection was dropped: the answer is lost with it
+                return
+            self._skip_late_answers(function, register, 1 if count > 1 else 2)
+        except (ProtocolError, InstrumentTimeoutError):
             self._unanswered_at = time.monotonic()
             raise
-        except InstrumentError:  # the connection was dropped: the answer is lost with it
+
+    def _skip_late_answers(self, function: int, register: int, count: int) -> None:
+        """Request a number of registers and skip answers until that to this request, or its refusal."""
+        self._line.write(encode_request(self.framing, self.unit, function, register, count))
+        end = time.monotonic() + self.timeout
+        for _ in range(MAX_LATE_ANSWERS):
+            try:
+                decode_answer(self.framing, self._frame(end), self.unit, function, count)
+            except ModbusRefusal:
+                return
+            except ProtocolError:
+                continue
             return
+        raise ProtocolError(f"{self.url}: {MAX_LATE_ANSWERS} answers to earlier requests; expected one")
 
     def _frame(self, end: float) -> bytes:
         """Return one answer, of the length that its start states."""
