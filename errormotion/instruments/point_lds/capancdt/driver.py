@@ -190,7 +190,7 @@ class CapaNCDT(Driver):
             raise
         finally:
             self._streaming = False
-            if not self._failed and self._transport is not None:  # closed meanwhile: the trigger is restored there
+            if self._transport is not None and not self._failed:
                 self._query(f"{codec.TRIGGER}{codec.ON_REQUEST}")
 
     def _blocks(self, sequence: Sequence, size: int) -> Iterator[Samples]:
@@ -313,6 +313,7 @@ class CapaNCDT(Driver):
 
     def _start_session(self) -> None:
         self._channel, self._failed = None, False
+        self._data.report_delivered(0)
         request = f"{codec.TRIGGER}?"
         self._trigger = codec.parse_number(request, self._query(request))
         self._stale = self._trigger == codec.CONTINUOUS
