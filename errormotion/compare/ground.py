@@ -21,7 +21,7 @@ from errormotion.kinematics.iso import DOF
 SAME_POINT = 1e-6
 """Distance below which two commanded positions are the same, m."""
 SAME_MOTION = {"spindle": "tool", "tool": "tool"}
-"""Components that are the same motion, tool relative to workpiece: a bar in the spindle shows it, and so does a probe."""
+"""Components that are the same motion, the tool relative to the workpiece: a bar in the spindle shows it."""
 COORDINATES = {"position": ("x", "y", "z"), "target": ("x", "y", "z")}
 
 
@@ -184,8 +184,8 @@ def _in_time(
     missing = [name for name, start in starts.items() if not start]
     if missing and not same_start:
         raise DatasetError(
-            f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times have no "
-            "relation to the others. State it, or state that all start at the same instant (same_start)"
+            f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times "
+            "have no relation to the others. State it, or state that all start at the same instant (same_start)"
         )
     if missing:
         notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")

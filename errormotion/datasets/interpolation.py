@@ -5,7 +5,8 @@ line. At the share w of an interval of length h, with nothing known of the slope
 ``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
 ``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
 ``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a
-warm-up starts, so the intensity of an interval is that of the second differences near it. Sources that are one draw for
+warm-up starts, so the intensity of an interval is that of the second differences at its
+ends. Sources that are one draw for
 many values go through the same weights. Nothing is extrapolated.
 """
 
@@ -19,9 +20,6 @@ from errormotion.arrays import Array
 from errormotion.datasets.reduction import TOLERANCE, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
-
-NEAR = 1.0
-"""Second differences on either side of an interval that its intensity is estimated from, in steps from its middle."""
 
 
 def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> xr.Dataset:
@@ -119,11 +117,10 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     unit = np.broadcast_to((h**2 * g**2 / (3 * (h + g))).reshape(shape), bend.shape)
     known = np.isfinite(bend) & np.isfinite(noise)
     excess, scale = np.where(known, bend**2 - noise, 0.0), np.where(known, unit, 0.0)
-    # Between values k and k + 1 the nearest bends are those at k and k + 1, numbers k - 1 and k.
-    distance = np.arange(len(t) - 1)[:, None] - 0.5 - np.arange(len(t) - 2)
-    weight = np.where(np.abs(distance) <= NEAR, 1.0, 0.0)
-    local, unit = (np.tensordot(weight, each, axes=1) for each in (excess, scale))
-    found: Array = np.maximum(local, 0.0) / np.where(unit > 0, unit, np.inf)
+    # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
+    none = np.zeros((1, *excess.shape[1:]))
+    beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
+    found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
     return found
 
 

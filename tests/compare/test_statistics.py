@@ -53,8 +53,6 @@ def test_whitening_is_the_inverse_of_the_dense_covariance():
     expected = a.reshape(3, -1) @ np.linalg.solve(V, b.reshape(3, -1).T)
     np.testing.assert_allclose(white.product(a, b), expected, rtol=1e-8)
     assert white.degrees == N * D
-    scaled = V / np.outer(np.tile(white.scale, N), np.tile(white.scale, N))
-    assert white.log_determinant == pytest.approx(np.linalg.slogdet(scaled)[1])
 
 
 def test_a_value_that_is_exactly_zero_is_no_evidence():
