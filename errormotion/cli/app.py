@@ -245,6 +245,38 @@ def program(
 
 @app.command()
 @guarded
+def record(
+    bench: Annotated[Path, typer.Argument(help="A bench file.")],
+    instrument: Annotated[str, typer.Argument(help="The name of one of its instruments.")],
+    for_: Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the session.")] = "10 s",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The recording to write; default: INSTRUMENT-TIME.rec.")
+    ] = None,
+    mask_serial: Annotated[bool, typer.Option("--mask-serial", help="Mask the serial number.")] = False,
+    json_: Json = False,
+) -> None:
+    """Record a short session with one instrument: identity, readings, stream."""
+    from errormotion.cli.commands import record as command
+
+    if not command.record(bench, instrument, for_, out, mask_serial, json_):
+        raise typer.Exit(ERROR)
+
+
+@app.command()
+@guarded
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A recording that 'errormotion record' has made.")],
+    json_: Json = False,
+) -> None:
+    """Run the driver on a recorded session, and report whether it was reproduced."""
+    from errormotion.cli.commands import record as command
+
+    if not command.replay(recording, json_):
+        raise typer.Exit(INVALID)
+
+
+@app.command()
+@guarded
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
@@ -273,6 +305,43 @@ def validate(
         show("\n  - ".join([f"{file}: {count}", *mistakes]) if mistakes else f"{file}: valid")
     if mistakes:
         raise typer.Exit(INVALID)
+
+
+@app.command()
+@guarded
+def compare(
+    results: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Error datasets, run folders, or folders of runs (the newest result of each test)."),
+    ] = None,
+    name: Annotated[list[str] | None, typer.Option(help="A further one with a name of its own: NAME=PATH.")] = None,
+    at: Annotated[
+        str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of the first dataset.")
+    ] = None,
+    freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
+    since: Annotated[
+        float | None, typer.Option(help="Common reference state, s after the start of the first dataset.")
+    ] = None,
+    same_start: Annotated[
+        bool, typer.Option("--same-start", help="Take time 0 of all datasets as one instant where none is stated.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
+    json_: Json = False,
+) -> None:
+    """Compare results of one machine: whether they agree, and what explains it where they do not."""
+    from errormotion.cli.commands import compare as command
+
+    point = None
+    if at is not None:
+        try:
+            x, y, z = (float(part) / 1e3 for part in at.split(","))
+        except ValueError:
+            typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
+            raise typer.Exit(USAGE) from None
+        point = (x, y, z)
+    chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
+    command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
 
 
 @app.command()
@@ -313,12 +382,15 @@ def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: 
 def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
+    mutants: Annotated[
+        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
     from errormotion.cli.commands import plugins as command
 
-    if not command.check_plugin(plugin, address, json_):
+    if not command.check_plugin(plugin, address, mutants, json_):
         raise typer.Exit(INVALID)
 
 

@@ -26,8 +26,6 @@ class Whitener:
     ----------
     degrees : int
         Directions with variance.
-    log_determinant : float
-        Of the covariance over these directions, in units of the scales.
     """
 
     scale: Array  # (d,)
@@ -35,7 +33,6 @@ class Whitener:
     factor: Array  # (k, k) Cholesky factor of 1 + G'G
     G: Array  # (n d, k): whitened influence
     degrees: int
-    log_determinant: float
 
     def product(self, a: Array, b: Array) -> Array:
         """Return ``a' V^-1 b`` for arrays (p, n, d) and (q, n, d); NaN counts as unknown, and has no weight.
@@ -66,7 +63,6 @@ def whitener(own: Array, influence: Array) -> Whitener:
     difference (the zero of a reference state) is no evidence.
     """
     own, F = np.nan_to_num(own), np.nan_to_num(influence)
-    d = own.shape[-1]
     total = np.einsum("nii->ni", own) + (F**2).sum(axis=0)
     scale = np.sqrt(total.max(axis=0, initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
@@ -84,9 +80,7 @@ def whitener(own: Array, influence: Array) -> Whitener:
     factor = np.linalg.cholesky(inner)
     # Directions that sources alone move: no more of them are free than the sources can reach.
     degrees = int(strong.sum()) + _reached(root, F, weak)
-    logs = float(np.log(power[kept]).sum() + 2 * np.log(np.diag(factor)).sum()) if kept.any() else 0.0
-    assert root.shape[-1] == d
-    return Whitener(scale, root, factor, G, degrees, logs)
+    return Whitener(scale, root, factor, G, degrees)
 
 
 def _reached(root: Array, F: Array, weak: Array) -> int:

@@ -239,6 +239,24 @@ class ErrorMotion:
 
         return since(self._ds, time)
 
+    def to_times(self, times: ArrayLike) -> xr.Dataset:
+        """Return the errors at other instants, s, with what interpolation adds; see `interpolation.to_points`."""
+        from errormotion.datasets.interpolation import to_points
+
+        return to_points(self._ds, "time", "time", times)
+
+    def to_positions(self, positions: ArrayLike, coordinate: str = "") -> xr.Dataset:
+        """Return the errors at other positions of an axis, m; see `interpolation.to_points`.
+
+        ``coordinate`` is ``x``, ``y`` or ``z`` along ``position``; it may be left out where there is only one.
+        """
+        from errormotion.datasets.interpolation import to_points
+
+        own = [name for name in "xyz" if name in self._ds.variables and self._ds[name].dims == ("position",)]
+        if not coordinate and len(own) != 1:
+            raise DatasetError(f"Expected one coordinate along 'position'; found {', '.join(own) or 'none'}: name one")
+        return to_points(self._ds, "position", coordinate or own[0], positions)
+
     def mean(self, dim: str) -> xr.Dataset:
         """Return the mean over a dimension with its covariance; see `reduction.mean`."""
         from errormotion.datasets.reduction import mean

@@ -108,8 +108,10 @@ def _covariance_violations(variable: xr.Variable, row: Row) -> Iterator[str]:
     C = C[~np.isnan(C).any(axis=(-2, -1))]
     scale = np.sqrt(np.abs(np.diagonal(C, axis1=-2, axis2=-1)))
     scale[scale == 0] = 1.0
-    correlation = C / scale[..., :, None] / scale[..., None, :]
-    if np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(initial=0.0) > _ROUNDING:
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = C / scale[..., :, None] / scale[..., None, :]
+        symmetric = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(initial=0.0) <= _ROUNDING
+    if not symmetric:
         yield f"{row.name}: expected a symmetric matrix; found one that is not"
     elif np.linalg.eigvalsh(correlation).min(initial=0.0) < -_ROUNDING:
         yield f"{row.name}: expected no negative variance in any direction; found one"

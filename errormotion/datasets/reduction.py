@@ -48,7 +48,7 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     axis = ds["EX"].dims.index("time")
     E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
     C = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
-    F = np.moveaxis(_influence(ds), axis + 1, 1)
+    F = np.moveaxis(influence_of(ds), axis + 1, 1)
     seen = ~np.isnan(E).all(axis=0)
     inside = inside.reshape(-1, *[1] * (E.ndim - 1)) & (~np.isnan(E) | ~seen).all(axis=-1, keepdims=True)
     used = np.broadcast_to(inside[..., 0], E.shape[:-1])
@@ -77,7 +77,7 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     zero = (first + last) / 2
     values = np.moveaxis(E - E_ref, 0, axis)
     names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
-    return _rebuilt(
+    return rebuilt(
         ds,
         values,
         np.moveaxis(total, 0, axis),
@@ -111,7 +111,7 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     known = ~np.isnan(E)
     count = known.sum(axis=axis)
     weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
-    F = np.nan_to_num(_influence(ds))
+    F = np.nan_to_num(influence_of(ds))
     own = np.nan_to_num(np.asarray(ds["covariance"].values) - np.einsum("s...i,s...j->...ij", F, F))
     value = (weight * np.nan_to_num(E)).sum(axis=axis)
     value[count == 0] = np.nan
@@ -121,14 +121,14 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
     total[np.isnan(value)[..., :, None] | np.isnan(value)[..., None, :]] = np.nan
     rest = ds.isel({dim: 0}, drop=True).drop_vars(f"{dim}{INDEX}", errors="ignore")
-    return _rebuilt(rest, value, total, influence, [], {})
+    return rebuilt(rest, value, total, influence, [], {})
 
 
 TOLERANCE = 1e-9
 """Rounding of a time, s."""
 
 
-def _rebuilt(
+def rebuilt(
     ds: xr.Dataset,
     values: Array,
     covariance: Array,
@@ -190,7 +190,8 @@ def _sources_of(covariance: Array) -> Array:
     return np.array(rows) if rows else np.zeros((0, *covariance.shape[:-1]))
 
 
-def _influence(ds: xr.Dataset) -> Array:
+def influence_of(ds: xr.Dataset) -> Array:
+    """Return the influence of an error dataset, (source, ..., 6); without sources where it has none."""
     if "influence" in ds.variables:
         return np.asarray(ds["influence"].values, dtype=float)
     return np.zeros((0, *ds["EX"].shape, 6))

@@ -77,7 +77,7 @@ def load(path: str | Path) -> xr.Dataset:
     engine = _engine_of(path)
     with _reading(path):
         if engine == "h5netcdf":
-            h5py.File(path).close()  # h5netcdf leaves a half-made object behind when the file is damaged
+            probe(path)
         ds = xr.open_dataset(
             path,
             engine=engine,
@@ -91,6 +91,12 @@ def load(path: str | Path) -> xr.Dataset:
             with ds:
                 ds = ds.load()
     return _with_indexes(ds)
+
+
+def probe(path: Path) -> None:
+    """Open a NetCDF file and read its attributes with h5py: h5netcdf leaves a half-made object where these fail."""
+    with h5py.File(path) as file:
+        file.attrs.get("_nc3_strict")
 
 
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:

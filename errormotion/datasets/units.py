@@ -213,7 +213,7 @@ def convert(values: ArrayLike, source: str, target: str) -> ArrayLike:
     Returns
     -------
     float or ndarray
-        Numbers in ``target``.
+        Numbers in ``target``; infinite where they are beyond all numbers.
 
     Raises
     ------
@@ -222,8 +222,9 @@ def convert(values: ArrayLike, source: str, target: str) -> ArrayLike:
     """
     factor, offset = _linear(source, target)
     # Divided where the factor is 1/n: 25 um is then 2.5e-5 m to the last bit.
-    scaled = values / float(1 / factor) if factor.numerator == 1 else values * float(factor)
-    return scaled + float(offset) if offset else scaled
+    with np.errstate(over="ignore"):
+        scaled = values / float(1 / factor) if factor.numerator == 1 else values * float(factor)
+        return scaled + float(offset) if offset else scaled
 
 
 def si_unit(unit: str) -> str:

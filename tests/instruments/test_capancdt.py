@@ -121,6 +121,17 @@ def test_a_missing_value_is_a_timeout_and_a_late_one_is_not_taken_for_the_next(c
         assert capa.read() == pytest.approx(1e-3, abs=1e-9)
 
 
+def test_a_late_answer_shifts_no_later_reading(controller: ScriptedController) -> None:
+    controller.readings = [block(n, (1000 * n, 0)) for n in range(1, 6)]
+    with sensor(controller, timeout=0.3) as capa:
+        assert capa.read() == pytest.approx(1000 / 0xFFFFFF * 2e-3)
+        controller.late = {"GMD"}
+        with pytest.raises(InstrumentTimeoutError):
+            capa.read()
+        readings = [capa.read() for _ in range(3)]
+    assert readings == pytest.approx([n * 1000 / 0xFFFFFF * 2e-3 for n in (3, 4, 5)])
+
+
 def test_a_stream_starts_and_ends_with_the_trigger_mode(controller: ScriptedController) -> None:
     controller.blocks = [block(10 * n, *[(MIDDLE + 10 * n + k, 5) for k in range(10)]) for n in range(5)]
     controller.readings = [block(99, (4194304, 0))]

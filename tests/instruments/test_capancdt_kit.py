@@ -5,4 +5,4 @@ from errormotion.testing import InstrumentConformance, InstrumentSubject
 class TestKit(InstrumentConformance):
     """A sensor of the frame, in the middle of the bar's range."""
 
-    subject = InstrumentSubject(CapaNCDT, "sim://cframe/X1?seed=3", settings={"timeout": 0.5})
+    subject = InstrumentSubject(CapaNCDT, "sim://cframe/X1?seed=3", settings={"timeout": 2.0})

@@ -31,17 +31,15 @@ def plain_pack(raws: list[int], intensities: list[int], trigger: int, encoder: i
     size = -(-20 * len(raws) // 32)
     if intensities:
         pairs = [*intensities, 0] if len(intensities) % 2 else intensities
-        fields = [(a << 10 | b) if i + 1 < len(intensities) else a for i, a, b in zip(*_pairs(pairs), strict=True)]
+        fields = [a << 10 | b for a, b in zip(pairs[::2], pairs[1::2], strict=True)]
         bits |= sum(field << 10 * 2 * k for k, field in enumerate(fields)) << 20 * len(raws)
         size += -(-10 * len(intensities) // 32)
+    if (20 * len(raws) + 10 * (len(intensities) + len(intensities) % 2)) > 32 * size:
+        bits &= (1 << 20 * len(raws) + 10 * (len(intensities) - 1)) - 1  # the last of an odd number finds no room
     body = bits.to_bytes(4 * size, "little")
     words = struct.pack("<IIiIII", 0, trigger, encoder, 0, 0, 0) + body
     total = sum(struct.unpack(f"<{len(words) // 4}I", words)) % (1 << 32)
     return words + struct.pack("<I", total)
-
-
-def _pairs(values: list[int]) -> tuple[range, list[int], list[int]]:
-    return range(0, len(values), 2), values[::2], values[1::2]
 
 
 def profile(trigger: int, points: int = 16, raws: list[int] | None = None) -> bytes:
@@ -183,7 +181,9 @@ def test_profiles_are_packed_as_the_reference_does_and_come_back(
     if light:
         back = np.empty((1, len(raws)), dtype=np.uint16)
         HeightDecoder(where).intensities(profiles, reasons, back)
-        assert back[0].tolist() == light
+        n = len(light)
+        whole = n % 2 == 0 or 20 * n + 10 * (n + 1) <= 32 * (where.height_words + where.intensity_words)
+        assert back[0].tolist() == (light if whole else [*light[:-1], 0])
 
 
 def test_each_code_for_no_height_is_nan_and_counted_by_its_name() -> None:

@@ -2,6 +2,7 @@
 
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -96,12 +97,16 @@ def test_a_reply_that_breaks_off_is_completed_later(controller: Controller) -> N
     profiler.close()
 
 
-def test_a_reply_sent_twice_does_not_shift_the_replies_to_other_commands(controller: Controller) -> None:
+def test_a_reply_sent_twice_shifts_no_later_one(controller: Controller) -> None:
     profiler = opened(controller)
     number = len(controller.requests)
-    controller.otherwise[number] = lambda reply: controller.commands.send(2 * reply)
+    for i in (0, 2):
+        controller.otherwise[number + i] = lambda reply: controller.commands.send(2 * reply)
     assert profiler.counts().trigger == number
     assert profiler.program() == (number + 1) % 16
+    assert profiler.counts().trigger == number + 2
+    time.sleep(0.1)  # the second copy is there
+    assert profiler.counts().trigger == number + 3
     profiler.close()
 
 

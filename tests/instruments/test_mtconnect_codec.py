@@ -321,6 +321,11 @@ def test_percent_is_an_override_and_no_speed() -> None:
     assert choice.items["spindle_speed"].id == "s"
     assert choice.unclear == {}
     assert "feed" not in made(axis("P", feeds[1], component="Path")).items
+    by_revolution = item("r", "PATH_FEEDRATE", units="MILLIMETER/REVOLUTION")
+    assert made(axis("P", feeds[0], by_revolution, component="Path")).items["feed"].id == "f"
+    assert "feed" not in made(axis("P", by_revolution, component="Path")).items
+    angular = item("a", "ROTARY_VELOCITY", subType="ACTUAL", units="DEGREE/SECOND")
+    assert "spindle_speed" not in made(axis("C", angular, component="Rotary")).items
 
 
 @pytest.mark.parametrize("representation", ["TIME_SERIES", "DATA_SET", "TABLE"])

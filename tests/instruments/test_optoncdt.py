@@ -147,6 +147,25 @@ def test_the_smaller_model_works_as_well() -> None:
     assert reading == pytest.approx(truth, abs=5 * RESOLUTION / 2 * 1.001)
 
 
+def test_a_sensor_whose_user_may_only_read_is_refused_with_a_hint() -> None:
+    with pytest.raises(InstrumentError, match=r"refuses 'OUTPUT NONE': E06 Access denied\. Its user level may be USER"):
+        OptoNCDT("sim://cframe/X1?seed=3&user=USER", SLOW).open()
+
+
+@pytest.mark.parametrize("model", ["ILD2300", "ILD1420"])
+@pytest.mark.parametrize("echo", ["ON", "OFF"])
+def test_what_an_earlier_user_left_on_changes_no_value(model: str, echo: str) -> None:
+    left = f"OUTADD_RS422+SHUTTER+TIMESTAMP;AVERAGE+MEDIAN+9;OUTHOLD+INFINITE;ECHO+{echo}"
+    rate = 1500.0 if model == "ILD2300" else 2000.0
+    with OptoNCDT(
+        f"sim://cframe/X1?seed=3&model={model}&range=10&left={left}",
+        OptoSettings(model=model, rate=rate, timeout=10.0),
+    ) as sensor:
+        blocks = take(sensor, 2, block=500)
+        truth = world("cframe", 3).machine.distances(0, 1000, rate, ["X1"])[0]
+    np.testing.assert_allclose(values(blocks), truth, rtol=0, atol=5 * RESOLUTION / 2 * 1.001)
+
+
 def test_a_beam_that_the_machine_does_not_have_is_refused() -> None:
     with OptoNCDT("sim://cframe/X9", SLOW) as sensor, pytest.raises(InstrumentError, match="No such beam"):
         sensor.read()

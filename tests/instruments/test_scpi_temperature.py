@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import mutants
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -374,6 +375,7 @@ class Line:
 
     def __init__(self, unit: Unit) -> None:
         self.unit, self.url, self.waiting, self.late = unit, "serial:///dev/none", [], 0
+        self.timeout, self.reconnects = 0.05, False
 
     def write(self, data: bytes) -> None:
         text = self.unit.answer(data.decode().strip())
@@ -382,6 +384,9 @@ class Line:
 
     def read(self, max_bytes: int = 65536, timeout: float | None = None) -> bytes:
         raise InstrumentTimeoutError("no data")
+
+    def reopen(self) -> None:
+        """A serial line stays as it is."""
 
     def read_until(self, terminator: bytes, *, limit: int = 65536, timeout: float | None = None) -> bytes:
         if self.late:  # this answer comes after the next request
@@ -461,7 +466,7 @@ def test_a_recorded_session_gives_the_same_readings(tmp_path: Path) -> None:
         assert thermometer.flags["oil"] == "open"
 
 
-def test_a_pty_carries_the_session_of_a_serial_line() -> None:
+def test_a_pty_carries_the_session_of_a_serial_line(tmp_path: Path) -> None:
     import pty
 
     unit = Unit()
@@ -486,11 +491,34 @@ def test_a_pty_carries_the_session_of_a_serial_line() -> None:
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
     try:
-        with ScpiTemperature(f"serial://{name}?baudrate=9600", pt100(timeout=2.0)) as thermometer:
+        address, settings = f"serial://{name}?baudrate=9600", pt100(timeout=2.0)
+        with ScpiTemperature(address, settings, record=tmp_path / "s.rec") as thermometer:
             assert thermometer.read() == {"frame": 20.0, "oil": 20.0}
+        end = time.monotonic() + 5
+        while "SYST:LOC" not in unit.received and time.monotonic() < end:
+            time.sleep(0.01)
     finally:
         stop.set()
         os.write(slave, b"\n")
         thread.join(timeout=5)
         os.close(slave)
         os.close(master)
+    commands = [command for command in unit.received if command and not command.endswith("?")]
+    assert (commands[:2], commands[-1]) == (["*CLS", "SYST:REM"], "SYST:LOC")
+    with ScpiTemperature(f"replay://{tmp_path / 's.rec'}", settings) as thermometer:
+        assert thermometer.read() == {"frame": 20.0, "oil": 20.0}
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (codec.parse_readings, "+2.61950000E+01,101,+9.90000000E+37,102,-1.5,103"),
+        (codec.parse_identity, IDENTITY),
+        (codec.parse_error, '-113,"Undefined header"'),
+        (codec.parse_channels, "#214(@101,102,103)"),
+    ],
+)
+def test_damaged_answers_give_values_or_protocol_errors(parse: Callable[[str], object], text: str) -> None:
+    mutants.check(
+        lambda data: parse(codec.decode(data)), text.encode() + b"\n", seed=1, number=mutants.count(2000), limit=0.1
+    )

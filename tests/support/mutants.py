@@ -2,7 +2,9 @@
 
 ``mutants`` is for files and for frames of a protocol. Every mutant follows from the seed and its number alone, so that
 a failure is repeated with ``mutant(data, seed, number)``. The environment variable ``ERRORMOTION_MUTANTS`` sets the
-number of mutants of each input (the quick default is that of the test; 1e5 and more for a long run).
+number of mutants of each input (the quick default is that of the test); a long run takes the time limit off::
+
+    ERRORMOTION_MUTANTS=1e5 pytest -n0 --timeout=0 -k damaged tests
 """
 
 import os
@@ -13,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from errormotion.errors import ErrormotionError
 
+Change = Callable[[bytes, random.Random], bytes]
 NUMBER = re.compile(rb"[+-]?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 NUMBERS = (
     *(b"", b"0", b"-0", b"-1", b"255", b"65536", b"4294967296", b"-2147483649", b"9" * 26, b"9" * 400),
@@ -34,19 +37,19 @@ def count(quick: int) -> int:
     return int(float(os.environ.get("ERRORMOTION_MUTANTS", quick)))
 
 
-def mutants(data: bytes, seed: int, number: int) -> Iterator[bytes]:
-    """Yield mutants of some bytes; the first one is empty."""
+def mutants(data: bytes, seed: int, number: int, changes: Sequence[Change] = ()) -> Iterator[bytes]:
+    """Yield mutants of some bytes; the first one is empty. ``changes`` default to all of them."""
     yield b""
     for k in range(1, number):
-        yield mutant(data, seed, k)
+        yield mutant(data, seed, k, changes)
 
 
-def mutant(data: bytes, seed: int, number: int) -> bytes:
+def mutant(data: bytes, seed: int, number: int, changes: Sequence[Change] = ()) -> bytes:
     """Return one mutant: one to four changes, at most twice as long as the bytes and 1 KiB."""
     rng = random.Random(seed * 1_000_003 + number)
     found = data
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        found = rng.choice(CHANGES)(found, rng)
+        found = rng.choice(changes or CHANGES)(found, rng)
     return found[: 2 * len(data) + 1024]
 
 
@@ -122,12 +125,20 @@ def swap(data: bytes, rng: random.Random) -> bytes:
     return data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:]
 
 
-CHANGES: Sequence[Callable[[bytes, random.Random], bytes]] = (
+CHANGES: Sequence[Change] = (
     flip, overwrite, cut, delete, duplicate, insert, renumber, renumber, swap,
 )  # fmt: skip
 
 
-def check(read: Callable[[bytes], object], data: bytes, *, seed: int, number: int, limit: float = 10.0) -> int:
+def check(
+    read: Callable[[bytes], object],
+    data: bytes,
+    *,
+    seed: int,
+    number: int,
+    limit: float = 10.0,
+    changes: Sequence[Change] = (),
+) -> int:
     """Read every mutant; anything but a value or an error of the project fails, and more than ``limit`` s for one.
 
     Returns
@@ -137,7 +148,7 @@ def check(read: Callable[[bytes], object], data: bytes, *, seed: int, number: in
     """
     read(data)
     refused = 0
-    for k, each in enumerate(mutants(data, seed, number)):
+    for k, each in enumerate(mutants(data, seed, number, changes)):
         start = time.perf_counter()
         try:
             read(each)

@@ -17,7 +17,8 @@ CHANNEL = "ANO2303018,NAMDL6230,SNO0815,OFS0,RNG2000,UNTµm"
 class ScriptedController:
     """Answers commands from ``answers`` (without echo and ``OK``), refuses others; sends blocks on its data port.
 
-    Each GMD sends the next of ``readings``, then ``always``; TRG0 sends ``blocks``.
+    Each GMD sends the next of ``readings``, then ``always``; TRG0 sends ``blocks``. The next command that is in
+    ``late`` is carried out and answered when another one comes, ahead of it.
     """
 
     def __init__(self, **answers: str) -> None:
@@ -39,6 +40,8 @@ class ScriptedController:
         self.received: list[str] = []
         self.readings: list[bytes] = []
         self.always = b""
+        self.late: set[str] = set()
+        self._held: list[str] = []
         self.blocks: list[bytes] = []
         self.welcomed = False
         self._buffer = b""
@@ -61,6 +64,15 @@ class ScriptedController:
     def _answer(self, command: str) -> None:
         with self._lock:
             self.received.append(command)
+        if command in self.late:
+            self.late.remove(command)
+            self._held.append(command)
+            return
+        held, self._held = self._held, []
+        for each in [*held, command]:
+            self._carry_out(each)
+
+    def _carry_out(self, command: str) -> None:
         known = self.answers.get(command)
         if known is None and re.fullmatch(r"(AVT|AVN|STI)\d+", command):
             known = "," + command[3:] if command.startswith("STI") else ""

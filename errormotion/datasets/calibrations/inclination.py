@@ -451,8 +451,10 @@ def _covariance_violations(C: Array) -> list[str]:
         return [f"coefficient_covariance: expected a square matrix; found {C.shape[0]} x {C.shape[1]}"]
     scale = np.sqrt(np.abs(np.diag(C)))
     scale[scale == 0] = 1.0
-    correlation = C / scale[:, None] / scale
-    if np.abs(correlation - correlation.T).max() > 1e-8 or np.linalg.eigvalsh(correlation).min() < -1e-8:
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = C / scale[:, None] / scale
+        symmetric = np.abs(correlation - correlation.T).max() <= 1e-8  # not so where numbers are beyond all bounds
+    if not symmetric or np.linalg.eigvalsh(correlation).min() < -1e-8:
         return ["coefficient_covariance: expected a symmetric matrix without negative variances; found another"]
     return []
 

@@ -46,7 +46,7 @@ class Columns:
     start : str
         Date and time of the first line, if the log has dates.
     notes : list of str
-        What a reader of the data should know: holes in the rows, local times that occur twice.
+        What a reader of the data should know: local times that occur twice.
     """
 
     values: dict[str, Array]
@@ -103,8 +103,8 @@ def read_columns(
         raise DatasetError(f"{mistakes.path}: expected lines of numbers below the header; found none")
     values = {key: np.array(column, dtype=float) for key, column in cells.items()}
     found = np.array(lines, dtype=np.int64)
-    notes = [*holes(values[time], found), *(clock_notes(clock) if clock else [])]
-    return Columns(values, found, clock.start.isoformat() if clock and clock.start else "", notes)
+    start = clock.start.isoformat() if clock and clock.start else ""
+    return Columns(values, found, start, clock_notes(clock) if clock else [])
 
 
 def clock_of(form: Format, unit: str, *, repeats: bool = False) -> Clock:
@@ -120,7 +120,10 @@ def clock_notes(clock: Clock) -> list[str]:
 
 
 def holes(times: Array, lines: NDArray[np.int64]) -> list[str]:
-    """Return a note on holes in the rows: intervals of more than 1.5 times the usual one, where most are usual."""
+    """Return a note on holes in the rows: intervals of more than 1.5 times the usual one, where most are usual.
+
+    ``times`` are in s, with their ``lines``.
+    """
     known = ~np.isnan(times)
     t, at = times[known], lines[known]
     steps = np.diff(t)

@@ -11,6 +11,7 @@ import os
 import select
 import socket
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from errormotion.instruments.transports.address import Address
 
 LOOPBACK = "127.0.0.1"
 ANY_HOST = "0.0.0.0"
+ACCEPT_POLL = 0.002
+"""Interval at which a client is looked for, s."""
 SEND_BUFFER = 32768
 """Bytes: bounds how far a virtual clock runs ahead of its reader."""
 
@@ -206,6 +209,19 @@ class TcpServer(Server):
         """
         return self._connected.wait(timeout)
 
+    def await_present_client(self, timeout: float) -> bool:
+        """Wait for a connection whose other side has not closed it; False where there is none within ``timeout`` s.
+
+        For a line that only sends: a client that has left, and one that has come since, may not have been noticed yet.
+        """
+        end = time.monotonic() + timeout
+        while (left := end - time.monotonic()) > 0:
+            line = self._line
+            if line is not None and not _closed(line):
+                return self._connected.wait(left)
+            time.sleep(ACCEPT_POLL)
+        return False
+
     def send(self, data: bytes | memoryview) -> bool:
         """Send all bytes, waiting while the reader's buffers are full; False without a connection."""
         with self.lock:
@@ -261,6 +277,16 @@ class TcpServer(Server):
     def _release(self) -> None:
         self._forget()
         self._listener.close()
+
+
+def _closed(line: socket.socket) -> bool:
+    """Whether the other side has closed a connection on which nothing is received."""
+    try:
+        return line.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 class PtyServer(Server):

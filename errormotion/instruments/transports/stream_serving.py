@@ -88,7 +88,7 @@ class NewestConnectionServer(TcpServer):
         except OSError:
             data = b""
         if data:
-            self._on_data(data)
+            self._deliver(data)
             return
         with self._accepting:
             self._lines.remove(line)

@@ -355,7 +355,7 @@ def test_mapping_is_written_in_the_order_of_the_standard():
 def test_an_emergency_announces_a_broken_sensor():
     with network(open="0") as (_, node, seen):
         node.nmt.state = "RESET COMMUNICATION"
-        assert until(seen, lambda i, data: (i, data) == (0x080 + NODE, bytes.fromhex("00 ff 21 00 00 00 00 00")))
+        assert until(seen, lambda i, data: (i, data) == (0x080 + NODE, bytes.fromhex("30 50 21 00 00 00 00 00")))
 
 
 def test_a_node_that_was_without_power_boots():
@@ -366,6 +366,14 @@ def test_a_node_that_was_without_power_boots():
             node.sdo.upload(0x1000, 0)
         assert until(seen, lambda i, data: (i, data) == (0x700 + NODE, b"\0"))
         assert number(node, 0x1000, 0, "I") == 0x00020194
+
+
+def test_a_late_answer_precedes_the_next_one() -> None:
+    with raw(fault="late") as ask:
+        assert ask("40 00 10 00 00 00 00 00", wait=QUIET) is None
+        assert ask("40 01 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"  # of the request before
+    with raw(fault="late", late_by=0.1) as ask:
+        assert ask("40 00 10 00 00 00 00 00") == "43 00 10 00 94 01 02 00"
 
 
 @pytest.mark.parametrize("wrong", [{"values": "double"}, {"status": "some"}, {"unit": "degC"}, {"digits": 4}])

@@ -391,3 +391,17 @@ def test_the_trigger_by_command_needs_the_external_trigger_mode() -> None:
         assert peer.code(bytes([0x21, 0, 0, 0])) == 0x8080
     with client("&trigger=continuous") as peer:
         assert peer.code(bytes([0x21, 0, 0, 0])) == 0x8080
+
+
+def test_a_late_answer_comes_ahead_of_the_next_one() -> None:
+    with client("&fault=late&fault_at=1") as maker:
+        maker.single(0x06)
+        maker.control.sendall(struct.pack("<I4sII", 16, bytes.fromhex("0300F000"), 0, 4) + bytes([0x04, 0, 0, 0]))
+        maker.control.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            maker.control.recv(1)
+        maker.control.settimeout(10)
+        held = maker.raw(struct.pack("<I4sII", 16, bytes.fromhex("0300F000"), 0, 4) + bytes([0x06, 0, 0, 0]))
+        assert held[16] == 0x04
+        following = exactly(maker.control, 4)
+        assert exactly(maker.control, struct.unpack("<I", following)[0])[12] == 0x06

@@ -13,11 +13,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.instruments import simulators
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import SimulatedEmScon
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import SYSTEMS, from_system, to_system
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import AT4XX, COMMANDS, size_of
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import (
+    AT4XX,
+    COMMANDS,
+    POINTS,
+    RESULTS,
+    Wire,
+    size_of,
+)
 from errormotion.instruments.transports import parse_address
 
 EXACT = "noise=0&angle_noise=0&dead_path=0&air_temperature=20&air_pressure=101325&air_humidity=50"
@@ -165,6 +173,25 @@ def test_sizes_are_those_of_another_implementation_of_the_header() -> None:
     assert known == 2 * len(AT4XX)
 
 
+@pytest.mark.parametrize("vector", vectors("leica_emscon"), ids=str)
+def test_golden_vectors(vector: Vector) -> None:
+    size, kind = struct.unpack_from("<iI", vector.data)
+    assert size == len(vector.data)
+    number = struct.unpack_from("<i", vector.data, 8)[0]
+    match vector.layer:
+        case "command":
+            layout = COMMANDS[number].request
+            assert (kind, size) == (0, 12 + size_of(layout))
+            found = np.hstack([0.0, *Wire().unpack(layout, vector.data[12:])])
+            assert found[1:] == pytest.approx(list(vector.expected.values())[1:], rel=1e-12)
+        case "answer":
+            assert (kind, size) == (0, 16 + size_of(COMMANDS[number].reply))
+        case "points":
+            assert size == 8 + size_of(RESULTS[kind]) + vector.expected["count"] * size_of(POINTS[kind])
+        case _:
+            assert size == 8 + size_of(RESULTS[kind])
+
+
 def test_what_is_no_command_is_refused(made: Made) -> None:
     _, client = tracker(made)
     for number in (50, 64, 141, 999, -1):
@@ -177,6 +204,16 @@ def test_what_is_no_command_is_refused(made: Made) -> None:
     client.line.sendall(struct.pack("<iI", 4, 0))
     with pytest.raises((EOFError, ConnectionResetError)):
         client.packet()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
+@pytest.mark.parametrize("system", [0, 4, 7])
+def test_numbers_that_are_none_are_wrong_parameters(made: Made, value: float, system: int) -> None:
+    _, client = tracker(made)
+    assert client.ask(SET_CS, "i", system)[0] == OK
+    assert client.ask(GO, "3di", value, 1.0, value, 0)[0] == WRONG
+    assert client.ask(43, "di", value, 500)[0] == WRONG
+    assert client.ask(SET_AIR, "3d", value, 1013.0, 50.0)[0] == WRONG
 
 
 def test_requests_in_pieces_and_several_at_once(made: Made) -> None:
@@ -342,6 +379,21 @@ def test_without_a_number_it_goes_on_until_it_is_stopped_and_the_server_is_busy(
     assert client.ask(SET_UNITS, "5i", 1, 0, 0, 0, 0)[0] == OK
     assert all(kind not in (MULTI, MULTI2) for kind, _ in client.others)
     assert client.ask(2) == (OK, struct.pack("<i", 2))
+
+
+def test_a_client_that_leaves_ends_its_measurement(made: Made) -> None:
+    device, client = tracker(made, "pace=1")
+    client.ask(SET_MODE, "i", 1)
+    client.ask(SET_TIME_MODE, "4i", 10, 0, 0, 0)
+    assert client.ask(START)[0] == OK
+    client.until(MULTI)
+    client.line.sendall(b"\x0c\x00")  # the start of a request
+    client.line.close()
+    place = parse_address(device.url)
+    with socket.create_connection((place.host, place.port), timeout=TIMEOUT) as line:
+        other = Client(line)
+        assert other.ask(SET_UNITS, "5i", 1, 0, 0, 0, 0)[0] == OK
+        assert other.ask(2) == (OK, struct.pack("<i", 2))
 
 
 @pytest.mark.parametrize(("server", "newest"), [("3.6", 7), ("3.8", 0)])

@@ -328,6 +328,24 @@ def test_a_request_that_is_no_get_ends_the_connection() -> None:
         assert line.recv(100) == b""
 
 
+@pytest.mark.parametrize("when", ["", "&late_by=0.2"])
+def test_a_late_answer_precedes_the_next_one(when: str) -> None:
+    with (
+        agent(f"fault=late&fault_at=1{when}") as client,
+        socket.create_connection(client.place, timeout=TIMEOUT) as line,
+    ):
+        received = line.makefile("rb")
+        for path in ("/current", "/probe", "/current"):
+            line.sendall(f"GET {path} HTTP/1.1\r\n\r\n".encode())
+        kinds = []
+        for _ in range(3):
+            head = list(iter(received.readline, b"\r\n"))
+            (length,) = (int(each.split(b": ")[1]) for each in head if each.startswith(b"Content-Length"))
+            kinds.append(plain(ElementTree.fromstring(received.read(length))).tag)
+        received.close()
+    assert kinds == ["MTConnectStreams", "MTConnectDevices", "MTConnectStreams"]
+
+
 def test_several_values_in_one_observation() -> None:
     with agent("series=1") as client:
         current = client.read("/current")

@@ -143,6 +143,19 @@ def test_ping_is_answered_with_the_heartbeat() -> None:
         assert line.until("* PONG")[-1] == "* PONG 2500"
 
 
+def test_an_unfinished_line_ends_with_its_connection() -> None:
+    with adapter() as device:
+        first = Line(device)
+        first.until("avail|")
+        first.socket.sendall(b"* PI")
+        first.close()
+        second = Line(device)
+        second.until("avail|")
+        second.socket.sendall(b"* PING\n")
+        assert second.until("* PONG")[-1] == "* PONG 10000"
+        second.close()
+
+
 def test_an_adapter_without_heartbeat_ignores_ping() -> None:
     with connected("heartbeat=0") as line:
         line.socket.sendall(b"* PING\n")

@@ -231,3 +231,9 @@ def test_a_missing_log_is_told(tmp_path) -> None:
     (tmp_path / "map.toml").write_text(map_text())
     with pytest.raises(DatasetError, match=r"none\.csv: cannot be read: No such file"):
         import_log(tmp_path / "none.csv", tmp_path / "map.toml", tmp_path / "raw.nc")
+
+
+def test_a_hole_in_the_rows_is_noted_in_seconds(run) -> None:
+    log = GOOD[: GOOD.index("\n") + 1] + "".join(f"{t},1.1,1.2,1.3,1.4,1.5,20.5\n" for t in (0, 0.5, 1, 1.5, 2, 4.5))
+    (note,) = json.loads(run(log).attrs["import_notes"])
+    assert note == "1 hole in the rows, where the usual interval is 30 s; the longest, of 150 s, ends in line 7"

@@ -16,8 +16,9 @@ _ACTUAL = ("ACTUAL", "")
 _COMMANDED = ("COMMANDED", "PROGRAMMED", "TARGET")
 _SPEEDS = ("ROTARY_VELOCITY", "SPINDLE_SPEED")
 _WHOLE_POSITION = {"position": _ACTUAL, "commanded_position": _COMMANDED}
-_PERCENT = "PERCENT"
-"""Of a feed or spindle speed: an override, not the speed."""
+_FEED_UNITS = ("", "MILLIMETER/SECOND", "MILLIMETER/MINUTE", "METER/SECOND", "INCH/SECOND", "INCH/MINUTE")
+_SPEED_UNITS = ("", "REVOLUTION/MINUTE", "REVOLUTION/SECOND")
+"""In percent a feed or spindle speed is an override; by revolution or in degrees it is another quantity."""
 _MOST_NAMED = 8  # data items in a message
 _RANKS: Mapping[str, int] = {"MACHINE": 0, "": 1, "WORK": 3}
 """Order of coordinate systems; those of other types, such as BASE, are before WORK."""
@@ -43,8 +44,8 @@ def choose(device: Device, settings: MTConnectSettings) -> Choice:
     """Return the data items by quantity.
 
     Quantities without a data item are missing. An item in ``settings.items`` comes first; then type, subtype, the
-    name of the component, and machine before work coordinates decide. Items in percent are overrides, and items of
-    several values at once do not compete.
+    name of the component, and machine before work coordinates decide. Feeds and spindle speeds in percent, which are
+    overrides, or in other units than of a speed, and items of several values at once do not compete.
 
     Raises
     ------
@@ -59,11 +60,11 @@ def choose(device: Device, settings: MTConnectSettings) -> Choice:
         if not any(f"{key}.{axis}" in choice.items or f"{key}.{axis}" in choice.unclear for axis in "XYZ"):
             _add(choice, device, key, ("PATH_POSITION",), sub_types)
     rotates = _spindle(device, settings)
-    _add(choice, device, "spindle_speed", _SPEEDS, _ACTUAL, lambda item: item.units != _PERCENT and rotates(item))
+    _add(choice, device, "spindle_speed", _SPEEDS, _ACTUAL, lambda item: item.units in _SPEED_UNITS and rotates(item))
     if speed := choice.items.get("spindle_speed"):
         of_spindle = _of_component(speed.component_id)
         _add(choice, device, "spindle_load", ("LOAD",), _ACTUAL, of_spindle)
-    _add(choice, device, "feed", ("PATH_FEEDRATE",), _ACTUAL, lambda item: item.units != _PERCENT)
+    _add(choice, device, "feed", ("PATH_FEEDRATE",), _ACTUAL, lambda item: item.units in _FEED_UNITS)
     _add(choice, device, "mode", ("CONTROLLER_MODE",), ("",))
     _add(choice, device, "program", ("PROGRAM",), ("", "ACTIVE", "MAIN"))
     _add(choice, device, "execution", ("EXECUTION",), ("",))

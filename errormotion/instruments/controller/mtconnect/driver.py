@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.controller.mtconnect.choice import TIME_SERIES, choose
+from errormotion.instruments.controller.mtconnect.choice import choose
 from errormotion.instruments.controller.mtconnect.codec import (
-    UNAVAILABLE,
     DataItem,
     Device,
     Document,
@@ -20,12 +18,12 @@ from errormotion.instruments.controller.mtconnect.codec import (
     parse,
 )
 from errormotion.instruments.controller.mtconnect.settings import MTConnectSettings
+from errormotion.instruments.controller.mtconnect.state import machine_state
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports.http.client import HttpTransport
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 OUT_OF_RANGE = "OUT_OF_RANGE"
-_MODES = {"AUTOMATIC": "automatic", "SEMI_AUTOMATIC": "automatic", "MANUAL": "manual", "MANUAL_DATA_INPUT": "mdi"}
 _ATTEMPTS = 3  # to catch up with an agent that overwrites its buffer
 
 log = logging.getLogger(__name__)
@@ -77,7 +75,7 @@ class MTConnect(Driver):
         id="mtconnect",
         kind="controller",
         summary="Any machine with an MTConnect agent, read-only: positions, spindle, feed, mode, program, alarms",
-        status="simulated_only",
+        status="peer_verified",
         simulator="errormotion.instruments.simulators.controller.mtconnect:SimulatedAgent",
     )
     Settings: ClassVar[type[MTConnectSettings]] = MTConnectSettings
@@ -152,32 +150,7 @@ class MTConnect(Driver):
         """
         document = self._query("current")
         self._notice(document)
-        last = {each.item: each for each in document.observations if not each.level}
-        now = document.header.created - self._start(document)
-        values = {key: last.get(item.id) for key, item in self._items.items()}
-        position, moved = self._position("position", values)
-        text = {key: _text(values.get(key)) for key in ("mode", "program", "execution", "estop", "availability")}
-        state: dict[str, Any] = {
-            "time": now,
-            "position": position,
-            "commanded_position": self._position("commanded_position", values)[0],
-            "position_time": moved - self._start(document),
-            **{key: self._number(key, values) for key in ("spindle_speed", "spindle_load", "feed")},
-            "mode": _MODES.get(text["mode"], ""),
-            "program": text["program"],
-            "running": text["execution"] == "ACTIVE",
-            "homed": None,
-            "enabled": text["availability"] == "AVAILABLE" and text["estop"] != "TRIGGERED",
-            "estop": text["estop"] == "TRIGGERED",
-            "alarms": _conditions(document, "Fault"),
-            "warnings": _conditions(document, "Warning"),
-        }
-        state["unavailable"] = [
-            *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
-            *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
-            *(key for key, value in text.items() if not value),
-        ]
-        return state
+        return machine_state(document, self._items, self._start(document))
 
     def sample(self) -> Observed:
         """Return the observations since the last call; the first call returns the last value of every data item.
@@ -307,23 +280,6 @@ class MTConnect(Driver):
             self._started_at = document.header.created
         return self._started_at
 
-    def _number(self, key: str, values: Mapping[str, Observation | None]) -> float:
-        """Return a quantity in SI; of a time series the last of its values."""
-        observation, item = values.get(key), self._items.get(key)
-        if observation is None or item is None:
-            return math.nan
-        found = observation.numbers(item.scale)
-        return found[-1] if item.representation == TIME_SERIES else found[0]
-
-    def _position(self, key: str, values: Mapping[str, Observation | None]) -> tuple[list[float], float]:
-        """Return X, Y, Z, and when they last changed, s since 1970."""
-        keys = [f"{key}.{axis}" for axis in "XYZ"]
-        if key in self._items and (whole := values.get(key)) is not None:
-            found = whole.numbers(self._items[key].scale)
-            return (found[:3] if len(found) >= 3 else [math.nan] * 3), whole.time
-        times = [each.time for each in (values.get(name) for name in keys) if each is not None]
-        return [self._number(name, values) for name in keys], max(times, default=math.nan)
-
     # ------------------------------------------------------------------ requests
 
     @property
@@ -406,18 +362,3 @@ def _end(document: Document) -> int:
     header = document.header
     newest = document.observations[-1].sequence if document.observations else -1
     return header.next or max(header.last, newest) + 1
-
-
-def _text(observation: Observation | None) -> str:
-    if observation is None or observation.value.upper() == UNAVAILABLE:
-        return ""
-    return observation.value
-
-
-def _conditions(document: Document, level: str) -> list[str]:
-    """Return the texts of the conditions of a level, such as ``SYSTEM 1104: overtravel``."""
-    return [
-        f"{' '.join(filter(None, (each.type, each.code)))}: {each.value}".rstrip(": ")
-        for each in document.observations
-        if each.level == level
-    ]

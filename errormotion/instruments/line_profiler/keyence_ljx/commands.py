@@ -8,6 +8,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.line_profiler.keyence_ljx import codec
 from errormotion.instruments.line_profiler.keyence_ljx.codec import Reply
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import discard_input
 
 SYNCHRONISING: tuple[int, ...] = (codec.GET_STATUS, codec.GET_TEMPERATURE, codec.GET_COUNTS)
 """Opcodes that only read: after a timeout, the reply to one of them shows that all earlier replies have arrived."""
@@ -19,7 +20,8 @@ _HEAD = 4  # bytes of a reply that state its length
 class CommandLine:
     """Requests and replies on one connection.
 
-    A reply names its command, so that a late reply is not taken for the reply to a later request. After a timeout the
+    Unread bytes are discarded ahead of a request, as the maker's client does. A reply names its command, so that a late
+    reply is not taken for the reply to a later request. After a timeout the
     next exchange is preceded by a reading request of another opcode; once its reply has arrived, no earlier reply is
     outstanding. A device that does not name the command, or does not answer this request either, is lost.
 
@@ -80,6 +82,8 @@ class CommandLine:
             self.lost = error
 
     def _exchange(self, opcode: int, arguments: bytes = b"") -> Reply:
+        if not self._unanswered:
+            discard_input(self._transport)
         try:
             self._transport.write(codec.request(opcode, arguments, generation=self._generation))
             self._unanswered.append(opcode)

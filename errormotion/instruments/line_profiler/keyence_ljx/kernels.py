@@ -164,7 +164,7 @@ def unpack_intensities(profiles: Array, reasons: Array, intensities: Array) -> N
     reasons : ndarray, uint8, (n,)
         Not 0 where there is no profile.
     intensities : ndarray, uint16, (n, point)
-        Receives them; 0 where there is no profile.
+        Receives them; 0 where there is no profile, and for the last of an odd number where the profile ends before it.
     """
     n, points = intensities.shape
     for row in range(n):
@@ -172,16 +172,15 @@ def unpack_intensities(profiles: Array, reasons: Array, intensities: Array) -> N
             intensities[row] = 0
             continue
         words = profiles[row, HEADER_WORDS:]
+        room = 32 * (words.size - 1)
         for i in range(points):
-            intensities[row, i] = _field(words, _intensity_bit(i, points), 10)
+            bit = _intensity_bit(i, points)
+            intensities[row, i] = _field(words, bit, 10) if bit + 10 <= room else 0
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
 def _intensity_bit(i: int, points: int) -> int:
-    first = 20 * points
-    if i % 2 == 1:
-        return first + 10 * (i - 1)
-    return first + (10 * (i + 1) if i + 1 < points else 10 * i)  # the last of an odd number: an assumption
+    return 20 * points + 10 * (i - 1 if i % 2 else i + 1)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator, unused-ignore]
@@ -212,6 +211,9 @@ def pack(raws: Array, intensities: Array, trigger: int, encoder: int, words: Arr
     words[TRIGGER_WORD + 1] = np.uint32(encoder & 0xFFFFFFFF)
     for i in range(raws.size):
         _put(words[HEADER_WORDS:], 20 * i, raws[i] & 0xFFFFF)
+    room = 32 * (words.size - HEADER_WORDS - 1)
     for i in range(intensities.size):
-        _put(words[HEADER_WORDS:], _intensity_bit(i, intensities.size), intensities[i] & 0x3FF)
+        bit = _intensity_bit(i, intensities.size)
+        if bit + 10 <= room:
+            _put(words[HEADER_WORDS:], bit, intensities[i] & 0x3FF)
     words[-1] = _sum(words, 0, words.size - 1)

@@ -155,6 +155,8 @@ def _hash(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError as error:  # a name with the character NUL
+        raise InstrumentError(f"{str(path)!r} is no name of a file: {error}") from None
 
 
 def _write_list(path: Path, files: dict[Path, str]) -> None:

@@ -110,10 +110,14 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
     """Read ``height(profile, point)``, ``x(point)`` and ``y(profile)``, each with its attribute ``units``."""
     import xarray as xr
 
+    from errormotion.datasets.storage import probe, reading
+
     try:
-        dataset = xr.load_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError) as error:
-        raise InstrumentError(f"{path} cannot be read as NetCDF: {error}") from None
+        with reading(path):
+            probe(path)
+            dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)
+    except DatasetError as error:
+        raise InstrumentError(f"{path} cannot be read as NetCDF: {error.__cause__ or error}") from None
     found = []
     for name, dims in (("height", ("profile", "point")), ("x", ("point",)), ("y", ("profile",))):
         if name not in dataset.variables or set(dataset[name].dims) != set(dims):
@@ -122,6 +126,8 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
         unit = str(variable.attrs.get("units", ""))
         if not unit:
             raise InstrumentError(f"{path}: the variable {name} has no attribute 'units'")
+        if variable.dtype.kind not in "iuf":
+            raise InstrumentError(f"{path}: the variable {name} has no numbers")
         values = np.asarray(variable.values, dtype=np.float64)
         found.append(_in_metres(_cleared(values, settings) if name == "height" else values, unit))
     heights, x, y = found
@@ -219,6 +225,8 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
         The points are not on lines of equal x and equal y, or two have the same position.
     """
     points = points[np.isfinite(points[:, :2]).all(axis=1)]
+    if not len(points):
+        raise InstrumentError(f"{path} is not a height map: no point has an x and a y")
     (x, column), (y, row) = (_lines(points[:, axis]) for axis in (0, 1))
     if x.size * y.size * FULL > len(points):
         raise InstrumentError(

@@ -78,7 +78,7 @@ def answer_to(command: str, line: bytes) -> str:
     for error in ERRORS:
         if error in rest:
             raise InstrumentError(f"The controller refuses '${command}': {error[1:].lower()}")
-    without_ok = command == VERSION and rest  # 6500 p. 40 prints this answer without OK
+    without_ok = command == VERSION and rest  # the manuals print this answer without OK (6200 p. 66)
     if not echo or not (rest.endswith("OK") or without_ok):
         raise ProtocolError(f"Expected an answer to '${command}' that ends in 'OK'; found {text[:80]!r}")
     return rest.removesuffix("OK")

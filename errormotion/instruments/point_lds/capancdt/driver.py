@@ -149,6 +149,8 @@ class CapaNCDT(Driver):
         if self._streaming:
             raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
         block = self._requested_block()
+        if not block.intact:
+            raise ProtocolError(f"{self.address}: the block of a reading broke off, or stray bytes follow; read again")
         values, codes = scale(column(block, self.settings.channel)[-1:], channel.offset, channel.measuring_range)
         self.no_value = REASONS[int(codes[0])]
         self._data.report_delivered(1)
@@ -188,7 +190,7 @@ class CapaNCDT(Driver):
             raise
         finally:
             self._streaming = False
-            if not self._failed:
+            if self._transport is not None and not self._failed:
                 self._query(f"{codec.TRIGGER}{codec.ON_REQUEST}")
 
     def _blocks(self, sequence: Sequence, size: int) -> Iterator[Samples]:
@@ -311,6 +313,7 @@ class CapaNCDT(Driver):
 
     def _start_session(self) -> None:
         self._channel, self._failed = None, False
+        self._data.report_delivered(0)
         request = f"{codec.TRIGGER}?"
         self._trigger = codec.parse_number(request, self._query(request))
         self._stale = self._trigger == codec.CONTINUOUS

@@ -20,6 +20,7 @@ LONGEST_ANSWER = 1 << 16
 """Bytes of text; HELP and PRINT, the longest, list some hundred lines."""
 
 DONE = "ok"
+USER_HINT = ". Its user level may be USER, which may only read: log in on its web page, or set STDUSER PROFESSIONAL"
 _ERROR = re.compile(r"(?:^|\s)(E\d{2,4}\b.*)")
 _RANGE = re.compile(r"\s*(\d{1,6}(?:\.\d{1,9})?)\s*mm\s*", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z][A-Z0-9_]*")
@@ -50,7 +51,9 @@ def parse_answer(command: str, text: bytes) -> list[str]:
     for line in lines:
         found = _ERROR.search(line.partition(":")[0])
         if found:
-            raise RefusedCommandError(f"The sensor refuses '{command}': {line[found.start(1) :]}")
+            reason = line[found.start(1) :]
+            hint = USER_HINT if "denied" in reason.lower() else ""
+            raise RefusedCommandError(f"The sensor refuses '{command}': {reason}{hint}")
     return [line for line in lines if line]
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import time
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from typing import TYPE_CHECKING
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
@@ -17,6 +18,7 @@ from errormotion.instruments.point_lds.optoncdt.commands import (
     setting,
 )
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.quiet import await_quiet
 
 if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
@@ -28,7 +30,9 @@ MAX_BUFFERED_BYTES = 1 << 24
 """Bytes of text and values up to the end of one answer."""
 NOT_RESTORED = ("MASTERMV",)  # its setting would be taken from the present distance
 STREAMING = "OUTPUT RS422"
-_ECHO_STATE = re.compile(rb"\bECHO (?:ON|OFF)\b")
+MARKER = "ECHO"
+"""Query that is used for nothing else, so that its answer cannot be taken for another one."""
+_MARKER_ANSWER = re.compile(rb"\bECHO (?:ON|OFF)\b")
 
 
 class Dialogue:
@@ -36,7 +40,8 @@ class Dialogue:
 
     Parameters
     ----------
-    transport : Transport
+    exchange : callable
+        Gives the line for one request and its answer: `Driver.exchange`.
     timeout : float
         Time limit of an answer, s.
 
@@ -48,12 +53,12 @@ class Dialogue:
         Why no command can be sent any more.
     """
 
-    def __init__(self, transport: Transport, timeout: float) -> None:
+    def __init__(self, exchange: Callable[[], AbstractContextManager[Transport]], timeout: float) -> None:
         self.timeout = timeout
         self.reader: Reader | None = None
         self.lost: InstrumentError | None = None
-        self._transport = transport
-        self._unanswered = False  # an answer may still come
+        self._exchange = exchange
+        self._unanswered = False  # an answer may still come between the values, or later
         self._before: dict[str, str] = {}
 
     def command(self, text: str) -> list[str]:
@@ -68,42 +73,52 @@ class Dialogue:
         """
         if self.lost is not None:
             raise InstrumentError(f"The connection is lost ({self.lost}); close and open it again")
-        if self._unanswered:
-            self._resynchronise()
-        return parse_answer(text, self._exchange(text))
-
-    def _exchange(self, text: str) -> bytes:
-        """Return the text of the next answer after a command."""
-        request = text.encode("ascii") + LINE_END
         try:
             if self.reader is not None:
-                return self.reader.query(request, self.timeout)
-            self._transport.write(request)
-            return text_of(self._transport.read_until(PROMPT, limit=MAX_BUFFERED_BYTES, timeout=self.timeout))
+                return parse_answer(text, self._answer_in_stream(self.reader, text))
+            with self._exchange() as line:
+                if self._unanswered:  # since the stream
+                    self.synchronise(line)
+                answer = self._answer(line, text)
         except InstrumentTimeoutError:
             self._unanswered = True
             raise
+        return parse_answer(text, answer)
 
-    def _resynchronise(self) -> None:
-        """Discard late answers, until the answer to ECHO, a query that is used for nothing else, arrives."""
+    def synchronise(self, line: Transport) -> None:
+        """Discard late answers until the one to `MARKER` arrives.
+
+        Raises
+        ------
+        InstrumentError
+            It does not arrive.
+        """
         for _ in range(RESYNCHRONISATIONS):
-            self._await_quiet()
-            if _ECHO_STATE.search(self._exchange("ECHO")):
+            with suppress(ProtocolError):  # the sensor streams: its values are no answers
+                await_quiet(line, QUIET)
+            if _MARKER_ANSWER.search(self._answer(line, MARKER)):
                 self._unanswered = False
                 return
-        raise ProtocolError("No answer to ECHO among the late answers of the sensor; close and open it again")
+        raise _no_marker()
 
-    def _await_quiet(self) -> None:
-        end = time.monotonic() + self.timeout
-        if self.reader is not None:
-            seen = -1
-            while seen != self.reader.stray_bytes and time.monotonic() < end:
-                seen = self.reader.stray_bytes
+    def _answer(self, line: Transport, text: str) -> bytes:
+        line.write(text.encode("ascii") + LINE_END)
+        return text_of(line.read_until(PROMPT, limit=MAX_BUFFERED_BYTES, timeout=self.timeout))
+
+    def _answer_in_stream(self, reader: Reader, text: str) -> bytes:
+        """Return the answer to a command, with any late one discarded."""
+        for _ in range(RESYNCHRONISATIONS):
+            if not self._unanswered:
+                return reader.query(text.encode("ascii") + LINE_END, self.timeout)
+            seen, end = -1, time.monotonic() + self.timeout
+            while seen != reader.stray_bytes and time.monotonic() < end:
+                seen = reader.stray_bytes
                 time.sleep(QUIET)
-            return
-        with suppress(InstrumentTimeoutError):
-            while time.monotonic() < end:
-                self._transport.read(timeout=QUIET)
+            answer = reader.query(MARKER.encode("ascii") + LINE_END, self.timeout)
+            self._unanswered = not _MARKER_ANSWER.search(answer)
+        if self._unanswered:
+            raise _no_marker()
+        return reader.query(text.encode("ascii") + LINE_END, self.timeout)
 
     # ------------------------------------------------------------------ settings
 
@@ -130,3 +145,9 @@ class Dialogue:
             if command and name not in NOT_RESTORED and command != STREAMING:
                 with suppress(RefusedCommandError):
                     self.command(command)
+
+
+def _no_marker() -> ProtocolError:
+    return ProtocolError(
+        f"No answer to {MARKER} among the late answers of the sensor; close and open the connection again"
+    )

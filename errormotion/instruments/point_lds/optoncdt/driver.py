@@ -69,6 +69,7 @@ class OptoNCDT(Driver):
     _refused: list[str]
     _layout = Layout(())
     _termination = "TERMOFF"
+    _master = False  # sends pulses
 
     @property
     def rate(self) -> float:
@@ -151,6 +152,7 @@ class OptoNCDT(Driver):
         self._layout = parse_layout(self.command("GETOUTINFO_RS422"), counter=settings.counter)
         if model.synchronises:
             self._termination = self._termination_of("SYNC")
+            dialogue.set(f"SYNC NONE {self._termination}")  # no pulses while the sensors of a frame are made ready
         self.settings, self._range, dialogue.timeout = settings, measured, settings.timeout
 
     def _termination_of(self, name: str) -> str:
@@ -248,6 +250,7 @@ class OptoNCDT(Driver):
         try:
             self.command("OUTPUT RS422")
             if sync == "MASTER":
+                self._master = True
                 self.command(f"SYNC MASTER {self._termination}")
         except BaseException:
             self._abandon()
@@ -279,8 +282,11 @@ class OptoNCDT(Driver):
         if reader is None:
             return
         self._dialogue.reader = None
+        master, self._master = self._master, False
         try:
             reader.stop(b"OUTPUT NONE" + LINE_END, self.settings.timeout if timeout is None else timeout)
+            if master:
+                self.command(f"SYNC NONE {self._termination}")  # slaves start with the pulses of the next stream only
         except InstrumentError as error:
             reader.abandon()
             self._dialogue.lost = error
@@ -296,8 +302,8 @@ class OptoNCDT(Driver):
         )
 
     def _start_session(self) -> None:
-        self._range, self._refused = None, []
-        self._dialogue = Dialogue(self.transport, self.settings.timeout)
+        self._range, self._refused, self._master = None, [], False
+        self._dialogue = Dialogue(self.exchange, self.settings.timeout)
         self._dialogue.remember("OUTPUT")  # refused where an earlier user has left half a line
         self.command("OUTPUT NONE")  # it may have been streaming since it was switched on
         try:
@@ -310,6 +316,11 @@ class OptoNCDT(Driver):
     def _end_session(self) -> None:
         self.stop()
         self._dialogue.restore()
+
+    def resynchronise(self) -> None:
+        """Discard late answers after a failed exchange; see `Driver.resynchronise`."""
+        super().resynchronise()
+        self._dialogue.synchronise(self.transport)
 
     def _abandon(self) -> None:
         reader, self._reader = self._reader, None

@@ -93,7 +93,7 @@ class SimulatedAdapter:
         self._prefix = f"{address.params['device']}:" if "device" in address.params else ""
         self._assets = bool(address.number("assets", 0))
         self._lines = 0
-        self._pinged = (0, 0.0)  # connection and time of the last one
+        self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last one
         self._received = b""
         self._ended = threading.Event()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -106,7 +106,7 @@ class SimulatedAdapter:
             self._device = devices.root[0][-1].get("name", "")
             machine = [item for item in devices.items.values() if item.device is devices.root[0][-1]]
             self._items = {self._prefix + item.key: item for item in machine}
-            self._server = TcpServer(address.path or "shdr", self._on_data)
+            self._server = TcpServer(address.path or "shdr", self._on_data, self._on_connection)
         except BaseException:
             self.world.detach(self)
             raise
@@ -129,16 +129,17 @@ class SimulatedAdapter:
     # ------------------------------------------------------------------ lines
 
     def _run(self) -> None:
-        connection, shown = 0, dict[str, Value]()
+        connection, shown = None, dict[str, Value]()
         while not self._ended.wait(POLL_INTERVAL):
-            if not self._server.await_connection(0.0):
+            present = self._server.connection
+            if present is None:
                 continue
-            if self._server.connections != connection:
-                connection, shown = self._server.connections, {}
+            if present is not connection:
+                connection, shown = present, {}
                 self._send_all(f"* {command}" for command in (*_COMMANDS, f"device: {self._device}"))
                 self._send_all(self._asset())
             pinged, last = self._pinged
-            if pinged == connection and time.monotonic() - last > 2 * self._heartbeat / 1e3:
+            if pinged is connection and time.monotonic() - last > 2 * self._heartbeat / 1e3:
                 self._server.disconnect()
                 continue
             self._send_all(self._changes(shown))
@@ -191,12 +192,16 @@ class SimulatedAdapter:
             for piece in fault.pieces(data):
                 self._server.send(piece)
 
+    def _on_connection(self) -> None:
+        """Forget an unfinished line of the previous connection."""
+        self._received = b""
+
     def _on_data(self, data: bytes) -> None:
         *lines, self._received = (self._received + data).split(b"\n")
         self._received = self._received[-LONGEST_LINE:]
         for line in lines:
             if line.strip() == b"* PING" and self._heartbeat:
-                self._pinged = (self._server.connections, time.monotonic())
+                self._pinged = (self._server.connection, time.monotonic())
                 self._send(f"* PONG {self._heartbeat}")
 
 

@@ -50,7 +50,7 @@ class SimulatedLJX(SimulatedDevice):
         The surface, instead of the one that the address names.
     """
 
-    faults = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect")
+    faults = ("silence", "split", "garbage", "checksum", "out_of_range", "drop", "disconnect", "late")
     drops_answers = False
 
     def __init__(self, address: Address, source: ProfileSource | None = None) -> None:
@@ -152,10 +152,15 @@ class SimulatedLJX(SimulatedDevice):
 
     def reply(self, data: bytes) -> None:
         """Send an answer; garbage comes in the stream only."""
+        number = self._answers
         self._answers += 1
         if self.fault.kind == "silence" and self._mute:
             return
+        if self.fault.kind == "late" and number == self.fault.at:
+            self._hold(data)
+            return
         with self._server.lock:
+            self._release()
             for piece in self.fault.pieces(data):
                 self._server.send(piece)
 

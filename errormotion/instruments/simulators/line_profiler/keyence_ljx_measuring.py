@@ -68,7 +68,7 @@ class Measuring:
         self._before = 0  # profiles of the stream before the run
         self._unsent: tuple[int, int] | None = None  # batch and number of the first profile not sent yet
         self._thread: threading.Thread | None = None
-        self._starting = threading.Lock()
+        self._starting, self._ending = threading.Lock(), threading.Lock()
         self._ended, self._stopping = threading.Event(), threading.Event()
 
     @property
@@ -226,6 +226,7 @@ class Measuring:
             if self._measure(layout, limit):
                 if limit and self.memory.newest is not None:
                     self.memory.newest.committed = True
+                self._ended.set()  # ahead of the notice, behind which the client may start the next batch
                 if limit and self._streaming:
                     self._send(wire.notice(wire.BATCH_ENDED))
                 if self._stopping.is_set() or not limit:
@@ -299,8 +300,9 @@ class Measuring:
         return np.concatenate(parts) if parts else None
 
     def _end_stream(self) -> None:
-        if self._streaming:
-            self._streaming = False
+        with self._ending:
+            streamed, self._streaming = self._streaming, False
+        if streamed:
             time.sleep(self._notice_delay)
             self._send(wire.notice(wire.STOPPED))
 

@@ -3,8 +3,10 @@
 Written from the public manuals of such devices, not from the driver: esd CAN-CBX-THERMO C.3034.21 rev. 1.2 (p. 50, 54,
 90-97) and CAN-CBX-Pt100 C.3032.21 rev. 1.1 (p. 49, 91), HYDAC's CiA 404 protocol description (objects of the device
 profile), WIKA D-20-9 (contents, object 0x2330), SIKO AP10 (p. 49, TPDO parameters), Bonfiglioli ACU (p. 69, order of
-mapping), ABB FCAN-01 (p. 126-129, SDO). Assumed, as no document shows it: what a broken input reads (a Pt100 input's
-limits), that a TPDO by event without event timer is not sent, the emergency code of a broken sensor.
+mapping), ABB FCAN-01 (p. 126-129, SDO), JUMO 902910 CANtrans T (p. 16, emergency 5030h of a broken sensor).
+
+Assumed, as no document shows it: what a broken input reads (a Pt100 input's limits), that a TPDO by event without event
+timer is not sent.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ ZERO = int.from_bytes(b"zero", "little")  # signature of the autozero
 MOST_DIGITS = 3
 VALUES = {"float": (0x6130, "f32"), "int16": (0x7130, "i16"), "int32": (0x9130, "i32")}
 FIRST_SDO_ANSWER = 0x580  # COB-ID without the node
-BROKEN_SENSOR = (0xFF00, 0x21)  # emergency code, device specific; error register: generic and device profile
+BROKEN_SENSOR = (0x5030, 0x21)  # emergency code (JUMO); error register: generic and device profile
 
 
 class SimulatedCanopen:
@@ -68,10 +70,9 @@ class SimulatedCanopen:
     itself, as WIKA's object 0x2330 has it do; ``pre-operational``: it waits for a master).
 
     Faults: ``silence``, ``garbage``, ``drop``, ``out_of_range``, ``late`` as of all devices, counted over SDO answers
-    and PDOs;
-    ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for ``unplugged_for`` seconds nothing is
-    answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see `simulators.thermometers`; it boots
-    when it is back).
+    and PDOs (``late`` is an SDO answer); ``abort`` (the node refuses), ``bus_off`` (the controllers leave the bus; for
+    ``unplugged_for`` seconds nothing is answered), ``stopped`` (the node goes to the state STOPPED), ``unplugged`` (see
+    `simulators.thermometers`; it boots when it is back).
 
     Attributes
     ----------
@@ -101,7 +102,8 @@ class SimulatedCanopen:
         pdo = _choices(address, "pdo", "event", ("event", "sync", "timer", "off", "none"))[0]
         state = _choices(address, "state", "operational", ("operational", "pre-operational"))[0]
         self._answers = 0
-        self._held: tuple[int, bytes, float] | None = None  # the frame that is late, and when it is sent at the latest
+        self._was_late = False
+        self._held: tuple[float, int, bytes] | None = None  # time, s, and frame of the answer that is late
         node, seed = address.whole("node", 1, 127), int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *(address.path or "thermometer").encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -230,18 +232,15 @@ class SimulatedCanopen:
 
     def _due(self, now: float) -> float:
         if self._absent():
-            self._held = None
             return now + 1.0
-        if self._held is not None and now >= self._held[2]:
-            self._release()
-        due = self._slave.due(now)
-        return due if self._held is None else min(due, self._held[2])
+        if self._held and now >= self._held[0]:
+            self._send_held()
+        return min(self._slave.due(now), self._held[0] if self._held else math.inf)
 
-    def _release(self) -> None:
-        """Send the frame that was held back."""
+    def _send_held(self) -> None:
         held, self._held = self._held, None
-        if held is not None and self._server is not None:
-            self._server.send(held[0], held[1])
+        if held and self._server is not None:
+            self._server.send(*held[1:])
 
     def _absent(self) -> bool:
         """Whether the node is without power; it boots where it is back."""
@@ -265,16 +264,18 @@ class SimulatedCanopen:
                 server.send_bus_off()
             return
         self._answers += 1
+        if can_id >= FIRST_SDO_ANSWER:
+            self._send_held()
+            if self.fault.kind == "late" and number >= self.fault.at and not self._was_late:
+                self._was_late, self._held = True, (time.monotonic() + self.fault.delay, can_id, data)
+                return
         if self.fault.kind == "stopped" and number >= self.fault.at:
             self._slave.enter(STOPPED)
         elif (self.fault.kind == "silence" and number >= self.fault.at) or self.fault.hits("drop", number):
             return
         elif self.fault.hits("garbage", number):
             server.send(can_id, self._rng.integers(0, 256, self._rng.integers(1, 8), dtype=np.uint8).tobytes())
-        elif self.fault.kind == "late" and number == self.fault.at:
-            self._held = can_id, data, time.monotonic() + self.fault.delay
         else:
-            self._release()
             server.send(can_id, data)
 
 

@@ -14,7 +14,6 @@ from errormotion.instruments.thermometer.registers import ModbusSettings
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.modbus.client import framing_of
 from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
-from errormotion.instruments.transports.serving import TcpServer
 
 FAILURE = 4  # Modbus exception: server device failure
 _SAME = ("map", "type", "function", "first", "stride", "word_order", "byte_order", "scale", "offset", "open_from")
@@ -48,7 +47,6 @@ class SimulatedModbus(SimulatedDevice):
         self._code = address.whole("code", FAILURE, 11)
         self._unit = address.whole("unit", 1, 255)
         self._device: ModbusServer | None = None
-        self._connections = 0
         super().__init__(address, line_end=b"", default_name="thermometer")
         try:
             self._inputs = Inputs(self.world.machine, address)
@@ -73,14 +71,17 @@ class SimulatedModbus(SimulatedDevice):
             data = data[: len(data) // 2]
         super().reply(data)
 
+    def connection_opened(self) -> None:
+        """Forget the incomplete request of the connection before."""
+        super().connection_opened()
+        if self._device is not None:
+            self._device.reset()
+
     def _on_data(self, data: bytes) -> None:
         if self._unplugging.keeps_from(self._answers, self._server):
             return
         if self._device is None:
             return
-        if isinstance(self._server, TcpServer) and self._server.connections != self._connections:
-            self._connections = self._server.connections
-            self._device.reset()
         for answer in self._device.receive(data):
             self.reply(answer)
         if self._device.lost:

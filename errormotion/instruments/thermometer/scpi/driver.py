@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, TypeVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.scpi import codec
 from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, Thermometer
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.quiet import discard_input
-from errormotion.instruments.transports.reconnecting import disconnect_after_timeout, open_reconnecting
+from errormotion.instruments.transports.reconnecting import open_reconnecting
 from errormotion.plugins import Identity, InstrumentInfo
+
+T = TypeVar("T")
 
 MAX_ERRORS = 32
 """Largest number of entries that are read from the error queue; the units have 10 or 20."""
@@ -52,7 +54,7 @@ class ScpiTemperature(Thermometer):
 
     def identify(self) -> Identity:
         """Return maker, model, serial number and revision of the unit; InstrumentError for another model."""
-        maker, model, serial, revision = codec.parse_identity(self._query("*IDN?"))
+        maker, model, serial, revision = self._query("*IDN?", codec.parse_identity)
         if model not in self.settings.models:
             raise InstrumentError(
                 f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {maker} {model}. Add it "
@@ -76,7 +78,7 @@ class ScpiTemperature(Thermometer):
         """Read the error queue of the unit, which empties it; each entry such as ``-113 Undefined header``."""
         found = []
         for _ in range(MAX_ERRORS):
-            number, text = codec.parse_error(self._query("SYST:ERR?"))
+            number, text = self._query("SYST:ERR?", codec.parse_error)
             if not number:
                 break
             found.append(f"{number} {text}")
@@ -96,7 +98,11 @@ class ScpiTemperature(Thermometer):
         }
 
     def _scanned(self) -> dict[int, float]:
-        pairs = codec.parse_readings(self._query("READ?"))
+        return self._query("READ?", self._by_channel)
+
+    def _by_channel(self, text: str) -> dict[int, float]:
+        """Return the readings of a scan by channel; ProtocolError unless each channel has one."""
+        pairs = codec.parse_readings(text)
         found = [channel for channel, _ in pairs]
         if sorted(found) != sorted(self.settings.numbers):
             raise ProtocolError(
@@ -113,48 +119,61 @@ class ScpiTemperature(Thermometer):
         return value, GOOD if self.settings.lowest <= value <= self.settings.highest else OUT_OF_RANGE
 
     def _prepare(self) -> None:
-        """Synchronise with the unit, set it, and report what it refuses."""
-        self._synchronise()
+        """Set the unit, and report what it refuses."""
         self.unit_errors = tuple(self.errors())
-        line, settings = self.transport, self.settings
-        line.write(codec.encode("*CLS"))
-        for command in settings.commands() if settings.setup else settings.format_commands():
-            line.write(codec.encode(command))
-            if refused := self.errors():  # one command at a time: a serial line has no flow control
-                raise InstrumentError(f"{self.address}: the unit refuses '{command}': {'; '.join(refused)}")
-        if not settings.setup:
-            scanned = codec.parse_channels(self._query("ROUT:SCAN?"))
-            if sorted(scanned) != sorted(settings.numbers):
+        self._set("*CLS")
+        if self._serial:
+            self._set("SYST:REM")
+        for command in self.settings.commands() if self.settings.setup else self.settings.format_commands():
+            self._set(command)
+        if not self.settings.setup:
+            scanned = self._query("ROUT:SCAN?", codec.parse_channels)
+            if sorted(scanned) != sorted(self.settings.numbers):
+                wanted = codec.channel_list(sorted(self.settings.numbers))
                 raise InstrumentError(
-                    f"{self.address}: expected the scan list {codec.channel_list(sorted(settings.numbers))}; found "
-                    f"{codec.channel_list(scanned)}. Set 'inputs' to it, or 'setup' to true"
+                    f"{self.address}: expected the scan list {wanted}; found {codec.channel_list(scanned)}. Set "
+                    "'inputs' to it, or 'setup' to true"
                 )
         self._ready = True
 
-    def _synchronise(self) -> None:
-        """Ask for the identity and discard what comes before it: answers to earlier requests."""
-        answer = self._query("*IDN?")
+    def _set(self, command: str) -> None:
+        """Send a command, and raise what the unit puts into its error queue; this also paces a serial line."""
+        with self.exchange() as line:
+            line.write(codec.encode(command))
+            line.write(codec.encode("SYST:ERR?"))
+            number, text = self._answer(line, "SYST:ERR?", codec.parse_error)
+        if number:
+            raise InstrumentError(f"{self.address}: the unit refuses '{command}': {number} {text}")
+
+    def _query(self, command: str, parse: Callable[[str], T]) -> T:
+        with self.exchange() as line:
+            line.write(codec.encode(command))
+            return self._answer(line, command, parse)
+
+    def _answer(self, line: Transport, command: str, parse: Callable[[str], T]) -> T:
+        try:
+            return parse(codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST)))
+        except InstrumentTimeoutError as error:
+            raise InstrumentTimeoutError(f"'{command}': {error}") from None
+
+    def resynchronise(self) -> None:
+        """Discard late answers; those that are later still come before the identity of the unit.
+
+        Raises
+        ------
+        InstrumentError
+            The unit does not answer.
+        """
+        super().resynchronise()
+        line = self.transport
+        line.write(codec.encode("*IDN?"))
         for _ in range(MAX_LATE):
             try:
-                codec.parse_identity(answer)
-                return
+                self._answer(line, "*IDN?", codec.parse_identity)
             except ProtocolError:
-                answer = self._line("*IDN?")
+                continue
+            return
         raise ProtocolError(f"{self.address}: expected the identity of the unit; found {MAX_LATE} other lines")
-
-    def _query(self, command: str) -> str:
-        line = self.transport
-        discard_input(line)
-        line.write(codec.encode(command))
-        return self._line(command)
-
-    def _line(self, command: str) -> str:
-        line = self.transport
-        try:
-            return codec.decode(line.read_until(codec.LINE_END, limit=codec.LONGEST))
-        except InstrumentTimeoutError as error:
-            disconnect_after_timeout(line)
-            raise InstrumentTimeoutError(f"'{command}': {error}") from None
 
     def _connect(self) -> Transport:
         return open_reconnecting(
@@ -166,7 +185,17 @@ class ScpiTemperature(Thermometer):
             baudrate=self.settings.baudrate,
         )
 
+    @property
+    def _serial(self) -> bool:
+        """Whether the unit is on a serial line, where it has a remote mode of its own."""
+        return str(getattr(self.transport, "recorded_address", self.address)).startswith("serial:")
+
     def _start_session(self) -> None:
         self._ready = False
         self.identify()
         self._prepare()
+
+    def _end_session(self) -> None:
+        if self._serial:
+            with self.exchange() as line:
+                line.write(codec.encode("SYST:LOC"))

@@ -33,6 +33,7 @@ from errormotion.instruments.transports.recording import read_recording
 
 QUIET_INTERVAL = 0.05  # s without a byte after which a transmission has ended
 MAX_STRAY_BYTES = 512  # largest number of bytes discarded after a damaged answer
+MAX_LATE_ANSWERS = 8  # skipped after a timeout
 
 
 class ModbusLine(Transport):
@@ -63,8 +64,7 @@ class ModbusLine(Transport):
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
         self._unanswered_at: float | None = None
-        self._unanswered_count = 0  # registers of the request without an answer; 0: nothing is late
-        self._probes = False  # whether the request without an answer was that of `_overtake_late_answer`
+        self._passed_over = False  # whether the last request without an answer was that of `_skip_late_answers`
 
     def registers(self, function: int, register: int, count: int) -> list[int]:
         """Return ``count`` registers from ``register`` on, by function 3 (holding) or 4 (input).
@@ -90,7 +90,7 @@ class ModbusLine(Transport):
         raise AssertionError  # the loop has ended by itself
 
     def _exchange(self, function: int, register: int, count: int) -> list[int]:
-        self._await_late_answer(function, register)
+        self._await_late_answer(function, register, count)
         self._number = (self._number + 1) % (1 << 16)
         self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
         end = time.monotonic() + self.timeout
@@ -107,53 +107,49 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
-            self._unanswered_at, self._unanswered_count, self._probes = time.monotonic(), count, False
+            self._unanswered_at, self._passed_over = time.monotonic(), False
             disconnect_after_timeout(self._line)
             raise
 
-    def _await_late_answer(self, function: int, register: int) -> None:
-        """Discard unread bytes; after a timeout, also what arrives within a further time limit.
+    def _await_late_answer(self, function: int, register: int, count: int) -> None:
+        """Discard unread bytes; after a timeout, make sure that no late answer is taken for the next one.
 
-        An RTU frame has no number: a late answer would be taken for that to the next request.
+        An RTU frame has no number. What arrives within a further time limit is discarded. If nothing arrives, another
+        number of registers is read, so that its answer and one that is later still differ in length. A device that does
+        not answer that is sent the next request without it.
         """
         since, self._unanswered_at = self._unanswered_at, None
         if since is None or self.framing == "tcp":
             discard_input(self._line)
             return
-        discarded = 0
         try:
-            discarded = await_quiet(self._line, self.timeout, since)
-        except ProtocolError:
-            self._unanswered_at = time.monotonic()
-            raise
-        except InstrumentError:  # the connection was dropped; a serial server may still pass the answer on
-            pass
-        if not discarded and not self._probes:
-            self._overtake_late_answer(function, register)
-
-    def _overtake_late_answer(self, function: int, register: int) -> None:
-        """Send a request whose answer has another length than the missing one, and read until that.
-
-        A device answers in order: what is late comes before. One that does not answer this request is not sent it
-        again ahead of the next one.
-        """
-        count = 2 if self._unanswered_count == 1 else 1
-        self._line.write(encode_request(self.framing, self.unit, function, register, count, self._number))
-        end = time.monotonic() + self.timeout
-        while True:
             try:
-                data = self._frame(end)
-                if decode_answer(self.framing, data, self.unit, function, count, self._number) is not None:
+                if await_quiet(self._line, self.timeout, since):
                     return
-            except ModbusRefusal:  # two registers where there is one
-                return
-            except ProtocolError:  # the late answer, or a damaged one
-                if time.monotonic() > end:
-                    raise
-            except InstrumentTimeoutError:
-                self._unanswered_at, self._probes = time.monotonic(), True
-                disconnect_after_timeout(self._line)
+            except ProtocolError:
                 raise
+            except InstrumentError:  # the connection was dropped: the answer is lost with it
+                return
+            if not self._passed_over:
+                self._skip_late_answers(function, register, 1 if count > 1 else 2)
+        except (ProtocolError, InstrumentTimeoutError) as error:
+            self._unanswered_at = time.monotonic()
+            self._passed_over = isinstance(error, InstrumentTimeoutError)
+            raise
+
+    def _skip_late_answers(self, function: int, register: int, count: int) -> None:
+        """Request a number of registers and skip answers until that to this request, or its refusal."""
+        self._line.write(encode_request(self.framing, self.unit, function, register, count))
+        end = time.monotonic() + self.timeout
+        for _ in range(MAX_LATE_ANSWERS):
+            try:
+                decode_answer(self.framing, self._frame(end), self.unit, function, count)
+            except ModbusRefusal:
+                return
+            except ProtocolError:
+                continue
+            return
+        raise ProtocolError(f"{self.url}: {MAX_LATE_ANSWERS} answers to earlier requests; expected one")
 
     def _frame(self, end: float) -> bytes:
         """Return one answer, of the length that its start states."""

@@ -39,16 +39,30 @@ _RTU_SIZES: Mapping[int, int | tuple[int, int]] = {
 }
 
 
-def checksum(data: bytes) -> bytes:
-    """Return the CRC of a serial frame, low byte first (guide to serial line, appendix B)."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
+def _table() -> tuple[int, ...]:
+    """Return the change of the CRC register by each value of its low byte: polynomial A001, shifted right."""
+    values = []
+    for value in range(256):
+        crc = value
         for _ in range(8):
             crc, carry = crc >> 1, crc & 1
-            if carry:
-                crc ^= 0xA001
-    return struct.pack("<H", crc)
+            crc ^= carry * 0xA001
+        values.append(crc)
+    return tuple(values)
+
+
+_CRC = _table()
+
+
+def _crc(data: bytes, crc: int = 0xFFFF) -> int:
+    for byte in data:
+        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def checksum(data: bytes) -> bytes:
+    """Return the CRC of a serial frame, low byte first (guide to serial line, appendix B)."""
+    return struct.pack("<H", _crc(data))
 
 
 class ModbusServer:
@@ -157,8 +171,10 @@ class ModbusServer:
 
     def _checked_sizes(self) -> Iterator[int]:
         """Yield the sizes at which the bytes so far are a request of an unknown function with a right checksum."""
-        for size in range(4, min(len(self._rest), MAX_RTU_BYTES) + 1):
-            if _is_frame(self._rest[:size]):
+        crc = 0xFFFF
+        for size, byte in enumerate(self._rest[:MAX_RTU_BYTES], 1):
+            crc = _crc(bytes((byte,)), crc)
+            if size >= 4 and not crc:  # the CRC of a frame with its own CRC is 0
                 yield size
 
     def _next_known(self) -> int:
@@ -206,4 +222,4 @@ class ModbusServer:
 
 
 def _is_frame(data: bytes) -> bool:
-    return len(data) >= 4 and data[-2:] == checksum(data[:-2])
+    return len(data) >= 4 and not _crc(data)

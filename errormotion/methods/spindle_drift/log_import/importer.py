@@ -12,7 +12,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.text.dates import is_date
-from errormotion.datasets.text.log_reader import NOTES, Columns, Place, read_columns
+from errormotion.datasets.text.log_reader import NOTES, Columns, Place, holes, read_columns
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
@@ -151,8 +151,8 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
         "missing_values": json.dumps({key: count for key, count in missing.items() if count}),
     }
     attrs |= {name: value for name, value in (("machine", settings.machine), ("start", columns.start)) if value}
-    if columns.notes:
-        attrs[NOTES] = json.dumps(columns.notes)
+    if notes := [*holes(inside["time"], columns.lines), *columns.notes]:
+        attrs[NOTES] = json.dumps(notes)
     return xr.Dataset(variables, coords, attrs)
 
 

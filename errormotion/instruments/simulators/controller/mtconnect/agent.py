@@ -8,9 +8,11 @@ counts requests, and intervals of a stream; ``overrun``, ``jump`` and ``restart`
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -53,7 +55,7 @@ class SimulatedAgent:
     """
 
     faults = (
-        *("silence", "split", "garbage", "drop", "disconnect"),
+        *("silence", "split", "garbage", "drop", "disconnect", "late"),
         *("overrun", "jump", "restart", "alarm", "unavailable"),
     )
 
@@ -69,6 +71,7 @@ class SimulatedAgent:
         self._frame = Frame(version, max(1, int(address.number("buffer", BUFFER))), FIRST_INSTANCE)
         self._requests = 0
         self._befallen = False
+        self._held = WeakKeyDictionary[threading.Thread, bytes]()  # late answers, by the thread of their connection
         self._lock = threading.Lock()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         self.world.attach(self, address.number("pace", 0.0) or None)
@@ -158,8 +161,17 @@ class SimulatedAgent:
             f"HTTP/1.1 {status} {_REASONS[status]}\r\nServer: MTConnectAgent\r\nContent-Type: text/xml\r\n"
             f"Cache-Control: no-store, max-age=0\r\nContent-Length: {len(body)}\r\n\r\n"
         ).encode()
+        if fault.kind == "late" and number == fault.at:
+            return self._hold(head + body)
         stray = stray_bytes(self._rng) if fault.hits("garbage", number) else b""
-        return fault.pieces(stray + head + body)
+        return fault.pieces(self._held.pop(threading.current_thread(), b"") + stray + head + body)
+
+    def _hold(self, answer: bytes) -> Iterator[bytes]:
+        """Yield an answer late, or keep it until the next one of its connection."""
+        if math.isinf(self.fault.delay):
+            self._held[threading.current_thread()] = answer
+        elif not self._server.ended.wait(self.fault.delay):
+            yield answer
 
     def _check_stream(self, request: Request) -> None:
         items = self._items(request)

@@ -13,7 +13,7 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon import packet
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import Triple
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.points import BY_DISTANCE, BY_TIME, GRID
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import TrackerServer
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.state_commands import CAMERA, LEVEL, StateCommands
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event, Status, out_of_range, wrong
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import NEST
@@ -28,7 +28,7 @@ TILT = (1e-5, -4e-6)
 class Commands(StateCommands):
     """All commands of one client."""
 
-    def __init__(self, device: TrackerServer) -> None:
+    def __init__(self, device: Server) -> None:
         super().__init__(device)
         self._mode = STATIONARY
         self._reported_index = 0.0
@@ -182,8 +182,8 @@ class Commands(StateCommands):
     def _do_StartMeasurement(self) -> bytes | int:
         if not self._device.initialised:
             return Status.NOT_INITIALISED
-        if self._mode in (BY_TIME, BY_DISTANCE, GRID) and self._device.points is not None:
-            self._device.points.start_soon(self._mode)
+        if self._mode in (BY_TIME, BY_DISTANCE, GRID):
+            self._device.stream.start_soon(self._mode)
             return self._ok("StartMeasurement") + self._said(Event.BUSY)
         before = self._device.use_beam()
         if self._device.tracker.broken:
@@ -205,8 +205,7 @@ class Commands(StateCommands):
         return before + self._ok("GoAndMeasure") + self._single()
 
     def _do_StopMeasurement(self) -> bytes:
-        if self._device.points is not None:
-            self._device.points.end()
+        self._device.stream.end()
         return self._ok("StopMeasurement") + self._said(Event.READY)
 
     def _single(self) -> bytes:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import information, packets, settings
@@ -21,6 +23,8 @@ from errormotion.instruments.transports import Address
 
 BEAM_ERROR = 201
 """Status of the error that reports a broken beam: a number of the tracker processor (assumed)."""
+LARGEST = 1e12
+"""Numbers of a request beyond this, in SI, and those that are none, are wrong parameters (assumed)."""
 VERSIONS = {"3.6": (3, 6, 500), "3.8": (3, 8, 900)}
 
 
@@ -36,7 +40,7 @@ class SimulatedEmScon(SimulatedDevice):
     (points, measurements and motions), ``refuse`` and ``error`` (answers; ``code`` is their status).
     """
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect", "busy", "beam_broken", "refuse", "error")
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "busy", "beam_broken", "refuse", "error")
     drops_answers = False  # `drop` and `disconnect` are about points of a stream
 
     def __init__(self, address: Address) -> None:
@@ -99,6 +103,12 @@ class SimulatedEmScon(SimulatedDevice):
         if self.points is not None:
             self.points.report_delivered(samples)
 
+    def connection_opened(self) -> None:
+        """Forget the incomplete request, and end the measurement, of the connection before."""
+        super().connection_opened()
+        if self.points is not None:
+            self.points.request_end()
+
     # ------------------------------------------------------------------ requests
 
     def _on_data(self, data: bytes) -> None:
@@ -136,7 +146,10 @@ class SimulatedEmScon(SimulatedDevice):
             return self.wire.reply(number, Status.WRONG_PARAMETER)
         if self.measuring and not self._allowed_while_measuring(COMMANDS[number].name):
             return self.wire.reply(number, Status.BUSY)
-        return self._done(number, self.wire.unpack(COMMANDS[number].request, arguments))
+        values = self.wire.unpack(COMMANDS[number].request, arguments)
+        if not np.all(np.abs(np.hstack([0.0, *values])) < LARGEST):
+            return self.wire.reply(number, Status.WRONG_PARAMETER)
+        return self._done(number, values)
 
     def _done(self, number: int, values: list[Any]) -> bytes:
         name = COMMANDS[number].name
@@ -159,6 +172,13 @@ class SimulatedEmScon(SimulatedDevice):
     @staticmethod
     def _allowed_while_measuring(name: str) -> bool:
         return name.startswith("Get") or name in ("StopMeasurement", "ClearCommandQueue", "ExitApplication")
+
+    @property
+    def stream(self) -> PointStream:
+        """The continuous measurement."""
+        if self.points is None:
+            raise InstrumentError("The simulated tracker is not set up")
+        return self.points
 
     @property
     def measuring(self) -> bool:

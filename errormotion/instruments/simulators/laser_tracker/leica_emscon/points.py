@@ -14,7 +14,7 @@ import numpy as np
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import packets
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import RHR, Triple, to_system
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import TrackerServer
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event
 
 POINTS_A_PACKET = 20
@@ -32,10 +32,10 @@ class PointStream:
 
     Parameters
     ----------
-    device : TrackerServer
+    device : Server
     """
 
-    def __init__(self, device: TrackerServer) -> None:
+    def __init__(self, device: Server) -> None:
         self._device = device
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -67,6 +67,7 @@ class PointStream:
     def request_end(self) -> None:
         """Let the thread end."""
         self._stop.set()
+        self.running = False
 
     def end(self) -> None:
         """End the thread; idempotent."""

@@ -1,50 +1,45 @@
-"""What the commands and the stream of points use of the simulated server."""
+"""What the commands and the point stream need of the simulated server."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from errormotion.instruments.simulators.faults import Fault
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import Triple
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import Wire
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import Block
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import Tracker
-from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
+
+if TYPE_CHECKING:
+    from errormotion.instruments.simulators.faults import Fault
+    from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
 
 
-class Points(Protocol):
-    """A stream of points, see `points.PointStream`."""
+class Stream(Protocol):
+    """A continuous measurement."""
 
     def start_soon(self, mode: int) -> None:
         """Start as soon as the answer is out."""
 
     def end(self) -> None:
-        """End the stream; idempotent."""
+        """End it; idempotent."""
 
 
-class TrackerServer(Protocol):
-    """The server, see `device.SimulatedEmScon`."""
+class Server(Protocol):
+    """The simulated server: its state, and what it sends unasked."""
 
     name: str
-    fault: Fault
     world: VirtualWorld
-    tracker: Tracker
+    fault: Fault
     wire: Wire
+    blocks: dict[int, Block]
+    tracker: Tracker
+    version: tuple[int, int, int]
     initialised: bool
     always_extended: bool
 
     @property
-    def blocks(self) -> Mapping[int, Block]:
-        """Settings that are read and set as a whole, by the number of the command that sets them."""
-
-    @property
-    def version(self) -> tuple[int, int, int]:
-        """Version of the server."""
-
-    @property
-    def points(self) -> Points | None:
-        """The stream of points."""
+    def stream(self) -> Stream:
+        """The continuous measurement."""
 
     @property
     def measuring(self) -> bool:
@@ -64,7 +59,7 @@ class TrackerServer(Protocol):
         """Take up the reflector; return what the server states then."""
 
     def spread(self, seen: Triple) -> list[Any]:
-        """Return the standard deviations of a position and its covariances."""
+        """Return the standard deviations of a position, their total, and covariances."""
 
     def silent(self) -> bool:
         """Whether the fault ``silence`` holds."""

@@ -13,7 +13,7 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon import packet
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.information import REFLECTORS, SERIAL
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import SYSTEMS, Units
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import TrackerServer
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import DOUBLES, PARAMETERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event, Status, out_of_range, wrong
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import METEO_REFRACTION
@@ -30,10 +30,10 @@ class StateCommands:
 
     Parameters
     ----------
-    device : TrackerServer
+    device : Server
     """
 
-    def __init__(self, device: TrackerServer) -> None:
+    def __init__(self, device: Server) -> None:
         self._device = device
         self.system = [0, 0, 0, 0, 1, 1, 0, 1, 0]
         self._reflector = 1

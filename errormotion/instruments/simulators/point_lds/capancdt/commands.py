@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -79,10 +80,10 @@ class Settings:
 
 
 class Controller(Protocol):
-    """What the commands need of the controller."""
+    """What the commands need of the controller; its sensors are numbered from 1 to 4."""
 
     settings: Settings
-    sensors: tuple[Sensor, ...]
+    sensors: Mapping[int, Sensor]
     serial: int
     port: int
 
@@ -107,8 +108,7 @@ def answer(controller: Controller, command: str) -> str:
 def statuses(controller: Controller) -> list[int]:
     """Return the status of each channel: 0 not there, 1 there, 2 with a math function."""
     functions = controller.settings.functions
-    there = len(controller.sensors)
-    return [2 if channel in functions else int(channel <= there) for channel in range(1, CHANNELS + 1)]
+    return [2 if channel in functions else int(channel in controller.sensors) for channel in range(1, CHANNELS + 1)]
 
 
 def _whole(text: str, least: int, highest: int) -> int:
@@ -124,7 +124,7 @@ def _nothing(text: str) -> None:
 
 def _channel(controller: Controller, text: str) -> int:
     found = _CHANNEL.fullmatch(text)
-    if not found or int(text) > len(controller.sensors):
+    if not found or int(text) not in controller.sensors:
         raise Refused(WRONG_PARAMETER)
     return int(text)
 
@@ -183,7 +183,7 @@ def _linearisation(controller: Controller, text: str) -> str:
 
 def _pair(controller: Controller, text: str) -> tuple[int, int]:
     found = _PAIR.fullmatch(text)
-    if not found or int(found[1]) > len(controller.sensors):
+    if not found or int(found[1]) not in controller.sensors:
         raise Refused(WRONG_PARAMETER)
     return int(found[1]), int(found[2])
 
@@ -219,7 +219,7 @@ def _status(controller: Controller, text: str) -> str:
 
 def _version(_: Controller, text: str) -> str:
     _nothing(text)
-    return f"{NAME};{VERSION};{FIRMWARE}"
+    return f"{NAME};{VERSION};{FIRMWARE}{OK}"
 
 
 def _set_function(controller: Controller, text: str) -> str:
@@ -264,7 +264,7 @@ def _set_data_port(_: Controller, text: str) -> str:
 
 
 def _information_of_channel(controller: Controller, text: str) -> str:
-    sensor = controller.sensors[_channel(controller, text) - 1]
+    sensor = controller.sensors[_channel(controller, text)]
     return (
         f":ANO{SENSOR_ORDER_NUMBER},NAMCS{sensor.range / 1000:g},SNO{sensor.serial},OFS0,RNG{sensor.range:g},"
         f"UNT\N{MICRO SIGN}m,DTY1{OK}"

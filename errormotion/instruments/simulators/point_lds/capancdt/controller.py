@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -32,13 +33,14 @@ Array = np.ndarray[Any, Any]
 
 LINE_END = b"\r\n"
 ENDS = b"\r\n"
+GREETING = "DT6220"
 LONGEST_COMMAND = 255
 TIME_LIMIT = 10.0
 """Time after the last character within which a command has to be ended, s."""
-CONNECTION_POLL = 0.02
-"""Interval at which a connection to the data port is looked for, s."""
 ANSWER_DELAY = 0.02
 """Time for which an answer waits for values that are being sent, s."""
+ACCEPT_TIME = 0.5
+"""Time within which a client of the data port is accepted, s."""
 FIRST_COUNT = 100_000
 """Counter of the first value: the controller has been on for a while."""
 
@@ -50,10 +52,10 @@ class SimulatedCapaNCDT(SimulatedDevice):
     not have sends no values until then. The line ``data`` (in ``urls``) has the measured values, from the moment on
     at which a client is connected to it.
 
-    Further parameters of the address: ``beams`` (of all sensors, joined by commas: 1 to 4 channels), ``ranges``
+    Further parameters of the address: ``beams`` (of channels 1 to 4, joined by commas; empty: no sensor), ``ranges``
     (measuring ranges in um, joined by commas; default that of the machine's frame, 2000), ``serial``, ``left``
     (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
-    ``password`` (empty), ``frames`` (of a block at most, 256).
+    ``password`` (empty), ``frames`` (of a block at most, 256), ``greeting`` (line that a client of the commands gets).
 
     Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (FFFFFF),
     ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
@@ -66,43 +68,40 @@ class SimulatedCapaNCDT(SimulatedDevice):
     def __init__(self, address: Address) -> None:
         self._mute = False
         self._timer: threading.Timer | None = None
-        self._ended = threading.Event()
         self._streams: tuple[_Channel, ...] = ()
         self._once = 0  # single frames that are due
         self._sent = 0  # frames since the connection
         self._counter = FIRST_COUNT
         self._values: Array = np.zeros(CHANNELS, dtype=np.int64)
-        self._taken: int | None = None
         self._averaging = Averaging(0, 2)
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
         self._mute = self.fault.kind == "silence" and self.fault.from_the_start
         try:
             self._set_up(address)
-            self._data = TcpServer(f"{self.name}-data", _ignore)
+            self._data = TcpServer(f"{self.name}-data", _ignore, self._data_connected)
         except (InstrumentError, ValueError) as error:
             super().close()
             raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
         self._data.start()
         self.urls = {"data": self._data.url}
         self.port = int(self._data.url.rsplit(":", 1)[1])
-        self._watch = threading.Thread(target=self._serve, name=f"sim-{self.name}-data", daemon=True)
-        self._watch.start()
 
     def _set_up(self, address: Address) -> None:
-        beams = [each for each in address.params.get("beams", self.name).split(",") if each]
-        frame = self.world.machine.frame.range * 1e6
+        beams = address.params.get("beams", self.name).split(",")
+        channels = [channel for channel, beam in enumerate(beams, 1) if beam]
         texts = [each for each in address.params.get("ranges", "").split(",") if each]
-        ranges = [float(text) for text in texts] or [frame]
-        if not 1 <= len(beams) <= CHANNELS or len(ranges) not in (1, len(beams)) or min(ranges) <= 0:
+        ranges = [float(text) for text in texts] or [self.world.machine.frame.range * 1e6]
+        if not channels or len(beams) > CHANNELS or len(ranges) not in (1, len(channels)) or not min(ranges) > 0:
             raise InstrumentError(f"expected 1 to {CHANNELS} 'beams', and one of 'ranges' (um) for all or for each")
-        ranges = ranges * len(beams) if len(ranges) == 1 else ranges
+        ranges = ranges * len(channels) if len(ranges) == 1 else ranges
         self.serial = int(address.number("serial", 1000 + abs(self.world.seed)))
-        self.sensors = tuple(
-            Sensor(beam, length, 100 * self.serial + number)
-            for number, (beam, length) in enumerate(zip(beams, ranges, strict=True), 1)
-        )
+        self.sensors: Mapping[int, Sensor] = {
+            channel: Sensor(beams[channel - 1], length, 100 * self.serial + channel)
+            for channel, length in zip(channels, ranges, strict=True)
+        }
         self.settings = Settings(password=address.params.get("password", ""))
         self._time_limit = address.number("time_limit", TIME_LIMIT)
+        self._greeting = address.params.get("greeting", GREETING)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))
         self.port = 0
         for command in address.params.get("left", "").split(";"):
@@ -111,11 +110,8 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     def close(self) -> None:
         """End the device."""
-        self._ended.set()
         self._cancel_timer()
         self._end_streams()
-        self._data.disconnect()
-        self._watch.join()
         self._data.close()
         super().close()
 
@@ -125,6 +121,13 @@ class SimulatedCapaNCDT(SimulatedDevice):
             stream.taken = samples
 
     # ------------------------------------------------------------------ commands
+
+    def connection_opened(self) -> None:
+        """Forget an unfinished command, and greet the client."""
+        super().connection_opened()
+        self._cancel_timer()
+        if self._greeting:
+            self._send(self._greeting.encode("latin-1") + LINE_END)
 
     def _on_data(self, data: bytes) -> None:
         self._cancel_timer()
@@ -146,21 +149,26 @@ class SimulatedCapaNCDT(SimulatedDevice):
             self._timer.start()
 
     def _obey(self, command: bytes) -> None:
-        before = (self.settings.trigger, self.settings.sample_time)
-        kind = (self.settings.averaging, self.settings.averaging_number)
+        settings = self.settings
+        before, kind = (settings.trigger, settings.sample_time), (settings.averaging, settings.averaging_number)
+        ended: tuple[_Channel, ...] = ()
+        if command == b"GMD" and settings.trigger:
+            self._data.await_present_client(ACCEPT_TIME)  # one that is connecting gets the value
         held = self._data.lock.acquire(timeout=ANSWER_DELAY)  # no value is sent meanwhile, unless its reader stalls
         try:
             text = answer(self, command.decode("latin-1"))
-            if kind != (self.settings.averaging, self.settings.averaging_number):
+            if kind != (settings.averaging, settings.averaging_number):
                 self._averaging = self._new_averaging()
+            if before != (settings.trigger, settings.sample_time):
+                ended, self._streams = self._streams, ()  # none of their values follows the answer
             self._reply(text.encode("latin-1") + LINE_END)
         finally:
             if held:
                 self._data.lock.release()
-        if before != (self.settings.trigger, self.settings.sample_time):
-            for stream in self._streams:
-                stream.taken = stream.taken or 0  # the clock goes on where the reader is
-            self._end_streams()  # they start again with the new settings
+        for stream in ended:
+            stream.taken = stream.taken or 0  # the clock goes on where the reader is
+            self._end(stream)
+        self._start_if_due()
 
     def _reply(self, data: bytes) -> None:
         number, self._answers = self._answers, self._answers + 1
@@ -202,28 +210,28 @@ class SimulatedCapaNCDT(SimulatedDevice):
 
     # ------------------------------------------------------------------ values
 
-    def _serve(self) -> None:
-        """Start the streams whenever a client is connected and values are due."""
-        while not self._ended.is_set():
-            connected = self._data.await_connection(CONNECTION_POLL)
-            if not connected:
-                self._end_streams()
-                self._once = 0
-            elif not self._streams and (self._once or not self.settings.trigger) and not self._mute:
-                self._start_streams()
-            if connected:
-                self._ended.wait(CONNECTION_POLL)
+    def _data_connected(self) -> None:
+        self._end_streams()  # of the client before
+        self._once = self._sent = 0
+        self._start_if_due()
+
+    def _start_if_due(self) -> None:
+        """Start the streams where a client is connected and values are due."""
+        due = self._once or not self.settings.trigger
+        if due and not self._streams and not self._mute and self._data.connection is not None:
+            self._start_streams()
 
     def _start_streams(self) -> None:
         world = self.world
-        known = all(sensor.beam in world.machine.frame.channels for sensor in self.sensors)
+        known = all(sensor.beam in world.machine.frame.channels for sensor in self.sensors.values())
         if not (known or world.stand.target is not None) or world.following:
             return
         rate = 1e6 / self.settings.sample_time
         self._averaging = self._new_averaging()
-        self._sent = 0
+        self._sent = 0  # faults count from here
         pending: list[Array] = []
-        self._streams = tuple(_Channel(self, pending, number, each, rate) for number, each in enumerate(self.sensors))
+        sensors = tuple(self.sensors.values())
+        self._streams = tuple(_Channel(self, pending, each, rate, last=each is sensors[-1]) for each in sensors)
         with world._change:  # all channels start at the same sample
             for stream in self._streams:
                 world.start_stream(stream)
@@ -231,15 +239,20 @@ class SimulatedCapaNCDT(SimulatedDevice):
     def _end_streams(self) -> None:
         streams, self._streams = self._streams, ()
         for stream in streams:
-            stream.ended = True
-            self.world.end_stream(stream)
+            self._end(stream)
+
+    def _end(self, stream: _Channel) -> None:
+        stream.ended = True
+        self.world.end_stream(stream)
 
     def pass_on(self, stream: _Channel, distances: list[Array]) -> None:
         """Send the frames that the samples of all channels make."""
-        columns = [raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors, strict=True)]
+        columns = [
+            raw_values(each, sensor.range * 1e-6) for each, sensor in zip(distances, self.sensors.values(), strict=True)
+        ]
         frames = np.stack(columns, axis=1)
         with self._data.lock:
-            if stream not in self._streams or self._ended.is_set():
+            if stream not in self._streams:
                 return
             if self.settings.trigger:
                 frames, self._once = frames[: self._once], 0
@@ -260,7 +273,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
             frames[active & ((fault.length == 0) | (numbers < fault.at + fault.length))] = FULL_SCALE
         if fault.kind in ("silence", "disconnect"):
             frames = frames[~active]
-        values, channels = with_functions(self._averaging(frames), self.settings)
+        values, channels = with_functions(self._averaging(frames), tuple(self.sensors), self.settings)
         if len(values):
             self._values[[channel - 1 for channel in channels]] = values[-1]
         heard = all(self._data.send(piece) for piece in fault.pieces(self._bytes(values, channels, first)))
@@ -295,7 +308,7 @@ class _Channel:
     sync = "NONE"
 
     def __init__(
-        self, controller: SimulatedCapaNCDT, pending: list[Array], number: int, sensor: Sensor, rate: float
+        self, controller: SimulatedCapaNCDT, pending: list[Array], sensor: Sensor, rate: float, *, last: bool
     ) -> None:
         self.channel = sensor.beam
         self.measuring_range = sensor.range * 1e-6
@@ -305,7 +318,7 @@ class _Channel:
         self.ended = False
         self._controller = controller
         self._pending = pending
-        self._last = number == len(controller.sensors) - 1
+        self._last = last
 
     def push(self, distances: Array) -> None:
         """Send the next samples, with those of the last channel; may wait for the reader."""

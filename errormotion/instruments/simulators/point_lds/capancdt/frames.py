@@ -59,21 +59,20 @@ def _whole(values: Array) -> Array:
     return np.asarray(np.rint(values), dtype=np.int64)
 
 
-def with_functions(frames: Array, settings: Settings) -> tuple[Array, tuple[int, ...]]:
+def with_functions(frames: Array, there: Sequence[int], settings: Settings) -> tuple[Array, tuple[int, ...]]:
     """Return the values of all channels that are sent, shape (frame, channel), and their numbers.
 
-    ``frames`` has those of the sensors; a math function takes the position of its channel.
+    ``frames`` has those of the channels that are ``there``; a math function takes the position of its channel.
     """
-    there = frames.shape[1]
-    channels = tuple(each for each in range(1, CHANNELS + 1) if each <= there or each in settings.functions)
+    channels = tuple(each for each in range(1, CHANNELS + 1) if each in there or each in settings.functions)
     columns = []
     for channel in channels:
         function = settings.functions.get(channel)
         if function is None:
-            columns.append(frames[:, channel - 1])
+            columns.append(frames[:, there.index(channel)])
             continue
-        factors = np.array(function.factors[:there])
-        columns.append(np.rint((function.offset << _MATH_SHIFT) + frames @ factors).astype(np.int64))
+        factors = np.array([function.factors[each - 1] for each in there])
+        columns.append(_whole((function.offset << _MATH_SHIFT) + frames @ factors))
     return np.stack(columns, axis=1), channels
 
 

@@ -1,0 +1,107 @@
+"""``errormotion compare``: whether several results of one machine agree, and what explains it where they do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.cli.output import show, show_json, table
+from errormotion.compare import compare as compared
+from errormotion.compare.loading import load
+from errormotion.compare.text import cause_text, probability, verdict
+from errormotion.errors import DatasetError
+
+
+def compare(
+    paths: list[Path],
+    names: list[str],
+    at: tuple[float, float, float] | None,
+    freedoms: list[str],
+    since: float | None,
+    same_start: bool,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+) -> xr.Dataset:
+    """Compare error datasets, print the result, and write what was asked for.
+
+    Raises
+    ------
+    DatasetError
+        The datasets cannot be read or compared, or a file exists already.
+    """
+    for path in (out, report):
+        if path is not None and path.exists():
+            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    found = compared(load(paths, _named(names)), at=at, freedoms=freedoms, since=since, same_start=same_start)
+    if out is not None:
+        datasets.save(found, out)
+    if report is not None:
+        from errormotion.compare.report import write
+
+        write(found, report)
+    if as_json:
+        show_json(as_plain(found))
+        return found
+    show(text(found))
+    for path in (out, report):
+        if path is not None:
+            show(f"written: {path}")
+    return found
+
+
+def _named(names: list[str]) -> dict[str, Path]:
+    found = {}
+    for each in names:
+        name, equals, path = each.partition("=")
+        if not (name and equals and path):
+            raise DatasetError(f"--name {each}: expected NAME=PATH, as in --name 'five sensors=runs/drift-1'")
+        found[name] = Path(path)
+    return found
+
+
+def text(ds: xr.Dataset) -> str:
+    """Return the result for a person."""
+    names = [str(name) for name in ds["dof"].values]
+    rows = []
+    for j, pair in enumerate(ds["pair"].values):
+        en = np.abs(ds["en"].values[j])
+        share = 100 * np.mean(en[np.isfinite(en)] <= 1) if np.isfinite(en).any() else np.nan
+        p = [probability(each) for each in (ds["p"].values[j], *ds["curve_p"].values[j])]
+        rows.append([str(pair), f"{share:.0f} %", f"{np.nanmax(en, initial=0.0):.2f}", *p])
+    head = ["pair", "|En| <= 1", "max |En|", "p", *(f"p {name}" for name in names)]
+    notes = [note for note in ds.attrs["notes"] if note]
+    return "\n".join([*verdict(ds), "", table(head, rows), *(["", *notes] if notes else [])])
+
+
+def as_plain(ds: xr.Dataset) -> dict[str, Any]:
+    """Return the result for a program."""
+    pairs = []
+    for j, pair in enumerate(ds["pair"].values):
+        causes = [cause_text(ds, j, rank) for rank in range(ds.sizes["rank"])]
+        pairs.append(
+            {
+                "pair": str(pair),
+                "chi2": float(ds["chi2"].values[j]),
+                "degrees": int(ds["degrees"].values[j]),
+                "p": float(ds["p"].values[j]),
+                "p_of_freedoms": dict(
+                    zip(map(str, ds["dof"].values), map(float, ds["curve_p"].values[j]), strict=True)
+                ),
+                "causes": [cause._asdict() for cause in causes if cause is not None],
+            }
+        )
+    return {
+        "ok": True,
+        "agree": bool(ds.attrs["fit_p"] >= 0.05),
+        "p": float(ds.attrs["fit_p"]),
+        "birge_ratio": float(ds.attrs["birge_ratio"]),
+        "verdict": verdict(ds),
+        "misfit_p": dict(zip(map(str, ds["dataset"].values), map(float, ds["misfit_p"].values), strict=True)),
+        "pairs": pairs,
+        "notes": [note for note in ds.attrs["notes"] if note],
+    }

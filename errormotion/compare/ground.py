@@ -1,0 +1,290 @@
+"""Common ground: the same errors, at the same point, in the same frame, since the same state, on the same grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.compare.stack import Estimate
+from errormotion.datasets import validate
+from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.timing import between
+from errormotion.errors import DatasetError
+from errormotion.kinematics.iso import DOF
+
+SAME_POINT = 1e-6
+"""Distance below which two commanded positions are the same, m."""
+SAME_MOTION = {"spindle": "tool", "tool": "tool"}
+"""Components that are the same motion, the tool relative to the workpiece: a bar in the spindle shows it."""
+COORDINATES = {"position": ("x", "y", "z"), "target": ("x", "y", "z")}
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Estimates of the same errors on one grid.
+
+    Attributes
+    ----------
+    estimates : list of Estimate
+        One for each dataset, (n, d): the points of the grid, and ``freedoms``.
+    dim : str
+        ``time``, ``position``, ``target``, a declared dimension, or empty for a single position.
+    coords : dict
+        Coordinates along ``dim``.
+    freedoms : tuple of str
+    component, machine, frame : str
+    point : ndarray, (3,)
+        Functional point, m.
+    since : float or None
+        Time of the common reference state, s on ``time``; None where the errors have no common reference in time.
+    notes : list of str
+    """
+
+    estimates: list[Estimate]
+    dim: str
+    coords: dict[str, xr.DataArray]
+    freedoms: tuple[str, ...]
+    component: str
+    machine: str
+    frame: str
+    point: Array
+    since: float | None
+    start: str = ""
+    notes: list[str] = field(default_factory=list)
+
+
+def common_ground(
+    datasets: Mapping[str, xr.Dataset],
+    *,
+    at: ArrayLike | None = None,
+    freedoms: Sequence[str] = (),
+    since: float | None = None,
+    same_start: bool = False,
+) -> Ground:
+    """Bring error datasets to common ground.
+
+    Parameters
+    ----------
+    datasets : mapping of str to Dataset
+        Name to error dataset; at least two.
+    at : array_like, (3,), optional
+        Functional point in the common frame, m. Default: that of the first dataset.
+    freedoms : sequence of str, optional
+        Which of the six are compared. Default: all that every dataset sees.
+    since : float, optional
+        Time of the common reference state, s after the start of the first dataset. Default: the first common instant.
+    same_start : bool
+        Take time 0 of all datasets as the same instant where they do not state their start.
+
+    Raises
+    ------
+    DatasetError
+        Fewer than two datasets, one twice, another machine, component or frame, dimensions that do not fit, no start,
+        no overlap, no common freedom: what is missing, and in which dataset.
+    """
+    names = list(datasets)
+    if len(names) < 2:
+        raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
+    for name, ds in datasets.items():
+        _check(name, ds)
+    for i, name in enumerate(names):
+        for other in names[:i]:
+            if datasets[name].identical(datasets[other]):
+                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    first = datasets[names[0]]
+    component = _same(datasets, "component", SAME_MOTION)
+    machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
+    dim = _dimension(datasets)
+    notes: list[str] = []
+    point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
+    moved = {name: ds if component == "beam" else ds.em.at(point) for name, ds in datasets.items()}
+    reference: float | None = None
+    if dim == "time":
+        moved, reference = _in_time(moved, since, same_start, notes)
+    elif dim:
+        moved = _in_place(moved, dim, notes)
+    seen = [_seen(ds) for ds in moved.values()]
+    chosen = tuple(name for name in (freedoms or DOF) if all(name in each for each in seen))
+    for name in freedoms:
+        for dataset, each in zip(moved, seen, strict=True):
+            if name not in each:
+                raise DatasetError(f"'{dataset}' does not state {name}; it states {', '.join(each) or 'nothing'}")
+    if not chosen:
+        states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(moved, seen, strict=True))
+        raise DatasetError(f"The datasets have no freedom in common: {states}")
+    estimates = [_estimate(name, ds, chosen) for name, ds in moved.items()]
+    grid = next(iter(moved.values()))
+    coords = {str(name): grid[name] for name in grid.coords if dim and grid[name].dims == (dim,) and name != "source"}
+    return Ground(
+        estimates=estimates,
+        dim=dim,
+        coords={name: value.drop_vars(set(value.coords) - {name}) for name, value in coords.items()},
+        freedoms=chosen,
+        component=component,
+        machine=machine,
+        frame=frame,
+        point=point,
+        since=reference,
+        start=str(grid.attrs.get("start", "")),
+        notes=notes,
+    )
+
+
+def _check(name: str, ds: xr.Dataset) -> None:
+    try:
+        validate(ds)
+        ds.em  # noqa: B018 - refuses what is no error dataset
+    except DatasetError as error:
+        raise DatasetError(f"'{name}': {error}") from None
+    if ds.em.names != DOF:
+        raise DatasetError(
+            f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
+        )
+    if len(ds["EX"].dims) > 1:
+        raise DatasetError(
+            f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
+            "in ds.isel(position=3)"
+        )
+
+
+def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str, str] | None = None) -> str:
+    found = {name: str(ds.attrs[attribute]) for name, ds in datasets.items()}
+    values = {(alike or {}).get(value, value) for value in found.values()}
+    if len(values) > 1:
+        stated = "; ".join(f"'{name}': {value}" for name, value in found.items())
+        hint = {
+            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name)",
+            "component": ". The errors of an axis and of the tool need the kinematic chain; predict one from the other",
+        }.get(attribute, "")
+        raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
+    return values.pop()
+
+
+def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
+    dims = {name: ds["EX"].dims for name, ds in datasets.items()}
+    if len(set(dims.values())) > 1:
+        stated = "; ".join(f"'{name}': {', '.join(map(str, each)) or 'none'}" for name, each in dims.items())
+        raise DatasetError(f"The errors of the datasets depend on different things ({stated})")
+    found = next(iter(dims.values()))
+    return str(found[0]) if found else ""
+
+
+def _in_time(
+    datasets: Mapping[str, xr.Dataset], since: float | None, same_start: bool, notes: list[str]
+) -> tuple[dict[str, xr.Dataset], float]:
+    """Return the datasets on the instants of the sparsest one, as changes since a common instant."""
+    names = list(datasets)
+    starts = {name: str(ds.attrs.get("start", "")) for name, ds in datasets.items()}
+    missing = [name for name, start in starts.items() if not start]
+    if missing and not same_start:
+        raise DatasetError(
+            f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times "
+            "have no relation to the others. State it, or state that all start at the same instant (same_start)"
+        )
+    if missing:
+        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")
+    offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
+    shifted = {
+        name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))
+        for name, ds in datasets.items()
+    }
+    known = {name: ds["time"].values[_known(ds)] for name, ds in shifted.items()}
+    first = max((times[0] if times.size else np.inf) for times in known.values())
+    last = min((times[-1] if times.size else -np.inf) for times in known.values())
+    if first > last:
+        spans = "; ".join(
+            f"'{name}': {times[0]:g} s to {times[-1]:g} s" if times.size else f"'{name}': nothing known"
+            for name, times in known.items()
+        )
+        raise DatasetError(f"The datasets do not overlap in time (s after the start of '{names[0]}'): {spans}")
+    inside = {name: times[(times >= first) & (times <= last)] for name, times in known.items()}
+    sparse = min(inside, key=lambda name: inside[name].size)
+    grid = inside[sparse]
+    if since is not None:
+        grid = grid[grid > since]
+        grid = np.concatenate([[since], grid])
+        if not first <= since <= last:
+            raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+    if grid.size < 2:
+        raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
+    others = [name for name in names if name != sparse]
+    notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
+    placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
+    start = starts[names[0]]
+    for ds in placed.values():
+        ds["time"] = ("time", grid, ds["time"].attrs)
+        ds.attrs["start"] = start
+    return placed, float(grid[0])
+
+
+def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:
+    """Return the datasets at the points that all have."""
+    names = list(datasets)
+    points = {name: _points(name, ds, dim) for name, ds in datasets.items()}
+    first = points[names[0]]
+    rows: dict[str, list[int]] = {name: [] for name in names}
+    for i, point in enumerate(first):
+        matches = {name: _match(point, points[name]) for name in names[1:]}
+        if all(match is not None for match in matches.values()):
+            rows[names[0]].append(i)
+            for name, match in matches.items():
+                rows[name].append(int(match or 0))
+    if not rows[names[0]]:
+        raise DatasetError(f"The datasets have no {dim} in common (within {SAME_POINT * 1e6:g} um)")
+    left = {name: ds.sizes[dim] - len(rows[name]) for name, ds in datasets.items()}
+    if any(left.values()):
+        notes.append(
+            f"{len(rows[names[0]])} common points; left out: "
+            + ", ".join(f"{count} of '{name}'" for name, count in left.items() if count)
+        )
+    return {name: ds.isel({dim: rows[name]}) for name, ds in datasets.items()}
+
+
+def _points(name: str, ds: xr.Dataset, dim: str) -> list[Any]:
+    """Return what tells the points of a dimension apart: coordinates, or labels."""
+    axes = [axis for axis in COORDINATES.get(dim, ()) if axis in ds.variables and ds[axis].dims == (dim,)]
+    if axes:
+        return list(np.stack([ds[axis].values for axis in axes], axis=-1))
+    if dim in ds.coords:
+        return list(ds[dim].values.tolist())
+    raise DatasetError(f"'{name}': its {dim} has no coordinate, so that its values cannot be assigned to the others'")
+
+
+def _match(point: Any, points: list[Any]) -> int | None:
+    if isinstance(point, np.ndarray):
+        if not points or np.shape(points[0]) != point.shape:
+            return None
+        distance = np.linalg.norm(np.array(points, dtype=float) - point, axis=1)
+        nearest = int(distance.argmin())
+        return nearest if distance[nearest] <= SAME_POINT else None
+    return points.index(point) if point in points else None
+
+
+def _known(ds: xr.Dataset) -> Array:
+    values = ds.em.twist().values
+    known: Array = np.isfinite(values).any(axis=-1)
+    return known
+
+
+def _seen(ds: xr.Dataset) -> list[str]:
+    return [name for name in DOF if np.isfinite(ds[name].values).any()]
+
+
+def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
+    k = [DOF.index(freedom) for freedom in freedoms]
+    value = ds.em.twist().values.reshape(-1, 6)[:, k]
+    F = influence_of(ds)
+    F = F.reshape(len(F), -1, 6)[..., k]
+    total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
+    own = total - np.einsum("sni,snj->nij", F, F)
+    size = len(F)
+    sources = ds["source"].values.tolist() if size else []
+    ids = ds["source_id"].values.tolist() if size and "source_id" in ds.coords else [""] * size
+    keys = tuple(identity or f"{name}: {source}" for identity, source in zip(ids, sources, strict=True))
+    return Estimate(name, value, own, F, keys)

@@ -1,0 +1,74 @@
+"""Differences of two estimates: the normalised error at every point, and one test of the whole curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from errormotion.arrays import Array
+from errormotion.compare.low_rank import whitener
+from errormotion.compare.stack import Estimate, difference
+
+COVERAGE_FACTOR = 2.0
+"""k of the expanded uncertainties in En."""
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """A sum of squares with its degrees of freedom; ``p`` is the probability of a larger one if both agree."""
+
+    value: float
+    degrees: int
+
+    @property
+    def p(self) -> float:
+        """Probability of a larger value; NaN without degrees of freedom."""
+        return float(chi2.sf(self.value, self.degrees)) if self.degrees else float("nan")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What two estimates say about each other.
+
+    Attributes
+    ----------
+    a, b : str
+        Names.
+    difference : Estimate
+        a less b.
+    en : ndarray, (n, d)
+        Difference over its expanded uncertainty (k = 2), with sign; NaN where unknown or exactly zero by definition.
+    joint : ChiSquare
+        Over all points and freedoms.
+    curve : list of ChiSquare
+        Over all points, for each freedom.
+    """
+
+    a: str
+    b: str
+    difference: Estimate
+    en: Array
+    joint: ChiSquare
+    curve: list[ChiSquare]
+
+
+def pair(a: Estimate, b: Estimate) -> Pair:
+    """Compare two estimates on one grid; what both share, by the keys of their sources, cancels."""
+    d = difference(a, b)
+    variance = np.diagonal(d.covariance(), axis1=1, axis2=2)
+    u = np.sqrt(np.maximum(variance, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        en = np.where(u > 0, d.value / (COVERAGE_FACTOR * u), np.nan)
+    curves = []
+    for k in range(d.value.shape[1]):
+        one = Estimate(d.name, d.value[:, [k]], d.own[:, [k]][:, :, [k]], d.influence[:, :, [k]], d.source)
+        curves.append(agreement(one))
+    return Pair(a.name, b.name, d, en, agreement(d), curves)
+
+
+def agreement(d: Estimate) -> ChiSquare:
+    """Return the chi-square of a difference whose expectation is zero."""
+    white = whitener(d.own, d.influence)
+    return ChiSquare(white.square(d.value), white.degrees)

@@ -1,0 +1,183 @@
+"""The result of a comparison as a dataset, schema ``errormotion.comparison/1``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.compare.consensus import Consensus
+from errormotion.compare.diagnosis import Cause
+from errormotion.compare.ground import Ground
+from errormotion.compare.pairs import Pair
+from errormotion.compare.stack import Estimate, shared
+from errormotion.errors import DatasetError
+
+SCHEMA = "errormotion.comparison/1"
+CAUSES = 5
+"""Causes that are kept for each pair."""
+
+#: Variable to its dimensions (``...``: the common dimension, if there is one), and its meaning.
+TABLE: dict[str, tuple[tuple[str, ...], str]] = {
+    "value": (("dataset", "...", "dof"), "errors of each dataset on common ground; m, rad"),
+    "covariance": (("dataset", "...", "dof", "dof_"), "their total covariance; m^2, m rad, rad^2"),
+    "difference": (("pair", "...", "dof"), "first less second dataset of a pair; m, rad"),
+    "difference_covariance": (
+        ("pair", "...", "dof", "dof_"),
+        "covariance of the difference; shared sources are one draw",
+    ),
+    "en": (("pair", "...", "dof"), "normalised error: difference over its expanded uncertainty (k = 2)"),
+    "chi2": (("pair",), "joint chi-square of the difference over all points and freedoms"),
+    "degrees": (("pair",), "its degrees of freedom"),
+    "p": (("pair",), "probability of a larger chi-square if both agree"),
+    "curve_chi2": (("pair", "dof"), "joint chi-square of one freedom over all points"),
+    "curve_degrees": (("pair", "dof"), "its degrees of freedom"),
+    "curve_p": (("pair", "dof"), "probability of a larger one if both agree"),
+    "consensus": (("...", "dof"), "generalised least squares of all datasets; m, rad"),
+    "consensus_covariance": (("...", "dof", "dof_"), "covariance of the consensus"),
+    "robust": (("...", "dof"), "mean with a variance between datasets (DerSimonian and Laird); m, rad"),
+    "robust_uncertainty": (("...", "dof"), "its standard uncertainty; m, rad"),
+    "between": (("dof",), "standard deviation between datasets (tau); m, rad"),
+    "misfit_p": (("dataset",), "probability that a dataset departs so far from the others, after Holm"),
+    "rest_p": (
+        ("dataset",),
+        "probability of the residuals of the others without this dataset; NaN below two",
+    ),
+    "cause": (("pair", "rank"), "causes that could explain the difference, the most likely one first"),
+    "cause_p": (("pair", "rank"), "probability of a larger rest if it is the only cause"),
+    "log_likelihood_ratio": (("pair", "rank"), "of the cause, against agreement"),
+    "size": (("pair", "rank", "parameter"), "size of the cause; SI"),
+    "size_u": (("pair", "rank", "parameter"), "its standard uncertainty; SI"),
+    "size_name": (("pair", "rank", "parameter"), "what the size is, and its unit"),
+    "alike": (("pair", "rank"), "causes that these data cannot tell from it"),
+}
+
+
+def build(
+    ground: Ground,
+    pairs: Sequence[Pair],
+    agreed: Consensus,
+    robust: tuple[Array, Array, Array],
+    causes: Sequence[Sequence[Cause]],
+) -> xr.Dataset:
+    """Return the result of a comparison as a dataset of the schema."""
+    estimates = ground.estimates
+    found: dict[str, Any] = {
+        "value": np.array([each.value for each in estimates]),
+        "covariance": np.array([each.covariance() for each in estimates]),
+        "difference": np.array([each.difference.value for each in pairs]),
+        "difference_covariance": np.array([each.difference.covariance() for each in pairs]),
+        "en": np.array([each.en for each in pairs]),
+        "chi2": np.array([each.joint.value for each in pairs]),
+        "degrees": np.array([each.joint.degrees for each in pairs]),
+        "p": np.array([each.joint.p for each in pairs]),
+        "curve_chi2": np.array([[one.value for one in each.curve] for each in pairs]),
+        "curve_degrees": np.array([[one.degrees for one in each.curve] for each in pairs]),
+        "curve_p": np.array([[one.p for one in each.curve] for each in pairs]),
+        "consensus": agreed.estimate.value,
+        "consensus_covariance": agreed.estimate.covariance(),
+        "robust": robust[0],
+        "robust_uncertainty": robust[1],
+        "between": robust[2],
+        "misfit_p": np.array(agreed.p),
+        "rest_p": np.array([each.p for each in agreed.rest]),
+        **_causes(causes),
+    }
+    single = not ground.dim
+    variables = {}
+    for name, (dims, meaning) in TABLE.items():
+        values = found[name]
+        if "..." in dims and single:
+            values = np.take(values, 0, axis=dims.index("..."))
+        names = [ground.dim if dim == "..." else dim for dim in dims if not (dim == "..." and single)]
+        variables[name] = (names, values, {"long_name": meaning})
+    coords: dict[str, Any] = {
+        "dataset": [each.name for each in estimates],
+        "pair": [f"{each.a} - {each.b}" for each in pairs],
+        "dof": list(ground.freedoms),
+        "dof_": list(ground.freedoms),
+        "rank": np.arange(1, CAUSES + 1),
+        **ground.coords,
+    }
+    attrs: dict[str, Any] = {
+        "schema": SCHEMA,
+        "component": ground.component,
+        "machine": ground.machine,
+        "frame": ground.frame,
+        "functional_point": ground.point,
+        "fit_chi2": agreed.fit.value,
+        "fit_degrees": agreed.fit.degrees,
+        "fit_p": agreed.fit.p,
+        "birge_ratio": agreed.birge,
+        "shared_sources": json.dumps(shared(estimates)),
+        "notes": ground.notes or [""],
+    }
+    if ground.since is not None:
+        attrs |= {"since": ground.since, "start": ground.start}
+    ds = xr.Dataset(variables, coords=coords, attrs=attrs)
+    if wrong := violations(ds):
+        raise DatasetError(f"The result of the comparison does not conform to {SCHEMA}:", wrong)
+    return ds
+
+
+def _causes(causes: Sequence[Sequence[Cause]]) -> dict[str, Any]:
+    most = max([1, *(len(cause.sizes) for each in causes for cause in each[:CAUSES])])
+    shape = (len(causes), CAUSES)
+    found: dict[str, Any] = {
+        "cause": np.full(shape, "", dtype=object),
+        "alike": np.full(shape, "", dtype=object),
+        "cause_p": np.full(shape, np.nan),
+        "log_likelihood_ratio": np.full(shape, np.nan),
+        "size": np.full((*shape, most), np.nan),
+        "size_u": np.full((*shape, most), np.nan),
+        "size_name": np.full((*shape, most), "", dtype=object),
+    }
+    for i, each in enumerate(causes):
+        for rank, cause in enumerate(each[:CAUSES]):
+            at = (i, rank)
+            found["cause"][at], found["alike"][at] = cause.name, "; ".join(cause.alike)
+            found["cause_p"][at], found["log_likelihood_ratio"][at] = cause.p, cause.log_likelihood_ratio
+            for j, size in enumerate(cause.sizes):
+                found["size"][(*at, j)], found["size_u"][(*at, j)] = size.value, size.standard_uncertainty
+                found["size_name"][(*at, j)] = f"{size.name} ({size.unit})"
+    return {name: array.astype(str) if array.dtype == object else array for name, array in found.items()}
+
+
+def violations(ds: xr.Dataset) -> list[str]:
+    """Return every violation of the schema, one sentence each."""
+    found = [f"attribute '{name}': missing" for name in ("machine", "component", "frame") if name not in ds.attrs]
+    own = {dim for dims, _ in TABLE.values() for dim in dims}
+    value = ds.variables.get("value")
+    common = [dim for dim in (() if value is None else value.dims) if dim not in own]
+    if len(common) > 1:
+        found.append(f"value: expected one common dimension at most; found {', '.join(map(str, common))}")
+    for name, (dims, meaning) in TABLE.items():
+        if name not in ds.variables:
+            found.append(f"{name}: missing; expected {meaning}")
+            continue
+        expected = tuple(part for dim in dims for part in (common if dim == "..." else [dim]))
+        if ds.variables[name].dims != expected:
+            found.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {ds.variables[name].dims}")
+    for name in ("dataset", "pair", "dof", "dof_"):
+        if name in ds.dims and name not in ds.coords:
+            found.append(f"{name}: missing; expected its labels")
+    if not found:
+        for name in ("p", "curve_p", "misfit_p", "rest_p"):
+            values = ds.variables[name].values
+            if values.dtype.kind != "f" or ((values < 0) | (values > 1)).any():
+                found.append(f"{name}: expected probabilities from 0 to 1")
+    return found
+
+
+def estimate_of(ds: xr.Dataset, name: str) -> Estimate:
+    """Return one dataset of a result as an estimate without sources: value and total covariance at every point."""
+    one = ds.sel(dataset=name)
+    d = one.sizes["dof"]
+    value = np.asarray(one["value"].values).reshape(-1, d)
+    return Estimate(
+        name, value, np.asarray(one["covariance"].values).reshape(-1, d, d), np.zeros((0, *value.shape)), ()
+    )

@@ -1,0 +1,89 @@
+"""A comparison in words: the verdict, and causes with their sizes in the field's units."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+LIMIT = 0.05
+"""Probability below which datasets contradict each other."""
+FIELD = {"m": (1e3, "mm"), "rad": (648000 / np.pi, "arcsec"), "s": (1.0, "s"), "1": (1.0, "")}
+FIELD |= {"m/K": (1e6, "um/K"), "rad/K": (648000 / np.pi, "arcsec/K")}
+
+
+class CauseText(NamedTuple):
+    """One cause, ready to be printed."""
+
+    name: str
+    size: str
+    ratio: float
+    p: float
+    alike: str
+
+
+def probability(p: float) -> str:
+    """Return a probability as a person reads it."""
+    if not np.isfinite(p):
+        return "unknown"
+    return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.01 else f"{p:.2f}"
+
+
+def _p(p: float) -> str:
+    text = probability(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def verdict(ds: xr.Dataset) -> list[str]:
+    """Return the result of a comparison in sentences, the most important one first."""
+    names = [str(name) for name in ds["dataset"].values]
+    p = float(ds.attrs["fit_p"])
+    lines = []
+    if not np.isfinite(p):
+        lines.append("Nothing can be said: no value is known in all datasets with an uncertainty.")
+    elif p >= LIMIT:
+        lines.append(f"The {len(names)} datasets agree within their uncertainties ({_p(p)}).")
+    else:
+        ratio = float(ds.attrs["birge_ratio"])
+        lines.append(
+            f"The {len(names)} datasets contradict each other ({_p(p)}): their differences are {ratio:.1f} "
+            "times as large as their uncertainties allow."
+        )
+        alone = [name for name, each in zip(names, ds["rest_p"].values, strict=True) if each >= LIMIT]
+        if len(names) > 2:
+            lines += [f"Without '{name}' the others agree." for name in alone]
+        if len(names) > 2 and not alone:
+            lines.append("Whichever one is left out, the others still contradict each other.")
+    for j, pair in enumerate(ds["pair"].values):
+        first = cause_text(ds, j, 0)
+        if first is None:
+            continue
+        if first.p < 1e-3:
+            lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.name} {first.size}.")
+        else:
+            more = f" These data cannot tell it from: {first.alike}." if first.alike else ""
+            lines.append(f"{pair}: most likely {first.name}{' ' + first.size if first.size else ''}.{more}")
+    shared = json.loads(ds.attrs.get("shared_sources", "[]"))
+    if shared:
+        lines.append(f"Taken as one draw in several datasets: {', '.join(shared)}.")
+    return lines
+
+
+def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:
+    """Return a cause of a pair in words; None where there is none of this rank."""
+    at = {"pair": pair, "rank": rank}
+    one = ds[["cause", "alike", "size", "size_u", "size_name", "cause_p", "log_likelihood_ratio"]].isel(at)
+    name = str(one["cause"].values)
+    if not name:
+        return None
+    parts = []
+    for label, value, u in zip(one["size_name"].values, one["size"].values, one["size_u"].values, strict=True):
+        if str(label):
+            what, _, unit = str(label).removesuffix(")").rpartition(" (")
+            factor, field = FIELD.get(unit, (1.0, unit))
+            parts.append(f"{what} {factor * value:.4g} ± {2 * factor * u:.2g} {field}".rstrip())
+    return CauseText(
+        name, ", ".join(parts), float(one["log_likelihood_ratio"]), float(one["cause_p"]), str(one["alike"].values)
+    )

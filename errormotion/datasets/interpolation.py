@@ -1,0 +1,137 @@
+"""Errors at other instants or positions, with the uncertainty that the interpolation adds.
+
+Between two neighbours the errors are taken as an integrated Wiener process of intensity q, whose mean is the straight
+line. At the share w of an interval of length h, with nothing known of the slope, it adds the variance
+``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
+``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
+``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a
+warm-up starts, so the intensity of an interval is that of the second differences at its
+ends. Sources that are one draw for
+many values go through the same weights. Nothing is extrapolated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets.reduction import TOLERANCE, rebuilt
+from errormotion.datasets.schemas import DOF, INDEX
+from errormotion.errors import DatasetError
+
+
+def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> xr.Dataset:
+    """Return the errors at other points along a dimension, by interpolation between neighbours.
+
+    Parameters
+    ----------
+    ds : Dataset
+        Error dataset of the six freedoms.
+    dim, coordinate : str
+        Dimension, and the increasing coordinate along it: ``time`` and ``time``, or ``position`` and ``y``.
+    points : array_like, (n,)
+        Increasing; s or m. A point outside of the dataset, or between neighbours one of which is unknown, is NaN.
+
+    Returns
+    -------
+    Dataset
+        Without the further results of the method. The attribute ``interpolation_intensity`` holds the largest q
+        that was used for each of the six freedoms (m^2/s^3 or rad^2/s^3; per m^3 along positions).
+
+    Raises
+    ------
+    DatasetError
+        No such dimension, errors along one direction only, points that do not increase.
+    """
+    if "deviation" in ds.variables:
+        raise DatasetError("The errors are known along one direction only; the six freedoms are needed here")
+    if dim not in ds["EX"].dims or coordinate not in ds.variables or ds[coordinate].dims != (dim,):
+        raise DatasetError(f"Expected errors over '{dim}' with the coordinate '{coordinate}' along it")
+    new = np.atleast_1d(np.asarray(points, dtype=float))
+    t = np.asarray(ds[coordinate].values, dtype=float)
+    if new.ndim != 1 or not np.isfinite(new).all() or (np.diff(new) <= 0).any():
+        raise DatasetError(f"{coordinate}: expected finite points that increase")
+    if (np.diff(t) <= 0).any():
+        raise DatasetError(f"{coordinate}: expected values that increase along '{dim}'")
+    axis = ds["EX"].dims.index(dim)
+    E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
+    F = (
+        np.asarray(ds["influence"].values, dtype=float)
+        if "influence" in ds.variables
+        else np.zeros((0, *ds["EX"].shape, 6))
+    )
+    F = np.moveaxis(F, axis + 1, 1)
+    total = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
+    own = total - np.einsum("s...i,s...j->...ij", F, F)
+    before, share, exact, inside = _neighbours(t, new)
+    after = np.minimum(before + ~exact, len(t) - 1)
+    w = share.reshape(-1, *[1] * (E.ndim - 1))
+    between = ~exact & inside
+    q = intensity(t, E, own)
+    q = np.where(between.reshape(w.shape), q[np.minimum(before, len(q) - 1)], 0.0)
+    width = np.where(exact, 0.0, t[after] - t[before])
+    added = (width**3 * share**2 * (1 - share) ** 2 / 3).reshape(w.shape) * q
+    values = np.where(exact.reshape(w.shape), E[before], (1 - w) * E[before] + w * E[after])
+    influence = np.where(exact.reshape(w.shape), F[:, before], (1 - w) * F[:, before] + w * F[:, after])
+    ww = w[..., None]
+    rest = (1 - ww) ** 2 * own[before] + ww**2 * own[after] + added[..., None] * np.eye(6)
+    rest = np.where(exact.reshape(ww.shape), own[before], rest)
+    values[~inside] = np.nan
+    unknown = np.isnan(values)
+    influence[:, unknown] = np.nan
+    covariance = rest + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    covariance[unknown[..., :, None] | unknown[..., None, :]] = np.nan
+    base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
+    base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
+    return rebuilt(
+        base,
+        np.moveaxis(values, 0, axis),
+        np.moveaxis(covariance, 0, axis),
+        np.moveaxis(influence, 1, axis + 1),
+        [],
+        {coordinate: (dim, new, dict(ds[coordinate].attrs))},
+        interpolation_intensity=q.max(axis=tuple(range(q.ndim - 1)), initial=0.0),
+    )
+
+
+def intensity(t: Array, values: Array, own: Array) -> Array:
+    """Return the intensity q of each interval, (n - 1, ..., 6), by the moments of second differences; NaN below three.
+
+    Parameters
+    ----------
+    t : ndarray, (n,)
+    values : ndarray, (n, ..., 6)
+    own : ndarray, (n, ..., 6, 6)
+        Covariance of what is drawn anew at every value.
+    """
+    if len(t) < 3:
+        return np.full((max(len(t) - 1, 1), *values.shape[1:]), np.nan)
+    h, g = (np.diff(t)[:-1], np.diff(t)[1:])
+    shape = (-1, *[1] * (values.ndim - 1))
+    w = (h / (h + g)).reshape(shape)
+    bend = values[1:-1] - (1 - w) * values[:-2] - w * values[2:]
+    variance = np.diagonal(own, axis1=-2, axis2=-1)
+    noise = variance[1:-1] + (1 - w) ** 2 * variance[:-2] + w**2 * variance[2:]
+    unit = np.broadcast_to((h**2 * g**2 / (3 * (h + g))).reshape(shape), bend.shape)
+    known = np.isfinite(bend) & np.isfinite(noise)
+    excess, scale = np.where(known, bend**2 - noise, 0.0), np.where(known, unit, 0.0)
+    # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
+    none = np.zeros((1, *excess.shape[1:]))
+    beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
+    found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
+    return found
+
+
+def _neighbours(t: Array, new: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return for each new point: the one before it, its share of the interval, whether it is one, whether inside."""
+    before = np.clip(np.searchsorted(t, new + TOLERANCE, side="right") - 1, 0, len(t) - 1)
+    nearest = np.where(np.abs(t[np.minimum(before + 1, len(t) - 1)] - new) <= TOLERANCE, before + 1, before)
+    nearest = np.minimum(nearest, len(t) - 1)
+    exact = np.abs(t[nearest] - new) <= TOLERANCE
+    before = np.where(exact, nearest, before)
+    width = np.where(before < len(t) - 1, t[np.minimum(before + 1, len(t) - 1)] - t[before], 1.0)
+    share = np.where(exact, 0.0, (new - t[before]) / np.where(width > 0, width, 1.0))
+    inside = (new >= t[0] - TOLERANCE) & (new <= t[-1] + TOLERANCE)
+    return before, np.clip(share, 0.0, 1.0), exact, inside

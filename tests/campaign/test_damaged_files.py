@@ -1,0 +1,32 @@
+"""Damaged bench and campaign files: every mutant is read, or refused with an error of the project, in bounded time."""
+
+from pathlib import Path
+
+import mutants
+import pytest
+
+from errormotion.campaign.files import load_bench, load_campaign
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.mark.parametrize("name", ["virtual_cframe", "virtual_tracker", "virtual_gantry", "virtual_probing"])
+def test_damaged_benches(tmp_path: Path, name: str) -> None:
+    def read(data: bytes) -> None:
+        (tmp_path / "bench.toml").write_bytes(data)
+        load_bench(tmp_path / "bench.toml")
+
+    refused = mutants.check(read, (EXAMPLES / name / "bench.toml").read_bytes(), seed=1, number=mutants.count(100))
+    assert refused > 20
+
+
+@pytest.mark.parametrize("name", ["virtual_cframe", "virtual_tracker", "virtual_gantry"])
+def test_damaged_campaigns(tmp_path: Path, name: str) -> None:
+    (tmp_path / "bench.toml").write_bytes((EXAMPLES / name / "bench.toml").read_bytes())
+
+    def read(data: bytes) -> None:
+        (tmp_path / "campaign.toml").write_bytes(data)
+        load_campaign(tmp_path / "campaign.toml")
+
+    refused = mutants.check(read, (EXAMPLES / name / "campaign.toml").read_bytes(), seed=2, number=mutants.count(100))
+    assert refused > 20

@@ -1,0 +1,231 @@
+"""Whole comparisons: methods that agree, planted mistakes and their causes, bad input, the dataset of the result."""
+
+import numpy as np
+import pytest
+
+from errormotion import datasets
+from errormotion.compare import compare
+from errormotion.errors import DatasetError
+
+START = "2026-03-01T08:00:00+00:00"
+NOISE = np.array([1e-7] * 3 + [5e-7] * 3)
+SIZE = np.array([20e-6, 25e-6, 40e-6, 60e-6, 50e-6, 40e-6])
+TAU = np.array([1500.0, 2600.0, 2000.0, 1800.0, 2400.0, 3000.0])
+
+
+def drift(t):
+    """Return a warm-up of all six freedoms, (n, 6), at the functional point 0."""
+    t = np.asarray(t)[:, None]
+    return SIZE * (1 - np.exp(-t / TAU)) + 0.2 * SIZE * np.sin(t / 1700)
+
+
+def made(t, rng, *, name="a", change=lambda values: values, point=(0, 0, 0), start=START, radius="", **more):
+    """Return an error dataset of the warm-up with noise and one source (a radius) that is one draw."""
+    z = rng.normal()
+    F = np.zeros((1, len(t), 6))
+    F[0, :, :3] = 0.004 * drift(t)[:, :3]
+    values = drift(t) - drift([t[0]])[0] + F[0] * z + NOISE * rng.normal(size=(len(t), 6))
+    values = change(values)
+    ds = datasets.build_errors(
+        values,
+        np.diag(NOISE**2) + np.einsum("sti,stj->tij", F, F),
+        dims=("time",),
+        coords={"time": np.asarray(t, dtype=float)},
+        influence=F,
+        sources=["radius"],
+        source_groups=["radius"],
+        source_ids={"radius": radius} if radius else None,
+        start=start,
+        **{
+            "component": "spindle",
+            "machine": "C-frame",
+            "frame": "machine",
+            "functional_point": (0, 0, 0),
+            "reference": "cold",
+            "method": name,
+            "method_version": "1",
+            "provenance": {},
+        }
+        | more,
+    )
+    return ds.em.at(point).assign_attrs(functional_point=np.array(point, dtype=float)) if any(point) else ds
+
+
+T1, T2 = np.arange(0, 7201, 60.0), np.arange(0, 7201, 240.0)
+
+
+def two(rng, **changed):
+    return {"drift": made(T1, rng), "probing": made(T2, rng, name="b", component="tool", **changed)}
+
+
+def test_methods_that_agree_pass_every_test():
+    rng, p, en, fit = np.random.default_rng(1), [], [], []
+    for _ in range(40):
+        found = compare(two(rng), causes=False)
+        p.append(found["p"].item())
+        en.append(np.nanmean(np.abs(found["en"].values) <= 1))
+        fit.append(found.attrs["fit_p"])
+    assert 0.92 <= np.mean(en) <= 0.98
+    assert 0.3 < np.mean(p) < 0.7
+    assert (np.array(p) < 0.01).sum() <= 2
+    np.testing.assert_allclose(p, fit, rtol=1e-3)  # of two datasets both are the same test
+
+
+def test_the_result_is_a_dataset_that_is_saved_and_loaded(tmp_path):
+    found = compare(two(np.random.default_rng(2)))
+    path = datasets.save(found, tmp_path / "comparison.nc")
+    again = datasets.load(path)
+    datasets.validate(again)
+    assert again["value"].dims == ("dataset", "time", "dof")
+    assert again["pair"].values.tolist() == ["drift - probing"]
+    assert again.sizes["time"] == T2.size
+    assert np.isnan(again["en"].values[0, 0]).all()  # the common reference
+    with pytest.raises(DatasetError, match="p: expected probabilities"):
+        datasets.validate(again.assign(p=("pair", [2.0])))
+    with pytest.raises(DatasetError, match="consensus: missing"):
+        datasets.validate(again.drop_vars("consensus"))
+
+
+def test_datasets_that_start_later_are_compared_from_a_common_state():
+    rng = np.random.default_rng(3)
+    late = made(T2[5:], rng, name="b", start="2026-03-01T08:00:00+00:00")
+    late = late.assign_coords(time=("time", T2[5:] - 600.0, late["time"].attrs)).assign_attrs(
+        start="2026-03-01T09:10:00+01:00"
+    )
+    found = compare({"drift": made(T1, rng), "late": late})
+    assert found["time"].values[0] == 1200.0
+    assert found.attrs["since"] == 1200.0
+    assert found["p"].item() > 0.001
+
+
+def test_one_bar_in_both_datasets_is_one_draw():
+    rng = np.random.default_rng(4)
+    shared = {"a": made(T1, rng, radius="bar 7"), "b": made(T2, rng, name="b", radius="bar 7")}
+    apart = {"a": made(T1, rng), "b": made(T2, rng, name="b")}
+    one, both = (compare(each, causes=False)["difference_covariance"].values[0, -1, 0, 0] for each in (shared, apart))
+    effect = 0.004 * (drift(T2) - drift([0.0]))[-1, 0]
+    assert both - one == pytest.approx(2 * effect**2, rel=0.02)
+    assert compare(shared, causes=False).attrs["shared_sources"] == '["bar 7"]'
+
+
+def flipped(k):
+    def change(values):
+        values = values.copy()
+        values[:, k] *= -1
+        return values
+
+    return change
+
+
+def exchanged(values):
+    return values[:, [1, 0, 2, 3, 4, 5]]
+
+
+def stepped(values):
+    values = values.copy()
+    values[15:, 0] += 5e-6
+    values[15:, 2] -= 8e-6
+    return values
+
+
+PLANTED = {
+    "functional point": {"functional_point": (0.0, 0.0, 0.03)},
+    "yaw of the frame (about Z)": {"change": lambda v: np.hstack([v[:, :3] @ turn(0.05).T, v[:, 3:] @ turn(0.05).T])},
+    "sign of EB": {"change": flipped(4)},
+    "EX and EY exchanged": {"change": exchanged},
+    "scale of the displacements": {"change": lambda v: v * [1.06, 1.06, 1.06, 1, 1, 1]},
+    "shift in time": {"start": "2026-03-01T08:01:30+00:00"},
+    "unit of 'probing': urad taken as arcsec": {"change": lambda v: v * ([1] * 3 + [4.8481368] * 3)},
+    "step at 3600 s (something moved)": {"change": stepped},
+}
+
+
+def turn(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_mistake_is_found_and_named(name):
+    rng = np.random.default_rng(5)
+    first = 0
+    for _ in range(5):
+        found = compare(two(rng, **PLANTED[name]))
+        assert found["p"].item() < 0.001
+        first += name in (found["cause"].values[0, 0], *found["alike"].values[0, 0].split("; "))
+    assert first >= 4, found["cause"].values[0].tolist()
+
+
+def test_the_size_of_a_mistake_is_estimated_with_its_uncertainty():
+    rng = np.random.default_rng(6)
+    inside = 0
+    for _ in range(30):
+        found = compare(two(rng, functional_point=(0.0, 0.0, 0.03)))
+        size = {
+            str(n): (v, u)
+            for n, v, u in zip(*(found[k].values[0, 0] for k in ("size_name", "size", "size_u")), strict=True)
+        }
+        value, u = size["Z (m)"]
+        inside += abs(abs(value) - 0.03) <= 2 * u
+    assert inside >= 25
+
+
+def test_a_difference_that_no_cause_explains_says_so():
+    rng = np.random.default_rng(7)
+
+    def noisy(values):
+        return values + 8e-7 * np.random.default_rng(1).normal(size=values.shape)
+
+    found = compare(two(rng, change=noisy))
+    assert found["p"].item() < 1e-6
+    assert found["cause_p"].values[0, 0] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"machine": "gantry"}, "different attributes 'machine' .*'drift': C-frame; 'probing': gantry"),
+        ({"component": "X"}, "different attributes 'component'.*kinematic chain"),
+        ({"frame": "table"}, "different attributes 'frame'.*in_frame"),
+        ({"start": ""}, "'probing': no attribute 'start'"),
+        ({"start": "2026-03-02T08:00:00+00:00"}, "do not overlap in time"),
+        ({"change": lambda v: v * np.nan}, "do not overlap in time|no freedom in common"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_in_words(changed, message):
+    if changed.get("component") == "X":
+        rng = np.random.default_rng(8)
+        pair = {"drift": made(T1, rng), "probing": made(T2, rng, component="X")}
+    else:
+        pair = two(np.random.default_rng(8), **changed)
+    with pytest.raises(DatasetError, match=message):
+        compare(pair)
+
+
+def test_one_dataset_twice_one_alone_and_other_dims_are_refused():
+    rng = np.random.default_rng(9)
+    ds = made(T1, rng)
+    with pytest.raises(DatasetError, match="the same dataset"):
+        compare({"a": ds, "b": ds.copy()})
+    with pytest.raises(DatasetError, match="at least two"):
+        compare({"a": ds})
+    single = ds.em.mean("time")
+    with pytest.raises(DatasetError, match="depend on different things"):
+        compare({"a": ds, "b": single})
+    assert compare({"a": ds, "b": made(T2, rng, start="", name="b")}, same_start=True)["p"].item() > 1e-4
+
+
+def test_three_datasets_have_a_consensus_and_the_wrong_one_is_named():
+    rng = np.random.default_rng(10)
+    found = compare({"a": made(T1, rng), "b": made(T2, rng), "c": made(T2 + 30.0, rng, change=lambda v: v * 1.2)})
+    assert found["misfit_p"].idxmin().item() == "c"
+    assert found["misfit_p"].values[2] < 1e-6
+    assert found.attrs["birge_ratio"] > 2
+    assert found.sizes["pair"] == 3
+
+
+def test_ten_thousand_instants_are_compared_in_seconds():
+    rng = np.random.default_rng(11)
+    t = np.linspace(0, 7200, 10_000)
+    found = compare({"a": made(t, rng), "b": made(t, rng, name="b")}, causes=False)
+    assert found.sizes["time"] == 10_000

@@ -1,0 +1,73 @@
+"""Damaged datasets and calibrations: cut off, or with other content, they are read or refused with a stated error.
+
+Other changes to the bytes of a NetCDF file are the matter of the HDF5 library, which does not bound its time on them.
+"""
+
+from pathlib import Path
+
+import mutants
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.datasets import storage
+from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.datasets.calibrations.pretravel import PretravelMap
+from errormotion.datasets.validation import validate
+from errormotion.errors import ErrormotionError
+
+ROOT = Path(__file__).parents[2]
+CALIBRATION = ROOT / "examples" / "virtual_beam" / "calibrations" / "lk-h050.nc"
+
+
+@pytest.mark.parametrize("reader", [InclinationCalibration, PretravelMap])
+def test_damaged_calibrations(tmp_path: Path, reader: type) -> None:
+    path = tmp_path / "calibration.nc"
+    data = CALIBRATION.read_bytes()
+
+    def read(each: bytes) -> None:
+        path.write_bytes(each)
+        if each != data or reader is InclinationCalibration:
+            reader.load(path)
+
+    mutants.check(read, data, seed=1, number=mutants.count(30), changes=(mutants.cut,))
+
+
+def test_damaged_raw_datasets(tmp_path: Path) -> None:
+    path = tmp_path / "raw.nc"
+    raw = xr.Dataset(
+        {
+            "displacement": (("station", "target"), np.ones((2, 3)), {"units": "m"}),
+            "target_nominal": (("target", "direction"), np.ones((3, 3)), {"units": "m"}),
+            "displacement_noise": ((), 1e-6, {"units": "m"}),
+        },
+        {"station": ["S1", "S2"], "target": [1, 2, 3], "direction": list("xyz")},
+        {"schema": "errormotion.raw.multilateration/1"},
+    )
+    storage.save(raw, path)
+    data = path.read_bytes()
+
+    def read(each: bytes) -> None:
+        path.write_bytes(each)
+        with storage.load(path) as found, storage.reading(path):
+            validate(found)
+
+    mutants.check(read, data, seed=2, number=mutants.count(60), changes=(mutants.cut,))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e308, 1e-320, 0.0, -1.0, 1e30])
+def test_calibrations_with_other_numbers(tmp_path: Path, value: float) -> None:
+    with storage.load(CALIBRATION) as found:
+        good = found.load()
+    rng = np.random.default_rng(3)
+    for name, variable in good.variables.items():
+        if variable.dtype.kind != "f":
+            continue
+        values = variable.values.copy()
+        values.flat[rng.integers(values.size)] = value
+        changed = good.assign({name: (variable.dims, values, variable.attrs)})
+        changed.to_netcdf(tmp_path / "calibration.nc", engine="h5netcdf")
+        try:
+            InclinationCalibration.load(tmp_path / "calibration.nc")
+        except ErrormotionError:
+            continue
