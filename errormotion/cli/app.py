@@ -245,6 +245,38 @@ def program(
 
 @app.command()
 @guarded
+def record(
+    bench: Annotated[Path, typer.Argument(help="A bench file.")],
+    instrument: Annotated[str, typer.Argument(help="The name of one of its instruments.")],
+    for_: Annotated[str, typer.Option("--for", metavar="TIME", help="Duration of the session.")] = "10 s",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The recording to write; default: INSTRUMENT-TIME.rec.")
+    ] = None,
+    mask_serial: Annotated[bool, typer.Option("--mask-serial", help="Mask the serial number.")] = False,
+    json_: Json = False,
+) -> None:
+    """Record a short session with one instrument: identity, readings, stream."""
+    from errormotion.cli.commands import record as command
+
+    if not command.record(bench, instrument, for_, out, mask_serial, json_):
+        raise typer.Exit(ERROR)
+
+
+@app.command()
+@guarded
+def replay(
+    recording: Annotated[Path, typer.Argument(help="A recording that 'errormotion record' has made.")],
+    json_: Json = False,
+) -> None:
+    """Run the driver on a recorded session, and report whether it was reproduced."""
+    from errormotion.cli.commands import record as command
+
+    if not command.replay(recording, json_):
+        raise typer.Exit(INVALID)
+
+
+@app.command()
+@guarded
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
@@ -350,12 +382,15 @@ def plugins_show(plugin: Annotated[str, typer.Argument(help="Its id.")], json_: 
 def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
+    mutants: Annotated[
+        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Run the conformance kit on a plugin."""
     from errormotion.cli.commands import plugins as command
 
-    if not command.check_plugin(plugin, address, json_):
+    if not command.check_plugin(plugin, address, mutants, json_):
         raise typer.Exit(INVALID)
 
 

@@ -26,7 +26,7 @@ from errormotion.plugins import (
     kind_registry,
     load_object,
 )
-from errormotion.testing import wire_checks
+from errormotion.testing import fuzz_checks, wire_checks
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.sessions import Session, first_blocks, leaves, numbers, open_things, require_same, run_session
 
@@ -328,6 +328,9 @@ def record_and_replay(subject: InstrumentSubject) -> str:
         gone = run_session(subject, address=f"replay://{record}")
         require(isinstance(gone.error, InstrumentError), f"without its recording the replay gave {gone.summary}")
     return f"{original.stream.size + original.read.size} values alike"
+
+
+INSTRUMENT_CHECKS.add(limit=90.0, why_not=fuzz_checks.no_mutants)(fuzz_checks.mutants)
 
 
 @INSTRUMENT_CHECKS.add()

@@ -14,7 +14,9 @@ from errormotion.testing.kit import Check, CheckResult, run_check
 SIMULATED = "sim://cframe?seed=3"
 
 
-def check_plugin(group: Group, plugin_id: str, *, address: str | None = None) -> list[CheckResult]:
+def check_plugin(
+    group: Group, plugin_id: str, *, address: str | None = None, mutants: int | None = None
+) -> list[CheckResult]:
     """Run every check on one plugin of the registry.
 
     Parameters
@@ -23,6 +25,8 @@ def check_plugin(group: Group, plugin_id: str, *, address: str | None = None) ->
     plugin_id : str
     address : str, optional
         Where to find the instrument; default: its own simulator.
+    mutants : int, optional
+        How many changed frames an instrument has to stand; default: as its subject states.
 
     Returns
     -------
@@ -36,6 +40,8 @@ def check_plugin(group: Group, plugin_id: str, *, address: str | None = None) ->
     """
     results = []
     for subject in subjects_of(group, plugin_id, address=address):
+        if mutants is not None and isinstance(subject, InstrumentSubject):
+            subject = replace(subject, mutants=mutants)
         for result in run_checks(subject):
             results.append(replace(result, name=f"{result.name}[{subject.name}]") if subject.name else result)
     return results

@@ -104,7 +104,7 @@ def _require_in_step(sound: list[Reading], late: list[Reading], how: str) -> str
         return f"{how}: no error"
     first = late.index(errors[0])
     after = [reading for reading in late[first:] if not isinstance(reading, Exception)]
-    if first + 1 >= len(sound) or _same(sound[first], sound[first + 1]):
+    if first >= len(sound) or sum(_same(sound[first], reading) for reading in sound) != 1:
         return f"{how}: {type(errors[0]).__name__}, then {len(after)} readings; equal ones, whose order is not seen"
     require(
         not any(_same(reading, sound[first]) for reading in after),

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from pydantic import Field
 
@@ -96,6 +97,19 @@ class HasItsOwnBaudrate(Dial):
         return open_transport(self.address, simulator=simulator, recorder=self._record, timeout=limit)
 
 
+class RaisesValueErrors(Dial):
+    def read(self) -> float:
+        return float(self.ask("R"))
+
+
+class TakesAnySize(Dial):
+    """Takes what the device says for the size of an array."""
+
+    def read(self) -> float:
+        value = super().read()
+        return value if abs(value) < 1.0 else float(np.ones(int(min(abs(value), 1e8))).sum())
+
+
 class AsksTwice(Dial):
     """Opens with a request: a silent device is noticed."""
 
@@ -118,10 +132,13 @@ class WithItsOwnBaudrate(HasItsOwnBaudrate, AsksTwice):
         ("late_answers", DiscardsWhatIsThereOnly),
         ("time_limit", WithItsOwnTimeLimit),
         ("baudrate", WithItsOwnBaudrate),
+        ("mutants", RaisesValueErrors),
+        ("mutants", TakesAnySize),
     ],
 )
 def test_a_broken_driver_fails_exactly_its_check(check: str, plugin: type[Dial]) -> None:
-    failed = {result.name for result in run_checks(InstrumentSubject(plugin, ADDRESS)) if not result.ok}
+    subject = InstrumentSubject(plugin, ADDRESS, mutants=100 if check == "mutants" else 0)
+    failed = {result.name for result in run_checks(subject) if not result.ok}
     assert failed == {check}
 
 

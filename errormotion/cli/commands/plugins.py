@@ -68,11 +68,11 @@ def _default(field: FieldInfo) -> str:
     return textwrap.shorten("-" if default is None else str(default), 30, placeholder=" ...")
 
 
-def check_plugin(plugin_id: str, address: str | None, as_json: bool) -> bool:
+def check_plugin(plugin_id: str, address: str | None, mutants: int | None, as_json: bool) -> bool:
     """Run the conformance kit on a plugin, print each check, and return whether all passed."""
     from errormotion import testing
 
-    results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address)
+    results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants)
     good = all(result.ok for result in results)
     if as_json:
         show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})

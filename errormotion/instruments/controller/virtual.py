@@ -42,7 +42,7 @@ def decode_answer(line: bytes, number: int) -> Any:
         answer = json.loads(line)
         matches, ok = answer["id"] == number, answer["ok"]
         content = answer["result"] if ok else answer["error"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise ProtocolError(f"Expected an answer in JSON to request {number}; found {line[:200]!r}") from None
     if not matches:
         raise ProtocolError(f"Expected the answer to request {number}; found {line[:200]!r}")
@@ -104,7 +104,7 @@ class VirtualController(Driver):
 
     def identify(self) -> Identity:
         """Request the identity of the controller."""
-        facts = self._call("identify")
+        facts = self._facts("identify", "manufacturer", "model", "serial_number")
         return Identity(
             manufacturer=str(facts["manufacturer"]),
             model=str(facts["model"]),
@@ -135,7 +135,7 @@ class VirtualController(Driver):
         ``tool``, ``stepping`` (whether a step program waits or runs); ``target`` where one is set (``kind``, and of a
         plane ``inclination`` and ``rotation``, rad).
         """
-        return dict(self._call("state"))
+        return self._facts("state", "time", "position", "running")
 
     def mount(self, tool: str) -> None:
         """Put ``"bar"``, ``"sphere"`` or ``"probe"`` into the spindle.
@@ -192,16 +192,15 @@ class VirtualController(Driver):
         dict
             ``duration`` of the motion and ``longest_lead_in`` before it, s.
         """
-        return dict(
-            self._call(
-                "run_steps",
-                start=[float(x) for x in start],
-                direction=[float(x) for x in direction],
-                step=float(step),
-                count=int(count),
-                dwell=float(dwell),
-                travel=float(travel),
-            )
+        return self._facts(
+            "run_steps",
+            "duration",
+            start=[float(x) for x in start],
+            direction=[float(x) for x in direction],
+            step=float(step),
+            count=int(count),
+            dwell=float(dwell),
+            travel=float(travel),
         )
 
     def run_program(self, text: str) -> dict[str, Any]:
@@ -228,7 +227,7 @@ class VirtualController(Driver):
             Another program runs, a word is unknown or a position out of travel: nothing moves, and the message
             names the line.
         """
-        return dict(self._call("run_program", text=str(text)))
+        return self._facts("run_program", "duration", text=str(text))
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
         """Move the axes in a straight line.
@@ -254,7 +253,7 @@ class VirtualController(Driver):
             The position is out of travel, or another motion runs: nothing moves.
         """
         goal = [float(x) for x in position]
-        return dict(self._call("move_to", position=goal, feed=None if feed is None else float(feed)))
+        return self._facts("move_to", "duration", position=goal, feed=None if feed is None else float(feed))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move the touch probe in a straight line until it trips; the machine then rests there, or at the target.
@@ -277,8 +276,13 @@ class VirtualController(Driver):
             The probe is tripped before it moves, the spindle turns, the target is out of travel, alarm or emergency
             stop: nothing moves.
         """
-        found = dict(self._call("probe", target=[float(x) for x in target], feed=float(feed)))
-        return {**found, "position": None if found["position"] is None else [float(x) for x in found["position"]]}
+        goal = [float(x) for x in target]
+        found = self._facts("probe", "tripped", "position", "time", target=goal, feed=float(feed))
+        try:
+            position = None if found["position"] is None else [float(x) for x in found["position"]]
+        except (TypeError, ValueError):
+            raise ProtocolError(f"Expected a position; found {str(found['position'])[:200]}") from None
+        return {**found, "position": position}
 
     def spindle(self, speed: float) -> None:
         """Turn the spindle at a speed in 1/min from now on; 0 stops it.
@@ -329,6 +333,14 @@ class VirtualController(Driver):
             No tracker is open, or a sensor streams.
         """
         self._call("set_station", position=[float(x) for x in position])
+
+    def _facts(self, op: str, *needed: str, **arguments: Any) -> dict[str, Any]:
+        """Return the result of a request, a mapping that has the needed keys."""
+        found = self._call(op, **arguments)
+        if not isinstance(found, dict) or (missing := [key for key in needed if key not in found]):
+            what = ", ".join(missing) if isinstance(found, dict) else "everything"
+            raise ProtocolError(f"The answer to '{op}' lacks {what}; found {str(found)[:200]}")
+        return found
 
     def _call(self, op: str, **arguments: Any) -> Any:
         with self.exchange() as line:

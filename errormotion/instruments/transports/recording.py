@@ -11,18 +11,24 @@ A recording is a text file: a header line with the address, then one line per fr
 bytes in hexadecimal. The checksum is the CRC-32 of direction and bytes, chained over all frames: changed bytes and
 missing or moved frames are detected.
 
+After the header there may be a line ``NOTE`` with a JSON object, which states the instrument and what was done with it;
+the format is then ``errormotion-session/2``.
+
 In playback each write must be the next recorded one, byte for byte; a frame that followed a write is returned only
 after that write; and at the end no frame may remain. Everything else is a `ReplayError`.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, ClassVar
 from zlib import crc32
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
@@ -30,6 +36,13 @@ from errormotion.instruments.transports.base import Transport
 
 FORMAT = "errormotion-session/1"
 INDEX_FORMAT = "errormotion-sessions/1"
+WITH_NOTE = {FORMAT: "errormotion-session/2", INDEX_FORMAT: "errormotion-sessions/2"}
+NOTE = "NOTE "
+MOST_NOTE_BYTES = 1 << 20
+
+
+class EndOfRecordingError(ReplayError):
+    """The driver reads after the end of the recording."""
 
 
 class Recorder:
@@ -41,7 +54,9 @@ class Recorder:
         self._frames = 0
         self._lock = threading.Lock()
         try:
-            self._file = Path(path).open("x", encoding="ascii", errors="backslashreplace")  # noqa: SIM115 - kept open
+            self._file = Path(path).open(  # noqa: SIM115 - kept open
+                "x", buffering=1, encoding="ascii", errors="backslashreplace"
+            )
         except FileExistsError:
             raise InstrumentError(f"The recording {path} exists already; choose another file or remove it") from None
         except OSError as error:
@@ -114,13 +129,14 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
     except UnicodeDecodeError as error:
         raise ReplayError(f"{path} is not a recording, or is damaged: byte {error.start} is not ASCII") from None
     head = lines[0].split(" ", 2) if lines else []
-    if len(head) != 3 or head[0] != FORMAT:
+    if len(head) != 3 or head[0] != (WITH_NOTE[FORMAT] if _has_note(lines) else FORMAT):
         raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
+    first = 1 + _has_note(lines)
     if len(lines) < 2 or not lines[-1].startswith("END "):
         raise ReplayError(f"The recording {path} is cut off: its last line should start with 'END'; record it again")
     frames: list[tuple[str, bytes]] = []
     crc = 0
-    for number, line in enumerate(lines[1:-1], start=2):
+    for number, line in enumerate(lines[first:-1], start=first + 1):
         try:
             direction, _, check, text = line.split(" ")
             data = bytes.fromhex(text)
@@ -137,7 +153,16 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
 
 
 class ReplayTransport(Transport):
-    """Plays a recorded session back; see the module for the conditions."""
+    """Plays a recorded session back; see the module for the conditions.
+
+    Attributes
+    ----------
+    longest_wait : float
+        Longest time for which a read waits for a write, s. Where bytes were changed on purpose, it is short: an answer
+        that is missing does not come.
+    """
+
+    longest_wait: ClassVar[float] = math.inf
 
     def __init__(self, path: Path, *, timeout: float = 1.0) -> None:
         super().__init__(f"replay://{path}", timeout)
@@ -177,8 +202,8 @@ class ReplayTransport(Transport):
             if self._closed:
                 raise InstrumentError(f"The recording {self.url} is closed")
             if not self._reads:
-                raise ReplayError(f"{self.url}: the driver reads after the end of the recording")
-            if not self._change.wait_for(lambda: self._closed or self._reads[0][0] <= self._written, timeout):
+                raise EndOfRecordingError(f"{self.url}: the driver reads after the end of the recording")
+            if not self._change.wait_for(self._readable, min(timeout, self.longest_wait)):
                 raise InstrumentTimeoutError(f"{self.url}: no data before the driver has written {self._writes[0]!r}")
             if self._closed:
                 raise InstrumentError(f"The recording {self.url} is closed")
@@ -186,6 +211,9 @@ class ReplayTransport(Transport):
             if len(data) > max_bytes:
                 self._reads.appendleft((before, data[max_bytes:]))
             return data[:max_bytes]
+
+    def _readable(self) -> bool:
+        return self._closed or self._reads[0][0] <= self._written
 
     def close(self) -> None:
         """Close; idempotent.
@@ -229,10 +257,64 @@ def read_index(path: Path) -> dict[str, Path]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
-    pairs = [line.partition(" ") for line in lines[1:]]
-    if not lines or lines[0] != INDEX_FORMAT or not all(name for _, _, name in pairs):
+    pairs = [line.partition(" ") for line in lines[1 + _has_note(lines) :]]
+    expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
+    if not lines or lines[0] != expected or not all(name and Path(name).name == name for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
     try:
         return {part: path.with_name(name) for part, _, name in pairs}
     except ValueError:
         raise ReplayError(f"{path}: expected names of files beside the list; found a path") from None
+
+
+def parts_of(path: Path, levels: int = 2) -> list[Path]:
+    """Return the files of a recording that have frames: itself, or those that it names, and those that these name."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            word = file.readline(MOST_NOTE_BYTES).split(" ")[0].strip()
+    except OSError as error:
+        raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
+    if word not in (INDEX_FORMAT, WITH_NOTE[INDEX_FORMAT]) or not levels:
+        return [path]
+    return [found for part in read_index(path).values() for found in parts_of(part, levels - 1)]
+
+
+def add_note(path: Path, note: Mapping[str, Any]) -> None:
+    """Write a note into a recording, or a list of recordings; it replaces an earlier one."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    word, _, rest = lines[0].partition(" ")
+    word = WITH_NOTE.get(word, word)
+    text = NOTE + json.dumps(note, allow_nan=False)
+    if len(text) > MOST_NOTE_BYTES:
+        raise InstrumentError(f"The note of the recording {path} has {len(text)} bytes; at most {MOST_NOTE_BYTES}")
+    head = f"{word} {rest}".rstrip()
+    path.write_text("\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n", encoding="utf-8")
+
+
+def read_note(path: Path) -> dict[str, Any] | None:
+    """Return the note of a recording; None without one. ReplayError where it cannot be read."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            file.readline(MOST_NOTE_BYTES)
+            line = file.readline(MOST_NOTE_BYTES)
+        note = json.loads(line.removeprefix(NOTE)) if line.startswith(NOTE) else None
+    except (OSError, ValueError, RecursionError) as error:
+        raise ReplayError(f"The note of the recording {path} cannot be read: {error}") from None
+    if note is not None and not isinstance(note, dict):
+        raise ReplayError(f"The note of the recording {path} is no JSON object")
+    return note
+
+
+def _has_note(lines: Sequence[str]) -> bool:
+    return len(lines) > 1 and lines[1].startswith(NOTE)
+
+
+def rewrite(path: Path, frames: Sequence[tuple[str, bytes]]) -> None:
+    """Replace the frames of a recording by others of the same number; address, times and note stay."""
+    lines = path.read_text(encoding="ascii").splitlines()
+    first = 1 + _has_note(lines)
+    crc, changed = 0, lines[:first]
+    for line, (direction, data) in zip(lines[first:-1], frames, strict=True):
+        crc = crc32(direction.encode() + data, crc)
+        changed.append(f"{direction} {line.split(' ')[1]} {crc:08x} {data.hex()}")
+    path.write_text("\n".join([*changed, f"END {len(frames)} {crc:08x}"]) + "\n", encoding="ascii")

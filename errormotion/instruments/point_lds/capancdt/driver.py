@@ -149,6 +149,8 @@ class CapaNCDT(Driver):
         if self._streaming:
             raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
         block = self._requested_block()
+        if not block.intact:
+            raise ProtocolError(f"{self.address}: the block of a reading broke off, or stray bytes follow; read again")
         values, codes = scale(column(block, self.settings.channel)[-1:], channel.offset, channel.measuring_range)
         self.no_value = REASONS[int(codes[0])]
         self._data.report_delivered(1)

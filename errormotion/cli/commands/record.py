@@ -1,0 +1,187 @@
+"""``errormotion record`` and ``errormotion replay``: a short session with an instrument, and the driver on it again."""
+
+from __future__ import annotations
+
+import glob
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from errormotion import __version__, plugins
+from errormotion.campaign.files import BenchInstrument, load_bench
+from errormotion.cli.output import show, show_json
+from errormotion.datasets.units import TIME
+from errormotion.errors import BenchError, InstrumentError, ReplayError
+from errormotion.instruments.sessions.masking import holds, mask, words_of
+from errormotion.instruments.sessions.session import Session, differences, live, repeated
+from errormotion.instruments.simulators.virtual_world.described import describe
+from errormotion.instruments.transports.recording import add_note, parts_of, read_note, read_recording
+
+LONGEST = 3600.0
+"""Longest session, s."""
+MOST_BYTES = 50_000_000
+"""Size of the recording at which a session ends."""
+LARGEST_REPLAY = 10 * MOST_BYTES
+
+
+def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial: bool, as_json: bool) -> bool:
+    """Record a session, print where, and return whether it went without an error."""
+    seconds = _seconds(duration)
+    instrument = _instrument(bench, name)
+    path = out or Path(f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}.rec")
+    if path.exists():
+        raise InstrumentError(f"The recording {path} exists already; choose another file or remove it")
+    early: dict[Path, int] = {}  # frames until the identity was known
+    session = live(
+        instrument.driver(instrument.address, instrument.settings, record=path),
+        seconds,
+        lambda: sum(each.stat().st_size for each in _files(path)) > MOST_BYTES,
+        lambda: early.update({each: len(each.read_bytes().splitlines()) - 1 for each in _files(path)}),
+    )
+    if not path.is_file():
+        raise InstrumentError(session.message or f"The instrument '{name}' recorded nothing")
+    note = _note(instrument, session)
+    add_note(path, note)
+    if mask_serial:
+        _mask(path, session, early)
+    files = [path, *(part for part in parts_of(path) if part != path)]
+    if as_json:
+        found = read_note(path)
+        show_json({"ok": not session.step, "files": [str(each) for each in files], "note": found})
+        return not session.step
+    if session.step:
+        show(f"The session ended in the step '{session.step}' with {session.error}: {session.message}")
+    frames, size = sum(len(read_recording(part)[1]) for part in parts_of(path)), sum(f.stat().st_size for f in files)
+    show(f"{frames} frames, {size / 1e3:.0f} kB, {session.readings.count} readings, {session.stream.count} blocks:")
+    for each in files:
+        show(f"  {each}")
+    return not session.step
+
+
+def replay(path: Path, as_json: bool) -> bool:
+    """Run the driver on a recording, print what it read, and return whether the session was reproduced."""
+    if (size := sum(part.stat().st_size for part in {path, *parts_of(path)})) > LARGEST_REPLAY:
+        raise ReplayError(
+            f"The recording {path} has {size / 1e6:.0f} MB; expected at most {LARGEST_REPLAY / 1e6:.0f} MB"
+        )
+    note, session, found = _played(path)
+    frames = sum(len(read_recording(part)[1]) for part in parts_of(path))
+    if as_json:
+        about = {name: note.get(name) for name in ("plugin", "plugin_version", "distribution", "errormotion", "masked")}
+        show_json(
+            {
+                "ok": not found,
+                "file": str(path),
+                "frames": frames,
+                "reproduced": not found,
+                "differences": found,
+                **about,
+                **session.record(),
+            }
+        )
+        return not found
+    identity = session.identity
+    who = " ".join(str(identity.get(key, "")) for key in ("manufacturer", "model", "serial_number", "firmware"))
+    show(f"{note['plugin']} {note.get('plugin_version', '')}: {who.strip() or 'no identity'}")
+    show(f"recorded with errormotion {note.get('errormotion', '?')}, {note.get('distribution', '?')}")
+    for name, summary in (("reading", session.readings), ("block of the stream", session.stream)):
+        if summary.count:
+            show(
+                f"{summary.count} x {name}: {summary.values} values, {summary.unknown} unknown, {summary.dropped} lost"
+            )
+            show(f"  first {_short(summary.first)}, last {_short(summary.last)}")
+    if session.step and not found:
+        show(f"As in the recording, the session ends in the step '{session.step}' with an error: {session.message}")
+    show(f"{frames} frames: " + ("reproduced frame by frame" if not found else "NOT reproduced"))
+    for difference in found:
+        show(f"  - {difference}")
+    return not found
+
+
+def _played(path: Path) -> tuple[dict[str, Any], Session, list[str]]:
+    note = read_note(path)
+    if note is None or "session" not in note or "plugin" not in note:
+        raise ReplayError(
+            f"The recording {path} states no instrument: it was not made by 'errormotion record'. Open replay://{path} "
+            "with its driver instead"
+        )
+    cls = plugins.get("instruments", str(note["plugin"]))
+    try:
+        settings = cls.Settings.model_validate(note.get("settings"))
+    except ValidationError as error:
+        raise ReplayError(
+            f"The settings in the recording {path} are not those of '{note['plugin']}': {error}"
+        ) from None
+    session = repeated(cls(f"replay://{path}", settings), note["session"])
+    return note, session, differences(note["session"], session)
+
+
+def _note(instrument: BenchInstrument, session: Session) -> dict[str, Any]:
+    info = instrument.driver.info
+    found = [plugin for plugin in plugins.available("instruments") if plugin.id == info.id]
+    return {
+        "plugin": info.id,
+        "plugin_version": info.version,
+        "kind": info.kind,
+        "status": info.status,
+        "distribution": found[0].distribution if found else "",
+        "errormotion": __version__,
+        "settings": json.loads(instrument.settings.model_dump_json()),
+        "masked": False,
+        "session": session.record(),
+    }
+
+
+def _mask(path: Path, session: Session, early: dict[Path, int]) -> None:
+    """Mask the serial number; remove the recording where that fails: it must not be sent by mistake."""
+    try:
+        if not session.identity:
+            raise InstrumentError("The instrument has stated no serial number")
+        words = words_of(str(session.identity["serial_number"]))
+        mask(path, words, early)
+        add_note(path, (read_note(path) or {}) | {"masked": True})
+        found = _played(path)[2]
+        if found:
+            raise InstrumentError(f"The masked recording does not replay ({found[0]})")
+        if holds(path, words):
+            raise InstrumentError("The serial number still stands in the masked recording")
+    except InstrumentError as error:
+        for each in {path, *parts_of(path)}:
+            each.unlink(missing_ok=True)
+        raise InstrumentError(
+            f"{error}. The recording was removed. Record without --mask-serial, and send it only to whom may know the "
+            "serial number"
+        ) from None
+
+
+def _instrument(bench: Path, name: str) -> BenchInstrument:
+    plan = load_bench(bench)
+    describe(plan.description)
+    found = [each for each in plan.instruments if each.name == name]
+    if not found:
+        names = ", ".join(each.name for each in plan.instruments)
+        raise BenchError(f"{bench}: no instrument '{name}'; there are: {names}")
+    return found[0]
+
+
+def _seconds(duration: str) -> float:
+    try:
+        value = TIME.parse(duration)
+    except ValueError as error:
+        raise BenchError(f"--for: {error}") from None
+    if not 0 < value <= LONGEST:
+        raise BenchError(f"--for: expected more than 0 s and at most {LONGEST:g} s; found '{duration}'")
+    return value
+
+
+def _files(path: Path) -> set[Path]:
+    """Return the files of a recording that is being written."""
+    parts = path.parent.glob(f"{glob.escape(path.stem)}.*{glob.escape(path.suffix)}")
+    return {each for each in (path, *parts) if each.is_file()}
+
+
+def _short(values: tuple[float | None, ...]) -> str:
+    return ", ".join("unknown" if value is None else f"{value:.6g}" for value in values)

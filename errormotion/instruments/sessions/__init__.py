@@ -1,0 +1,1 @@
+"""Short sessions with an instrument: recorded with what was read, repeated from the recording, and compared."""

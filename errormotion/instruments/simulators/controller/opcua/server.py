@@ -1,0 +1,207 @@
+"""The simulated server: a virtual machine, an address space, and the thread that serves it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Coroutine
+from dataclasses import replace
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+import numpy as np
+from asyncua import ua
+from asyncua.ua.attribute_ids import AttributeIds
+
+from errormotion.errors import InstrumentError
+from errormotion.instruments.simulators.controller.opcua import cnc, sinumerik
+from errormotion.instruments.simulators.controller.opcua.listening import FaultyServer, Outgoing
+from errormotion.instruments.simulators.controller.opcua.machine import Machine
+from errormotion.instruments.simulators.controller.opcua.space import UA, Attributes, Ids, SmallServer, Space
+from errormotion.instruments.simulators.controller.opcua.space import number as numeric
+from errormotion.instruments.simulators.device import DEFAULT_MACHINE
+from errormotion.instruments.simulators.faults import parse_fault
+from errormotion.instruments.simulators.virtual_world.world import world
+from errormotion.instruments.transports import Address
+from errormotion.instruments.transports.serving import listening_at, not_listening, reachable_at
+
+STYLES = ("cnc", "sinumerik")
+UNITS = ("model", "ua")
+REFRESH = 0.05
+"""Time between two looks at the machine for subscriptions, s."""
+Result = TypeVar("Result")
+
+
+class SimulatedServer:
+    """An OPC UA server whose machine is the virtual one; the parameters of its address are those of this package.
+
+    Attributes
+    ----------
+    url : str
+        Address for the client.
+
+    Raises
+    ------
+    InstrumentError
+        Unknown style, units or fault, or it cannot listen.
+    """
+
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "unavailable", "restart")
+
+    def __init__(self, address: Address) -> None:
+        self.fault = parse_fault(address, self.faults)
+        self._style, self._units = address.params.get("style", "cnc"), address.params.get("units", "model")
+        if self._style not in STYLES or self._units not in UNITS:
+            raise InstrumentError(
+                f"'{address.url}': expected 'style' one of {', '.join(STYLES)}, 'units' one of {', '.join(UNITS)}; "
+                f"found '{self._style}', '{self._units}'"
+            )
+        seed = int(address.number("seed", 0))
+        rng = np.random.default_rng([abs(seed), *b"opcua"])
+        self._seed = seed
+        self._path = address.path or "errormotion"
+        self._outgoing = Outgoing(self.fault, rng, self._restart)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._server: FaultyServer | None = None
+        self._refreshing: asyncio.Task[None] | None = None
+        self._host, self._port = listening_at()
+        self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
+        self.world.attach(self, address.number("pace", 0.0) or None)
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what a client does wrong is no concern of the user
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="sim-opcua", daemon=True)
+        self._thread.start()
+        try:
+            if moment := address.number("clock", 0.0):
+                self.world.tick(moment)
+            self._machine = Machine(self.world, self._unavailable)
+            try:
+                self._run(self._start())
+            except OSError as error:
+                raise not_listening(self._host, self._port, error) from None
+        except BaseException:
+            self.close()
+            raise
+        self.url = f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}"
+
+    def close(self) -> None:
+        """End the server; with the last device of its world the world ends. Idempotent."""
+        with self._lock:
+            closed, self._closed = self._closed, True
+        if closed:
+            return
+        self._run(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+        self.world.detach(self)
+
+    def report_delivered(self, samples: int) -> None:
+        """Take no note: a server follows the world's clock and never drives it."""
+
+    # ------------------------------------------------------------------ in the thread of the server
+
+    def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    def _unavailable(self) -> bool:
+        return self.fault.kind == "unavailable" and self._outgoing.reached
+
+    async def _start(self) -> None:
+        """Start a server at the port of the last one, with an address space of its own."""
+        inner = SmallServer()
+        inner.disabled_clock = True  # the time is read at each request
+        inner.allow_remote_admin = False
+        server = FaultyServer(inner)
+        server.outgoing = self._outgoing
+        server.name = "errormotion"
+        server.socket_address = self._host, self._port
+        server.set_endpoint(f"opc.tcp://{reachable_at(self._host, self._port)}/{self._path}")
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        await server.init()
+        release = version("errormotion")
+        await server.set_build_info(
+            "urn:errormotion", "errormotion", "simulated control", release, "0", self._machine.time
+        )
+        await server.set_application_uri(f"urn:errormotion:{self.world.name}:{self._seed}")
+        space = Space(inner)
+        further = await self._fill(server, space)
+        inner.attribute_service = Attributes(inner.aspace, self._machine.refresh, further)
+        await server.start()
+        self._server = server
+        self._port = server.port
+        await self._add_clock(server, space)
+        self._refreshing = asyncio.create_task(self._refresh(inner))
+
+    async def _fill(self, server: FaultyServer, space: Space) -> Any:
+        """Add the nodes of the style; return what reads nodes that are not in the space."""
+        if self._style == "sinumerik":
+            await server.register_namespace(sinumerik.NAMESPACE)
+            sinumerik.add(space, self._machine)
+            return lambda node: sinumerik.value(self._machine, node)
+        own = await server.register_namespace("urn:errormotion:machine")
+        model = await server.register_namespace(cnc.NAMESPACE)
+        texts = {
+            "VendorName": "errormotion",
+            "CncTypeName": f"virtual {self.world.name}",
+            "VendorRevision": version("errormotion"),
+            "Version": cnc.VERSION,
+            "Fix": f"seed {self._seed}",
+        }
+        cnc.Model(space, self._machine, own, model, UA if self._units == "ua" else model).add(texts)
+        return None
+
+    async def _add_clock(self, server: FaultyServer, space: Space) -> None:
+        """Have the server show the time of the world as its own."""
+        started = self._machine.time
+        ids = (Ids.Server_ServerStatus, Ids.Server_ServerStatus_StartTime, Ids.Server_ServerStatus_CurrentTime)
+        whole, start, now = (numeric(each) for each in ids)
+        shown = await server.get_node(whole).read_value()
+
+        def status() -> ua.DataValue:
+            present = replace(shown, StartTime=started, CurrentTime=self._machine.time)
+            return ua.DataValue(ua.Variant(present, ua.VariantType.ExtensionObject))
+
+        space.live(whole, status)
+        space.live(start, lambda: ua.DataValue(ua.Variant(started, ua.VariantType.DateTime)))
+        space.live(now, self._machine.clock)
+
+    async def _refresh(self, inner: SmallServer) -> None:
+        """Report the values of nodes that clients have subscribed to."""
+        while True:
+            await asyncio.sleep(REFRESH)
+            if not inner.subscription_service.subscriptions:
+                continue
+            self._machine.refresh()
+            for node in list(inner.aspace.keys()):
+                held = inner.aspace[node].attributes.get(AttributeIds.Value)
+                if held is None or held.value_callback is None:
+                    continue
+                for handle, report in list(held.datachange_callbacks.items()):
+                    await report(handle, held.value_callback(node, AttributeIds.Value))
+
+    def _restart(self) -> None:
+        """Go and come back: sessions and subscriptions are forgotten."""
+        self._restarting = asyncio.create_task(self._again())
+
+    async def _again(self) -> None:
+        await self._stop()
+        await self._start()
+
+    async def _stop(self) -> None:
+        if self._refreshing is not None:
+            self._refreshing.cancel()
+        server, self._server = self._server, None
+        if server is not None:
+            await server.stop()
+
+    async def _end(self) -> None:
+        """Stop the server and everything that still runs in this thread."""
+        await self._stop()
+        running = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+        await asyncio.get_running_loop().shutdown_default_executor()
