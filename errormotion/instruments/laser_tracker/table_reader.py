@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -48,6 +49,9 @@ QUANTITIES: Mapping[str, Quantity] = {
 }
 KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker",), "target": ("point",)}
 AIR = ("temperature", "pressure", "humidity")
+
+LONGEST_TABLE = 1 << 24
+"""Longest table, bytes."""
 
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
@@ -103,6 +107,9 @@ def read_table(
     DatasetError
         The file cannot be read; or all mistakes in it, with line, column, expected and found value.
     """
+    with suppress(OSError):  # stated by what follows
+        if (size := path.stat().st_size) > LONGEST_TABLE:
+            raise DatasetError(f"{path}: expected a table of at most {LONGEST_TABLE} bytes; found {size}")
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]

@@ -11,6 +11,8 @@ from typing import Any
 from errormotion.errors import InstrumentError, ProtocolError
 
 LINE_END = b"\n"
+LONGEST_LINE = 1 << 16
+"""Longest line of the bridge, bytes."""
 MODES = ("manual", "mdi", "automatic", "")
 
 
