@@ -13,10 +13,12 @@ from errormotion.errors import ErrormotionError
 
 SLOWEST = 10e-3
 """Limit of one frame, s of CPU time."""
+SLOWEST_PIECE = 50e-3
+"""Limit of bytes that were lengthened: a piece as a connection delivers it, with up to some thousand frames, s."""
 REPEATS = 5
 """A frame above the limit is read again so many times: what else the process does is no time of the codec."""
 LENGTHENED = 50
-"""Every so manieth mutant is made as long as the longest frame."""
+"""Every so manieth mutant is made as long as the longest frame, or as a piece that a connection delivers."""
 SAMPLED = 200
 """The memory of every so manieth mutant is measured."""
 SHOWN = 5
@@ -67,10 +69,10 @@ class Found:
     ----------
     frames, lengthened : int
         Number of mutants, and of those as long as the longest frame.
-    slowest : float
-        Longest CPU time of one frame, s.
-    size : int
-        Length of this frame, bytes.
+    slowest, slowest_piece : float
+        Longest CPU time of one frame, and of one that was lengthened, s.
+    size, size_piece : int
+        Length of these, bytes.
     memory : int
         Largest memory while one of the sampled frames was read, bytes.
     sampled : int
@@ -85,6 +87,8 @@ class Found:
     lengthened: int = 0
     slowest: float = 0.0
     size: int = 0
+    slowest_piece: float = 0.0
+    size_piece: int = 0
     memory: int = 0
     sampled: int = 0
     errors: Counter[str] = field(default_factory=Counter)
@@ -92,11 +96,14 @@ class Found:
 
     def __add__(self, other: "Found") -> "Found":
         slower = max(self, other, key=lambda found: found.slowest)
+        slower_piece = max(self, other, key=lambda found: found.slowest_piece)
         return Found(
             self.frames + other.frames,
             self.lengthened + other.lengthened,
             slower.slowest,
             slower.size,
+            slower_piece.slowest_piece,
+            slower_piece.size_piece,
             max(self.memory, other.memory),
             self.sampled + other.sampled,
             self.errors + other.errors,
@@ -119,10 +126,10 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
         for number in numbers:
             good = seeds[number % len(seeds)]
             data = mutants.mutant(good, seed, number, mutants.FRAME_CHANGES)
-            if number % LENGTHENED == 0:
+            piece = number % LENGTHENED == 0
+            if piece:
                 data = mutants.lengthen(data, seed, number, longest)
-                found.lengthened += 1
-            _read(codec, data, number, found)
+            _read(codec, data, number, found, piece=piece)
             if number % sampled == 0:
                 _measure(codec, data, number, found)
             if number % 1000 == 0:
@@ -133,8 +140,9 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
     return found
 
 
-def _read(codec: Codec, data: bytes, number: int, found: Found) -> None:
+def _read(codec: Codec, data: bytes, number: int, found: Found, *, piece: bool) -> None:
     found.frames += 1
+    found.lengthened += piece
     start = time.thread_time()
     error = _outcome(codec, data)
     took = time.thread_time() - start
@@ -142,13 +150,15 @@ def _read(codec: Codec, data: bytes, number: int, found: Found) -> None:
         start = time.thread_time()
         _outcome(codec, data)
         took = min(took, time.thread_time() - start)
-    if took > found.slowest:
+    if piece and took > found.slowest_piece:
+        found.slowest_piece, found.size_piece = took, len(data)
+    elif not piece and took > found.slowest:
         found.slowest, found.size = took, len(data)
     if isinstance(error, ErrormotionError):
         found.errors[type(error).__name__] += 1
     elif error is not None:
         _fail(found, number, data, f"{type(error).__name__}: {str(error)[:200]}")
-    if took > SLOWEST:
+    if took > (SLOWEST_PIECE if piece else SLOWEST):
         _fail(found, number, data, f"{1e3 * took:.1f} ms for {len(data)} bytes")
 
 

@@ -201,7 +201,7 @@ _FRAMINGS: tuple[modbus.Framing, ...] = ("tcp", "rtu")
 _THERMOMETERS = {framing: f"modbus_temperature ({framing.upper()})" for framing in _FRAMINGS}
 
 CODECS: Sequence[Codec] = (
-    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.LONGEST_ANSWER),
+    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.LONGEST_ANSWER, 1 << 21),
     *(
         Codec(
             *("optoncdt", f"values, {what}", readers.optoncdt_stream(counter, first)),
@@ -258,5 +258,5 @@ CODECS: Sequence[Codec] = (
     Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE, DOCUMENT),
     Codec("virtual_controller", "lines", readers.virtual_line, linuxcnc_lines, virtual.LONGEST_LINE, DOCUMENT),
     Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, LONGEST_LINE),
-    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK),
+    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK, 1 << 22),
 )

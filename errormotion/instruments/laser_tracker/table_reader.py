@@ -53,6 +53,7 @@ AIR = ("temperature", "pressure", "humidity")
 LONGEST_TABLE = 1 << 24
 """Longest table, bytes."""
 
+_MOST_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _EMPTY = ("", "NaN", "nan", "-", "---")
@@ -151,7 +152,7 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
         elif name in QUANTITIES:
             found[name] = (place, _unit(title, name, unit, line, mistakes))
         else:
-            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1)
+            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MOST_HINTS else []
             hint = f"; did you mean '{near[0]}'?" if near else ""
             mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):
