@@ -21,6 +21,8 @@ LENGTHENED = 50
 """Every so manieth mutant is made as long as the longest frame, or as a piece that a connection delivers."""
 SAMPLED = 200
 """The memory of every so manieth mutant is measured."""
+OWN_MEMORY, MEMORY_PER_BYTE = 1 << 16, 32
+"""Largest memory of a frame: so many bytes, and so many for each byte of the longest frame that is tried."""
 SHOWN = 5
 """Failures that are kept."""
 
@@ -41,8 +43,6 @@ class Codec:
         Returns good bytes.
     longest : int
         Longest frame that the codec's module states, bytes.
-    memory : int
-        Largest memory while a frame is read, bytes.
     tried : int
         Length up to which frames are lengthened, bytes; longer ones are documents or files, which take their time.
     """
@@ -52,13 +52,22 @@ class Codec:
     read: Callable[[bytes], object]
     seeds: Callable[[], Sequence[bytes]]
     longest: int
-    memory: int = 1 << 20
     tried: int = 1 << 16
 
     @property
     def name(self) -> str:
         """Name in tables and tests."""
         return f"{self.device}: {self.part}"
+
+    @property
+    def lengthened(self) -> int:
+        """Length to which frames are lengthened, bytes."""
+        return min(self.longest, self.tried)
+
+    @property
+    def memory(self) -> int:
+        """Largest memory while a frame is read, bytes."""
+        return OWN_MEMORY + MEMORY_PER_BYTE * self.lengthened
 
 
 @dataclass
@@ -118,7 +127,6 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
     if not accepted:
         raise AssertionError(f"{codec.name}: none of its good frames is accepted")
     found = Found()
-    longest = min(codec.longest, codec.tried)
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -128,7 +136,7 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
             data = mutants.mutant(good, seed, number, mutants.FRAME_CHANGES)
             piece = number % LENGTHENED == 0
             if piece:
-                data = mutants.lengthen(data, seed, number, longest)
+                data = mutants.lengthen(data, seed, number, codec.lengthened)
             _read(codec, data, number, found, piece=piece)
             if number % sampled == 0:
                 _measure(codec, data, number, found)

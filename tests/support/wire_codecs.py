@@ -1,7 +1,7 @@
 """Every codec of the wire, with good frames of it: from the golden vectors, and from sessions with the simulators."""
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from itertools import islice
 
@@ -32,9 +32,6 @@ from errormotion.instruments.transports.http.answer import MOST_LINE_BYTES as MO
 from errormotion.instruments.transports.modbus import codec as modbus
 from errormotion.instruments.transports.recording import Recorder, add_note, parts_of, read_recording, write_index
 from errormotion.testing.run import subjects_of
-
-DOCUMENT = 1 << 24
-"""Documents and their memory have limits of their own: bytes of a tree of XML, or of JSON."""
 
 
 @cache
@@ -73,7 +70,13 @@ def rows(device: str, *layers: str) -> list[bytes]:
 
 
 def optoncdt_answers() -> list[bytes]:
-    return [*rows("optoncdt", "getinfo", "answer"), b"GETOUTINFO_RS422 DIST1 COUNTER\r\n->", b"E210 unknown\r\n->"]
+    own = split(joined("optoncdt")[:2000], commands.PROMPT)
+    return [
+        *own,
+        *rows("optoncdt", "getinfo", "answer"),
+        b"GETOUTINFO_RS422 DIST1 COUNTER\r\n->",
+        b"E210 unknown\r\n->",
+    ]
 
 
 def optoncdt_values(counter: bool, counter_first: bool) -> list[bytes]:
@@ -93,7 +96,14 @@ def capancdt_frames() -> list[bytes]:
 
 
 def lk_answers() -> list[bytes]:
-    return [*(line + lk.LINE_END for line in rows("keyence_lk", "value", "no value")), b"MS,01,+01.2345\r"]
+    own = split(joined("keyence_lk"), lk.LINE_END)
+    return [*own, *(line + lk.LINE_END for line in rows("keyence_lk", "value", "no value")), b"MS,01,+01.2345\r"]
+
+
+def ljx_replies() -> list[bytes]:
+    pieces = session("keyence_ljx")[0]  # the length of a reply, then the rest of it
+    own = [head + rest for head, rest in zip(pieces[::2], pieces[1::2], strict=False)]
+    return [*own, *rows("keyence_ljx", "reply", "layout")]
 
 
 def ljx_profiles() -> list[bytes]:
@@ -110,7 +120,8 @@ READER_WORDS = readers.LAYOUT.words
 
 
 def emscon_packets() -> list[bytes]:
-    return [*rows("leica_emscon", "answer", "result", "points", "error"), emscon.encode_change(1)]
+    own = [frame for frame in session("leica_emscon")[0] if len(frame) > emscon.HEADER.size]
+    return [*own, *rows("leica_emscon", "answer", "result", "points", "error"), emscon.encode_change(1)]
 
 
 def emscon_points() -> list[bytes]:
@@ -131,6 +142,11 @@ def modbus_requests(framing: modbus.Framing) -> list[bytes]:
     return [one, one + modbus.encode_request(framing, 1, 4, 5, 100, 2), one[:1] + one]
 
 
+def can_frames() -> list[bytes]:
+    """Return the data of frames behind their identifiers."""
+    return [frame[4:] for frame in session("can_temperature")[0] if len(frame) > 4][:8]
+
+
 def sdo_transfers() -> list[bytes]:
     start = struct.pack("<BHBI", 0x41, 0x1008, 0, 10)
     return [struct.pack("<BHB4s", 0x43, 0x1008, 0, b"CAN4"), start + b"\0abcdefg" + b"\x19hij" + bytes(4)]
@@ -145,8 +161,19 @@ def pdo_frames() -> list[bytes]:
     return [entries + bytes(8) + bytes(range(8))]
 
 
+def scpi_answers() -> list[bytes]:
+    own = split(joined("scpi_temperature"), scpi.LINE_END)
+    return [*own, *rows("scpi_temperature", "identity", "scan list", "error", "readings")]
+
+
+def documents() -> list[bytes]:
+    own = [part[: part.rindex(b">") + 1] for part in joined("mtconnect").split(b"\r\n\r\n")[1:]]
+    return [*own, *rows("mtconnect", "probe", "streams", "error")]
+
+
 def http_answers() -> list[bytes]:
     return [
+        joined("mtconnect"),
         b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: 5\r\n\r\n<a/>\n",
         b"HTTP/1.1 100 Continue\r\n\r\nHTTP/1.0 404 Not Found\r\nConnection: keep-alive\r\n\r\nnothing",
         b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n4\r\n<a/>\r\n1;x=y\r\n\n\r\n0\r\nA: b\r\n\r\n",
@@ -167,7 +194,11 @@ def linuxcnc_lines() -> list[bytes]:
         '{"id": 1, "ok": false, "error": "the machine is busy", "time": 1.5}',
         '{"id": 1, "beat": 7, "time": 3.2, "running": true}',
     )
-    return [text.encode() + linuxcnc.LINE_END for text in texts]
+    return [*split(joined("linuxcnc"), linuxcnc.LINE_END), *(text.encode() + linuxcnc.LINE_END for text in texts)]
+
+
+def virtual_lines() -> list[bytes]:
+    return [*split(joined("virtual_controller"), virtual.LINE_END), b'{"id": 1, "ok": true, "result": {"x": [1.5]}}\n']
 
 
 def dprnt_lines() -> list[bytes]:
@@ -201,7 +232,7 @@ _FRAMINGS: tuple[modbus.Framing, ...] = ("tcp", "rtu")
 _THERMOMETERS = {framing: f"modbus_temperature ({framing.upper()})" for framing in _FRAMINGS}
 
 CODECS: Sequence[Codec] = (
-    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.LONGEST_ANSWER, 1 << 21),
+    Codec("optoncdt", "answers", readers.optoncdt_answer, optoncdt_answers, commands.LONGEST_ANSWER),
     *(
         Codec(
             *("optoncdt", f"values, {what}", readers.optoncdt_stream(counter, first)),
@@ -209,12 +240,18 @@ CODECS: Sequence[Codec] = (
         )
         for counter, first, what in _VALUES
     ),
-    Codec("capancdt", "answers", readers.capancdt_answer, lambda: rows("capancdt", "answer"), capancdt.MAX_LINE_BYTES),
+    Codec(
+        "capancdt",
+        "answers",
+        readers.capancdt_answer,
+        lambda: [*split(joined("capancdt"), b"\n"), *rows("capancdt", "answer")],
+        capancdt.MAX_LINE_BYTES,
+    ),
     Codec("capancdt", "blocks", readers.capancdt_blocks, capancdt_frames, blocks.MAX_BLOCK_BYTES),
     Codec("keyence_lk", "answers", readers.keyence_lk, lk_answers, lk.MAX_LINE_BYTES),
     Codec(
         *("keyence_ljx", "replies", readers.ljx_reply),
-        *(lambda: rows("keyence_ljx", "reply", "layout"), ljx.MAX_REPLY_BYTES),
+        *(ljx_replies, ljx.MAX_REPLY_BYTES),
     ),
     Codec("keyence_ljx", "profiles", readers.ljx_stream, ljx_profiles, ljx.MAX_PROFILE_BYTES),
     Codec("keyence_ljx", "requests", ljx.parse_request, lambda: rows("keyence_ljx", "request"), ljx.MAX_REPLY_BYTES),
@@ -225,7 +262,13 @@ CODECS: Sequence[Codec] = (
         emscon.MAX_PACKET_BYTES,
     ),
     Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096),
-    Codec("dcon_temperature", "answers", readers.dcon_answer, lambda: [b">+025.12-0000+9999.9\r"], dcon.MAX_LINE_BYTES),
+    Codec(
+        "dcon_temperature",
+        "answers",
+        readers.dcon_answer,
+        lambda: [*split(joined("dcon_temperature"), dcon.LINE_END), b">+025.12-0000+9999.9\r"],
+        dcon.MAX_LINE_BYTES,
+    ),
     *(
         Codec(
             *(_THERMOMETERS[framing], "answers", readers.modbus_answer(framing)),
@@ -240,23 +283,31 @@ CODECS: Sequence[Codec] = (
         )
         for framing in _FRAMINGS
     ),
-    Codec("can_temperature", "SDO frames", readers.sdo_frame, lambda: rows("can_temperature", "sdo"), sdo.FRAME_BYTES),
+    Codec(
+        "can_temperature",
+        "SDO frames",
+        readers.sdo_frame,
+        lambda: [*can_frames(), *rows("can_temperature", "sdo")],
+        sdo.FRAME_BYTES,
+    ),
     Codec("can_temperature", "SDO transfers", readers.sdo_transfer, sdo_transfers, sdo.LONGEST_TRANSFER),
     Codec("can_temperature", "entries of CiA 404", readers.cia404_entries, cia404_entries, sdo.LONGEST_TRANSFER),
     Codec("can_temperature", "PDO", readers.pdo_frames, pdo_frames, sdo.FRAME_BYTES),
     Codec(
         *("scpi_temperature", "answers", readers.scpi_answer),
-        *(lambda: rows("scpi_temperature", "identity", "scan list", "error", "readings"), scpi.LONGEST),
+        *(scpi_answers, scpi.LONGEST),
     ),
     Codec(
         *("mtconnect", "documents", readers.mtconnect_document),
-        *(lambda: rows("mtconnect", "probe", "streams", "error"), xml.LONGEST, DOCUMENT),
+        *(documents, xml.LONGEST),
     ),
     Codec("mtconnect", "HTTP", readers.http_answer, http_answers, MOST_HEAD_LINE),
-    Codec("shdr", "lines", readers.shdr_lines, lambda: rows("shdr", "line", "stream"), MOST_LINE_BYTES, DOCUMENT),
-    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opcua.MOST_BYTES, DOCUMENT),
-    Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE, DOCUMENT),
-    Codec("virtual_controller", "lines", readers.virtual_line, linuxcnc_lines, virtual.LONGEST_LINE, DOCUMENT),
+    Codec(
+        "shdr", "lines", readers.shdr_lines, lambda: [joined("shdr"), *rows("shdr", "line", "stream")], MOST_LINE_BYTES
+    ),
+    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opcua.MOST_BYTES),
+    Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE),
+    Codec("virtual_controller", "lines", readers.virtual_line, virtual_lines, virtual.LONGEST_LINE),
     Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, LONGEST_LINE),
-    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK, 1 << 22),
+    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK),
 )

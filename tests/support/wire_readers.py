@@ -208,7 +208,8 @@ def emscon_points(data: bytes) -> None:
 @cache
 def folder() -> Path:
     """Return a folder of this process, which ends with it."""
-    found = Path(tempfile.mkdtemp(prefix="mutants-"))
+    memory = Path("/dev/shm")  # a disk would be what is measured
+    found = Path(tempfile.mkdtemp(prefix="mutants-", dir=memory if memory.is_dir() else None))
     atexit.register(shutil.rmtree, found, ignore_errors=True)
     return found
 

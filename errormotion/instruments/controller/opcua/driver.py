@@ -194,7 +194,11 @@ class OpcUa(Driver):
 
 def _is_child(each: Any) -> bool:
     """Whether this is a node as `transports.opcua` describes one."""
-    return isinstance(each, dict) and all(isinstance(each.get(name), str) for name in ("id", "name")) and "namespace" in each
+    return (
+        isinstance(each, dict)
+        and all(isinstance(each.get(name), str) for name in ("id", "name"))
+        and "namespace" in each
+    )
 
 
 def _seconds(time: Any) -> float:

@@ -167,9 +167,7 @@ class Dprnt(Driver):
         pattern = re.compile(self.settings.pattern)
         while True:
             try:
-                raw = self.transport.read_until(
-                    _LINE_END, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0)
-                )
+                raw = self.transport.read_until(_LINE_END, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0))
                 text = text_of(raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
