@@ -13,6 +13,7 @@ from wire_readers import Received, dprnt_line, opcua_lines
 from errormotion import plugins
 from errormotion.errors import ProtocolError, ReplayError
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
+from errormotion.instruments.point_lds.optoncdt.commands import MOST_LINES, parse_answer
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, PATTERN, parse_line
 from errormotion.instruments.transports.recording import read_index
 
@@ -96,6 +97,13 @@ def test_a_long_line_of_digits_is_no_work() -> None:
             dprnt_line(text.encode())
     with pytest.raises(ProtocolError, match=f"at most {LONGEST_LINE}"):
         parse_line("X1 Y2 Z3" + " " * LONGEST_LINE, re.compile(PATTERN))
+
+
+def test_an_answer_of_a_sensor_has_a_limited_number_of_lines() -> None:
+    assert len(parse_answer("PRINT", b"MEASRATE 4\r\n" * MOST_LINES)) == MOST_LINES
+    for end in (b"\n", b"->"):
+        with pytest.raises(ProtocolError, match=f"more than {MOST_LINES} lines"):
+            parse_answer("PRINT", end * (2 * MOST_LINES + 1))
 
 
 def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:

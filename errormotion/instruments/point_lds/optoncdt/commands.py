@@ -18,6 +18,8 @@ PROMPT = b"->"
 LINE_END = b"\r\n"
 LONGEST_ANSWER = 1 << 16
 """Bytes of text; HELP and PRINT, the longest, list some hundred lines."""
+MOST_LINES = 4096
+"""Lines of an answer."""
 
 DONE = "ok"
 USER_HINT = ". Its user level may be USER, which may only read: log in on its web page, or set STDUSER PROFESSIONAL"
@@ -47,6 +49,8 @@ def parse_answer(command: str, text: bytes) -> list[str]:
     if len(text) > LONGEST_ANSWER:
         raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {LONGEST_ANSWER} at most")
     words = text.translate(None, _UNPRINTABLE).decode("ascii").replace(PROMPT.decode(), "\n")
+    if words.count("\n") + words.count("\r") > 2 * MOST_LINES:
+        raise ProtocolError(f"The answer to '{command}' has more than {MOST_LINES} lines")
     lines = [_without_echo(command, line.strip()) for line in words.splitlines()]
     for line in lines:
         found = _ERROR.search(line.partition(":")[0])
