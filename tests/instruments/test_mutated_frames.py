@@ -13,6 +13,7 @@ from wire_readers import Received, dprnt_line, opcua_lines
 from errormotion import plugins
 from errormotion.errors import ProtocolError, ReplayError
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
+from errormotion.instruments.controller.shdr import codec as shdr
 from errormotion.instruments.point_lds.optoncdt.commands import MOST_LINES, parse_answer
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, PATTERN, parse_line
 from errormotion.instruments.transports.recording import read_index
@@ -114,6 +115,13 @@ def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:
     numbers = {"time": HUGE, "position": [0.0] * 3, "commanded_position": [0.0] * 3}
     with pytest.raises(ProtocolError, match="state of LinuxCNC"):
         linuxcnc.decode_state({"mode": "mdi", **numbers, "spindle_speed": 1})
+
+
+@pytest.mark.parametrize("line", [b"* PONG", b"* PONG ", b"* PONG: 12x", b"* PONG x"])
+def test_a_heartbeat_without_a_number_is_none(line: bytes) -> None:
+    command = shdr.parse_line(line)
+    assert isinstance(command, shdr.Command)
+    assert shdr.pong(command) is None
 
 
 @pytest.mark.parametrize(

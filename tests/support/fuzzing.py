@@ -21,7 +21,7 @@ LENGTHENED = 50
 """Every so manieth mutant is made as long as the longest frame, or as a piece that a connection delivers."""
 SAMPLED = 200
 """The memory of every so manieth mutant is measured."""
-OWN_MEMORY, MEMORY_PER_BYTE = 1 << 16, 32
+OWN_MEMORY, MEMORY_PER_BYTE = 1 << 16, 64
 """Largest memory of a frame: so many bytes, and so many for each byte of the longest frame that is tried."""
 SHOWN = 5
 """Failures that are kept."""
