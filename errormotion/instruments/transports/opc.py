@@ -310,5 +310,5 @@ def request(line: Transport, content: Mapping[str, Any]) -> Any:
     answer = line.read_until(b"\n", limit=MOST_BYTES)
     try:
         return json.loads(answer)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ProtocolError(f"{line.url}: the answer is not JSON: {error}") from None

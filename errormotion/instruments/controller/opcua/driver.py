@@ -127,7 +127,10 @@ class OpcUa(Driver):
         value = None if answer is None else answer.get("value")
         if isinstance(value, bool) or not isinstance(value, int | float):
             return math.nan
-        return float(value) * self._factors[key]
+        try:
+            return float(value) * self._factors[key]
+        except OverflowError:  # a whole number beyond the range of float
+            return math.nan
 
     # ------------------------------------------------------------------ requests
 
@@ -140,9 +143,7 @@ class OpcUa(Driver):
 
     def _browse(self, node: str) -> list[Mapping[str, Any]]:
         found = request(self.transport, {"browse": node})
-        if not isinstance(found, list) or not all(
-            isinstance(each, dict) and {"id", "name", "namespace"} <= each.keys() for each in found
-        ):
+        if not isinstance(found, list) or not all(_is_child(each) for each in found):
             raise ProtocolError(f"{self.address}: expected the children of {node}; found {str(found)[:80]}")
         return found
 
@@ -158,7 +159,9 @@ class OpcUa(Driver):
 
     def _start_session(self) -> None:
         server = request(self.transport, {"server": True})
-        namespaces = server.get("namespaces", []) if isinstance(server, dict) else []
+        namespaces = server.get("namespaces") if isinstance(server, dict) else None
+        if not isinstance(namespaces, list):
+            raise ProtocolError(f"{self.address}: expected the namespaces of the server; found {str(server)[:80]}")
         root = model.interface(namespaces, self._browse)
         found: dict[str, str] = {}
         if root:
@@ -187,6 +190,15 @@ class OpcUa(Driver):
         if not unit and key not in self.settings.nodes:
             unit = self._units.get(key, "")
         return model.factor(key, self._read([unit])[0]["value"] if unit else None, self.settings)
+
+
+def _is_child(each: Any) -> bool:
+    """Whether this is a node as `transports.opcua` describes one."""
+    return (
+        isinstance(each, dict)
+        and all(isinstance(each.get(name), str) for name in ("id", "name"))
+        and "namespace" in each
+    )
 
 
 def _seconds(time: Any) -> float:

@@ -114,7 +114,7 @@ def factor(key: str, stated: Any, settings: OpcUaSettings) -> float:
         return _scaled(settings.units[name], UNITS[name], f"The setting units.{name}")
     if isinstance(stated, dict):
         code, unit = stated.get("code"), str(stated.get("unit", ""))
-        if code in UNIT_CODES:
+        if isinstance(code, int) and code in UNIT_CODES:
             return _scaled(UNIT_CODES[code], UNITS[name], f"'{key}'")
         if unit:
             return _scaled({"rpm": "1/min", "r/min": "1/min"}.get(unit, unit), UNITS[name], f"'{key}'")

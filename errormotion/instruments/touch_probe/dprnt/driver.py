@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.touch_probe.dprnt.codec import Line, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, parse_line, text_of
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
@@ -21,7 +21,6 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
 _LINE_END = b"\n"
-_MAX_LINE_BYTES = 1024
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -168,9 +167,7 @@ class Dprnt(Driver):
         pattern = re.compile(self.settings.pattern)
         while True:
             try:
-                raw = self.transport.read_until(
-                    _LINE_END, limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
-                )
+                raw = self.transport.read_until(_LINE_END, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0))
                 text = text_of(raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
