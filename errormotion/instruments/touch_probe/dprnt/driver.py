@@ -20,7 +20,7 @@ from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
-_LINE_END = b"\n"
+_LINE_ENDS = {"lf": b"\n", "cr": b"\r"}
 _MAX_LINE_BYTES = 1024
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
@@ -169,7 +169,7 @@ class Dprnt(Driver):
         while True:
             try:
                 raw = self.transport.read_until(
-                    _LINE_END, limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
+                    _LINE_ENDS[self.settings.line_end], limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
                 )
                 text = text_of(raw)
                 if text:
