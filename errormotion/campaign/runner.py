@@ -30,7 +30,11 @@ from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
 from errormotion.datasets.files.folders import looking_beside
+from errormotion.datasets.merit import figures_of, stored
 from errormotion.errors import RunError
+
+MOST_RESULTS = 200
+"""Figures of merit in a run.json."""
 
 log = logging.getLogger(__name__)
 
@@ -310,14 +314,16 @@ class _Session:
         self.progress.stage("identifying")
         method = test.method()
         path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
-        if not (folder.path / path).exists():  # else: computed, but the process ended before run.json was written
+        if (folder.path / path).exists():  # computed, but the process ended before run.json was written
+            errors = datasets.load(folder.path / path)
+        else:
             with datasets.load(folder.raw) as raw:
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
             datasets.save(errors, folder.path / path)
         folder.step("identify", "done")
-        folder.save(errors=path)
+        folder.save(errors=path, results=results_of(errors))
         log.info("identified", extra={"data": {"errors": path}})
 
     def _report(self, folder: RunFolder) -> None:
@@ -409,6 +415,18 @@ def _in_order() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def results_of(errors: xr.Dataset) -> list[dict[str, Any]] | None:
+    """Return the figures of merit for ``run.json``, SI, at most MOST_RESULTS; None if the method fails to state them.
+
+    A failure is only logged, since the measurement is valid without them.
+    """
+    try:
+        return [stored(figure) for figure in figures_of(errors)[:MOST_RESULTS]]
+    except Exception:
+        log.exception("the figures of merit failed")
+        return None
 
 
 def settings_hash(settings: Mapping[str, Any], method: str, method_version: str) -> str:

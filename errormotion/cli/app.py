@@ -346,6 +346,23 @@ def compare(
 
 @app.command()
 @guarded
+def runs(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Run folders, or folders of runs; default: runs.", show_default=False)
+    ] = None,
+    machine: Annotated[str | None, typer.Option(help="Only the runs of this machine.")] = None,
+    method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    since: Annotated[str | None, typer.Option(metavar="DATE", help="Only runs from this date on, UTC.")] = None,
+    json_: Json = False,
+) -> None:
+    """List the runs of folders, newest first, each with its figure of merit."""
+    from errormotion.cli.commands import runs as command
+
+    command.runs(folders or [], machine, method, since, json_)
+
+
+@app.command()
+@guarded
 def doctor(json_: Json = False) -> None:
     """Check that this computer has what errormotion needs."""
     from errormotion.cli.commands import doctor as command

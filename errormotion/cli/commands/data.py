@@ -15,7 +15,8 @@ from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
-from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.datasets.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 

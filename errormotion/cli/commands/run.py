@@ -15,7 +15,8 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
-from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.datasets.merit import figures_of
 
 
 def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
