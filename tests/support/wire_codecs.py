@@ -309,5 +309,5 @@ CODECS: Sequence[Codec] = (
     Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE),
     Codec("virtual_controller", "lines", readers.virtual_line, virtual_lines, virtual.LONGEST_LINE),
     Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, LONGEST_LINE),
-    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK),
+    Codec("all", "recordings", readers.in_file(readers.recording), recordings, CHUNK, tried=4096),
 )
