@@ -369,6 +369,23 @@ def runs(
 
 @app.command()
 @guarded
+def history(
+    machine: Annotated[str, typer.Option(help="The machine.")],
+    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
+    ] = None,
+    method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    json_: Json = False,
+) -> None:
+    """Show a figure of a machine over time, with its trend and a step."""
+    from errormotion.cli.commands import history as command
+
+    command.history(folders or [], machine, figure, method, json_)
+
+
+@app.command()
+@guarded
 def doctor(json_: Json = False) -> None:
     """Check that this computer has what errormotion needs."""
     from errormotion.cli.commands import doctor as command
