@@ -50,8 +50,8 @@ def main() -> None:
         en = np.abs(result["en"].values)
         inside = np.mean(en[np.isfinite(en)] <= 1)
         print(
-            f"{count} datasets of {size} instants with {sources} sources: {seconds:.2f} s; {result.sizes['pair']} pairs, "
-            f"|En| <= 1 in {100 * inside:.1f} %, joint p {result.attrs['fit_p']:.2f}"
+            f"{count} datasets of {size} instants with {sources} sources: {seconds:.2f} s; "
+            f"{result.sizes['pair']} pairs, |En| <= 1 in {100 * inside:.1f} %, joint p {result.attrs['fit_p']:.2f}"
         )
 
 
