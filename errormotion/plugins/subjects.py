@@ -65,8 +65,6 @@ class InstrumentSubject:
         A fault must have become an error, or a counted loss, by then, s.
     dead_address : str
         An address at which nothing answers.
-    late_answer : int
-        Number of the answer that is late: one of a reading, by which the instrument is open.
     mutants : int
         How many times a recorded session is replayed with a changed frame; 0: never.
     """
@@ -84,7 +82,6 @@ class InstrumentSubject:
     blocks: int = 3
     time_limit: float = 10.0
     dead_address: str = "tcp://127.0.0.1:9"
-    late_answer: int = 20
     mutants: int = 300
 
     def build(self, *, address: str = "", fault: str = "", record: Path | None = None) -> Any:

@@ -18,11 +18,8 @@ from errormotion.testing.kit import require
 from errormotion.testing.sessions import numbers
 
 LATE = "late"
-<<<<<<< HEAD
 LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
 """Numbers of the answer that is late: the first one for which the instrument is open by then."""
-=======
->>>>>>> audit12
 READINGS = 24
 READINGS_AFTER_ERROR = 4
 MOST_FAILURES = 12
@@ -67,11 +64,7 @@ def late_answers(subject: InstrumentSubject) -> str:
         limit = 1.0
     sound = _readings(subject, "")
     seen = [
-<<<<<<< HEAD
         _require_in_step(sound, _late_readings(subject, when), how)
-=======
-        _require_in_step(sound, _readings(subject, f"{LATE}&fault_at={subject.late_answer}{when}"), how)
->>>>>>> audit12
         for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
     ]
     return "; ".join(seen)

@@ -111,7 +111,7 @@ class CanTemperature(Thermometer):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-        return InstrumentSubject(cls, "sim://cframe?seed=3", late_answer=80)
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
     def node(self) -> CanNode:

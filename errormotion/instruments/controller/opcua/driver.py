@@ -42,11 +42,7 @@ class OpcUa(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-<<<<<<< HEAD
         return InstrumentSubject(cls, "sim://cframe/opcua", {"timeout": 1.5})
-=======
-        return InstrumentSubject(cls, "sim://cframe/opcua", late_answer=80)
->>>>>>> audit12
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)

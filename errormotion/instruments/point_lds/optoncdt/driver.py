@@ -74,7 +74,7 @@ class OptoNCDT(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-        return InstrumentSubject(cls, "sim://cframe?seed=3", late_answer=40)
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
     def rate(self) -> float:
