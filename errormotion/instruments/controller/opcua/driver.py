@@ -13,7 +13,7 @@ from errormotion.instruments.controller.opcua import model
 from errormotion.instruments.controller.opcua.settings import NUMBERS, TEXTS, OpcUaSettings
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.opcua import Credentials, open_opcua, request
+from errormotion.instruments.transports.opc import Credentials, open_session, request
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 
@@ -148,7 +148,7 @@ class OpcUa(Driver):
 
     def _connect(self) -> Transport:
         settings = self.settings
-        return open_opcua(
+        return open_session(
             self.address,
             Credentials(settings.security, settings.user, _first_line(settings.password_file)),
             timeout=settings.timeout,
