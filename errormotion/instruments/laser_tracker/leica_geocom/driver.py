@@ -215,7 +215,7 @@ class LeicaGeoCom(Driver):
         limit, radius = self.settings.motion_timeout, self.settings.search_angle
         for call, parameters in (
             (codes.POSITION, (horizontal, zenith, 0, 0, 0)),
-            (codes.FINE_ADJUST, (radius, radius)),
+            (codes.FINE_ADJUST, (radius, radius, 0)),
         ):
             found = self._call(call, *parameters, limit=limit)
             codec.check(call, found)
