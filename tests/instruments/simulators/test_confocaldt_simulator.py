@@ -282,7 +282,6 @@ def test_mastering_sets_the_present_value() -> None:
     with streaming() as client:
         client.block()
         assert client.ask("MASTERMV MASTER 0.5") == ""
-        client.quiet()
         assert client.ask("MASTERMV") == "MASTERMV MASTER 0.5"
     with streaming(left="ECHO OFF;MASTERMV MASTER 0.5") as client:
         assert client.block()[2][0, 0] == 500_000
