@@ -228,7 +228,21 @@ def test_values_that_an_earlier_output_left_are_not_read() -> None:
 
 
 def test_refuses_a_master_value() -> None:
+    with pytest.raises(InstrumentError, match="master value"):
+        ConfocalDT(f"{ADDRESS}&left=MASTERMV+MASTER+0.5").open()
+
+
+@pytest.mark.parametrize("left", ["ECHO+OFF", "OUTADD_ETH+COUNTER+INTENSITY", "OUTPUT+ETHERNET", "OUTREDUCE+10"])
+def test_reads_whatever_another_client_left(left: str) -> None:
     with ConfocalDT(ADDRESS) as sensor:
-        sensor._commands().command("MASTERMV MASTER 1")
-        with pytest.raises(InstrumentError, match="master value"):
-            sensor.configure(sensor.settings)
+        expected = sensor.read()
+    simulators.reset()
+    with ConfocalDT(f"{ADDRESS}&left={left}") as sensor:
+        assert sensor.read() == pytest.approx(expected, abs=20e-6)
+        assert next(sensor.stream(block=20)).dropped == 0
+
+
+@pytest.mark.parametrize("left", ["MEASMODE+THICKNESS", "SWITCHMD2+1"])
+def test_refuses_other_values_than_one_distance(left: str) -> None:
+    with ConfocalDT(f"{ADDRESS}&left={left}") as sensor, pytest.raises(InstrumentError, match="one distance"):
+        sensor.read()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -287,8 +288,9 @@ class ConfocalDT(Driver):
 
     def _end_session(self) -> None:
         dialogue, self._dialogue = self._dialogue, None
-        if dialogue is not None and not self._failed:
-            dialogue.restore()
+        if dialogue is not None:
+            with suppress(InstrumentError):  # after a lost connection nothing can be restored
+                dialogue.restore()
 
 
 def _check_range(stated: float | None, found: float) -> None:
