@@ -224,7 +224,7 @@ class ConfocalDT(Driver):
         self._commands().command(ON)
 
     def _refresh(self) -> None:
-        """Make sure that the next values on the data line are new ones."""
+        """Switch the output off, and make sure that the next values on the data line are new ones."""
         if self._stale:
             self._commands().command(OFF)
             self._data.reopen()
@@ -240,7 +240,7 @@ class ConfocalDT(Driver):
             data = self._data.read(timeout=max(until - time.monotonic(), 0.0))
             if blocks := decoder.feed(data, last=True):
                 self._data.report_delivered(1)
-                self._commands().command(OFF)
+                self._refresh()
                 return blocks[0]
 
     # ------------------------------------------------------------------ commands
