@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from wire_vectors import Vector, vectors
 
 from errormotion.instruments import simulators
 from errormotion.instruments.simulators.laser_tracker.leica_geocom import SimulatedGeoComStation
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import CALLS
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import CALLS, parse
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import atmospheric_ppm
 from errormotion.instruments.transports import parse_address
 
@@ -131,6 +132,14 @@ def truth(device: SimulatedGeoComStation) -> np.ndarray:
 def test_answers_each_request_as_the_manual_states(made: Made, request_text: str, reply: str) -> None:
     _, client = station(made)
     assert client.raw(request_text) == reply
+
+
+@pytest.mark.parametrize("vector", vectors("leica_geocom", "request"), ids=str)
+def test_understands_the_requests_of_the_vectors(vector: Vector) -> None:
+    found = parse(vector.data.removesuffix(b"\r\n"))
+    assert found.name == CALLS[vector.expected["call"]][0]
+    assert found.transaction == vector.expected["transaction"]
+    assert list(found.values) == vector.expected["parameters"]
 
 
 def test_every_call_refuses_a_parameter_too_many(made: Made) -> None:
