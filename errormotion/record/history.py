@@ -102,10 +102,14 @@ def _arrays(values: list[Value]) -> tuple[Array, Array, Array]:
 
 def _fit(A: Array, y: Array, w: Array) -> tuple[Array, Array, int]:
     """Return parameters of a weighted fit, their standard uncertainties by the scatter, and the degrees of freedom."""
-    degrees = y.size - A.shape[1]
+    degrees = int(y.size) - int(A.shape[1])
     if degrees < 1 or np.linalg.matrix_rank(A) < A.shape[1]:
         return np.full(A.shape[1], np.nan), np.full(A.shape[1], np.nan), 0
     x, *_ = np.linalg.lstsq(A * w[:, None], y * w, rcond=None)
     scatter = float(np.sum((w * (y - A @ x)) ** 2)) / degrees
     inverse = np.linalg.inv((A * w[:, None]).T @ (A * w[:, None]))
+<<<<<<< HEAD
     return np.asarray(x, dtype=float), np.asarray(np.sqrt(scatter * np.diag(inverse))), degrees
+=======
+    return np.asarray(x, dtype=float), np.sqrt(scatter * np.diag(inverse)), degrees
+>>>>>>> hist
