@@ -42,7 +42,7 @@ class OpcUa(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-        return InstrumentSubject(cls, "sim://cframe/opcua", late_answer=80)
+        return InstrumentSubject(cls, "sim://cframe/opcua", late_answer=40)
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
