@@ -1,5 +1,6 @@
 import json
 
+import numpy as np
 from pydantic import BaseModel
 
 from errormotion.datasets import hash_dataset, provenance

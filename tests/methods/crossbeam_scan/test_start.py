@@ -26,7 +26,11 @@ def test_errors_that_count_from_the_cold_scans_start_with_them():
     assert warm_up_start(RECORD, shifted, [0]) == "2026-03-02T07:01:40+00:00"
 
 
-@pytest.mark.parametrize("changed", [RECORD.drop_vars("line_clock"), RECORD.drop_attrs(),
-                                     RECORD.assign_attrs(start="2026-03-02 08:00"), RECORD.isel(line=[0, 1])])  # fmt: skip
+NAIVE = RECORD.assign_attrs(start="2026-03-02 08:00")
+
+
+@pytest.mark.parametrize(
+    "changed", [RECORD.drop_vars("line_clock"), RECORD.drop_attrs(), NAIVE, RECORD.isel(line=[0, 1])]
+)
 def test_nothing_is_stated_where_the_data_do_not_determine_it(changed):
     assert warm_up_start(changed, COLD, [0]) == ""
