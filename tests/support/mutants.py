@@ -130,6 +130,32 @@ CHANGES: Sequence[Change] = (
 )  # fmt: skip
 
 
+def lie(data: bytes, rng: random.Random) -> bytes:
+    """Replace one to eight bytes by an extreme number, as in a field that states a length or a count."""
+    size = rng.choice((1, 2, 2, 4, 4, 8))
+    if len(data) < size:
+        return flip(data, rng)
+    place = rng.randrange(len(data) - size + 1)
+    number = rng.choice((0, 1, len(data), (1 << 8 * size) - 1, 1 << 8 * size - 1, (1 << 8 * size - 1) - 1))
+    order = rng.choice(("little", "big"))
+    stated = (number % (1 << 8 * size)).to_bytes(size, order)  # type: ignore[arg-type]
+    return data[:place] + stated + data[place + size :]
+
+
+FRAME_CHANGES: Sequence[Change] = (*CHANGES, lie)
+"""Changes of the frames of a protocol."""
+
+
+def lengthen(data: bytes, seed: int, number: int, longest: int) -> bytes:
+    """Return bytes of which one stretch is repeated until they are ``longest`` long."""
+    rng = random.Random(seed * 1_000_003 + number)
+    start, end = _span(data, rng)
+    if start == end:
+        return data
+    count = max(longest - len(data), 0) // (end - start)
+    return data[:end] + data[start:end] * count + data[end:]
+
+
 def check(
     read: Callable[[bytes], object],
     data: bytes,

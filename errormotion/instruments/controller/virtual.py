@@ -19,6 +19,8 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
 
 LINE_END = b"\n"
+LONGEST_LINE = 1 << 16
+"""Longest answer, bytes."""
 
 # ---------------------------------------------------------------------- codec
 
@@ -346,7 +348,7 @@ class VirtualController(Driver):
         with self.exchange() as line:
             self._number += 1
             line.write(encode_request(self._number, op, arguments))
-            return decode_answer(line.read_until(LINE_END), self._number)
+            return decode_answer(line.read_until(LINE_END, limit=LONGEST_LINE), self._number)
 
     def _connect(self) -> Transport:
         self._number = 0

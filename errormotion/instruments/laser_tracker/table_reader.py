@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -49,6 +50,10 @@ QUANTITIES: Mapping[str, Quantity] = {
 KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker",), "target": ("point",)}
 AIR = ("temperature", "pressure", "humidity")
 
+LONGEST_TABLE = 1 << 24
+"""Longest table, bytes."""
+
+_MOST_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _EMPTY = ("", "NaN", "nan", "-", "---")
@@ -103,6 +108,9 @@ def read_table(
     DatasetError
         The file cannot be read; or all mistakes in it, with line, column, expected and found value.
     """
+    with suppress(OSError):  # stated by what follows
+        if (size := path.stat().st_size) > LONGEST_TABLE:
+            raise DatasetError(f"{path}: expected a table of at most {LONGEST_TABLE} bytes; found {size}")
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]
@@ -144,7 +152,7 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
         elif name in QUANTITIES:
             found[name] = (place, _unit(title, name, unit, line, mistakes))
         else:
-            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1)
+            near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MOST_HINTS else []
             hint = f"; did you mean '{near[0]}'?" if near else ""
             mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):

@@ -68,21 +68,23 @@ class Transport(ABC):
             ``limit`` bytes without a terminator.
         """
         allowed = self.timeout if timeout is None else timeout
-        end, data = time.monotonic() + allowed, b""
-        while terminator not in data:
+        end, data, searched = time.monotonic() + allowed, bytearray(), 0
+        while (place := data.find(terminator, searched)) < 0:
             if len(data) >= limit:
-                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start {data[:32]!r}")
+                start = bytes(data[:32])
+                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start {start!r}")
+            searched = max(len(data) - len(terminator) + 1, 0)
             try:
                 data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
             except InstrumentTimeoutError:
-                received = f"{data[:64]!r}" if data else "nothing"
+                received = f"{bytes(data[:64])!r}" if data else "nothing"
                 raise InstrumentTimeoutError(
                     f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; "
                     f"received {received}"
                 ) from None
-        head, found, tail = data.partition(terminator)
-        self._rest = tail + self._rest
-        return head + found
+        place += len(terminator)
+        self._rest = bytes(data[place:]) + self._rest
+        return bytes(data[:place])
 
     def read_exactly(self, size: int, timeout: float | None = None) -> bytes:
         """Return exactly ``size`` bytes.

@@ -39,6 +39,8 @@ INDEX_FORMAT = "errormotion-sessions/1"
 WITH_NOTE = {FORMAT: "errormotion-session/2", INDEX_FORMAT: "errormotion-sessions/2"}
 NOTE = "NOTE "
 MOST_NOTE_BYTES = 1 << 20
+MOST_PARTS = 64
+"""Recordings in a list."""
 
 
 class EndOfRecordingError(ReplayError):
@@ -259,12 +261,18 @@ def read_index(path: Path) -> dict[str, Path]:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
     pairs = [line.partition(" ") for line in lines[1 + _has_note(lines) :]]
     expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
-    if not lines or lines[0] != expected or not all(name and Path(name).name == name for _, _, name in pairs):
+    if len(pairs) > MOST_PARTS:
+        raise ReplayError(f"{path}: expected a list of at most {MOST_PARTS} recordings; found {len(pairs)}")
+    if not lines or lines[0] != expected or not all(_is_name(name) for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
     try:
         return {part: path.with_name(name) for part, _, name in pairs}
     except ValueError:
         raise ReplayError(f"{path}: expected names of files beside the list; found a path") from None
+
+
+def _is_name(text: str) -> bool:
+    return bool(text) and "\0" not in text and Path(text).name == text
 
 
 def parts_of(path: Path, levels: int = 2) -> list[Path]:

@@ -11,6 +11,8 @@ from typing import Any
 from errormotion.errors import InstrumentError, ProtocolError
 
 LINE_END = b"\n"
+LONGEST_LINE = 1 << 16
+"""Longest line of the bridge, bytes."""
 MODES = ("manual", "mdi", "automatic", "")
 
 
@@ -56,7 +58,7 @@ def decode(line: bytes) -> Answer | Beat:
             return Answer(message["id"], True, message["result"])
         if message["ok"] is False:
             return Answer(message["id"], False, error=str(message["error"]))
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         pass
     raise ProtocolError(f"Expected an answer of the bridge in JSON; found {line[:200]!r}")
 
@@ -88,7 +90,7 @@ def decode_state(result: Any) -> dict[str, Any]:
             "estop": _switch(state, "estop"),
             "alarms": [str(text) for text in state["alarms"]],
         }
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ProtocolError(f"Expected the state of LinuxCNC; found {str(result)[:200]} ({error!r})") from None
 
 
@@ -100,7 +102,7 @@ def decode_touch(result: Any) -> dict[str, Any]:
         if position is not None and not all(math.isfinite(x) for x in position):
             raise ValueError("a touch at an unknown position")
         return {"tripped": tripped, "position": position, "time": _known(result, "time")}
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ProtocolError(f"Expected the result of a touch; found {str(result)[:200]} ({error!r})") from None
 
 

@@ -258,7 +258,9 @@ class LinuxCNC(Driver):
     def _await(self, line: Transport, number: int) -> codec.Answer:
         while True:
             try:
-                message = codec.decode(line.read_until(codec.LINE_END, timeout=self.settings.timeout))
+                message = codec.decode(
+                    line.read_until(codec.LINE_END, limit=codec.LONGEST_LINE, timeout=self.settings.timeout)
+                )
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
                     f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"

@@ -11,6 +11,8 @@ from xml.parsers import expat
 
 from errormotion.errors import ProtocolError
 
+LONGEST = 16 << 20
+"""Longest document, bytes."""
 MOST_DEPTH = 64
 MOST_ELEMENTS = 200_000
 MOST_ATTRIBUTES = 64  # of one element
@@ -60,6 +62,8 @@ def parse_tree(data: bytes) -> Element:
     ProtocolError
         No XML, a document type, or more than one of the limits of this module.
     """
+    if len(data) > LONGEST:
+        raise ProtocolError(f"Expected a document of at most {LONGEST} bytes; found {len(data)}")
     builder = _Builder()
     try:
         parser = expat.ParserCreate()

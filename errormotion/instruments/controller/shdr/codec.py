@@ -27,6 +27,7 @@ _MOST_TIME = 64  # characters
 _MULTILINE = "--multiline--"
 _NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]{1,4})?", re.ASCII)
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9:.]+(Z|[+-][0-9]{2}:?[0-9]{2})?", re.ASCII)
+_MILLISECONDS = re.compile(r"[0-9]{1,9}", re.ASCII)
 _PONG = re.compile(r"PONG ([0-9]{1,9})", re.ASCII)
 
 
@@ -256,7 +257,7 @@ def _size(key: str, rest: list[str], keys: Keys, *, alone: bool) -> int:
 
 
 def pong(command: Command) -> float | None:
-    """Return the heartbeat of ``* PONG``, s; None for another command."""
-    if command.name != "PONG":
+    """Return the heartbeat of ``* PONG``, s; None for another command, and where it states no number."""
+    if command.name != "PONG" or not _MILLISECONDS.fullmatch(command.value):
         return None
     return min(int(command.value), MOST_MILLISECONDS) / 1000

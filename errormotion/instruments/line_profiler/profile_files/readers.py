@@ -117,7 +117,7 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
             probe(path)
             dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)
     except DatasetError as error:
-        raise InstrumentError(f"Cannot be read as NetCDF: {error}") from None
+        raise InstrumentError(f"{path} cannot be read as NetCDF: {error.__cause__ or error}") from None
     found = []
     for name, dims in (("height", ("profile", "point")), ("x", ("point",)), ("y", ("profile",))):
         if name not in dataset.variables or set(dataset[name].dims) != set(dims):

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from errormotion.errors import InstrumentError, ProtocolError
 
 LINE_END = b"\r"
+MAX_LINE_BYTES = 256
+"""Longest line of an answer."""
 BITS_PER_BYTE = 10  # 8N1
 MEASURING, SETTING = "R0", "Q0"  # commands that change the mode, and the modes' names here
 ERROR = "ER"

@@ -19,6 +19,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
     GARBLED,
     HEADS,
     LINE_END,
+    MAX_LINE_BYTES,
     MEASURING,
     NO_OFFSET,
     OFFSET_SETTING,
@@ -38,7 +39,6 @@ from errormotion.instruments.transports import Transport, open_transport, parse_
 from errormotion.plugins import Identity, InstrumentInfo, Samples
 
 BLOCK_SECONDS = 0.5
-MAX_LINE_BYTES = 256  # bytes
 MAX_LATE_LINES = 16
 
 

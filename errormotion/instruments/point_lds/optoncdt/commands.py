@@ -18,11 +18,14 @@ PROMPT = b"->"
 LINE_END = b"\r\n"
 LONGEST_ANSWER = 1 << 16
 """Bytes of text; HELP and PRINT, the longest, list some hundred lines."""
+MOST_LINES = 4096
+"""Lines of an answer."""
 
 DONE = "ok"
 USER_HINT = ". Its user level may be USER, which may only read: log in on its web page, or set STDUSER PROFESSIONAL"
 _ERROR = re.compile(r"(?:^|\s)(E\d{2,4}\b.*)")
 _RANGE = re.compile(r"\s*(\d{1,6}(?:\.\d{1,9})?)\s*mm\s*", re.IGNORECASE)
+_UNPRINTABLE = bytes(byte for byte in range(256) if byte not in b"\r\n\t" and not 0x20 <= byte < 0x7F)
 _WORD = re.compile(r"[A-Z][A-Z0-9_]*")
 
 DISTANCE, COUNTER = "DIST1", "COUNTER"
@@ -45,8 +48,9 @@ def parse_answer(command: str, text: bytes) -> list[str]:
     """
     if len(text) > LONGEST_ANSWER:
         raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {LONGEST_ANSWER} at most")
-    printable = bytes(byte for byte in text if byte in b"\r\n\t" or 0x20 <= byte < 0x7F)
-    words = printable.decode("ascii").replace(PROMPT.decode(), "\n")
+    words = text.translate(None, _UNPRINTABLE).decode("ascii").replace(PROMPT.decode(), "\n")
+    if words.count("\n") + words.count("\r") > 2 * MOST_LINES:
+        raise ProtocolError(f"The answer to '{command}' has more than {MOST_LINES} lines")
     lines = [_without_echo(command, line.strip()) for line in words.splitlines()]
     for line in lines:
         found = _ERROR.search(line.partition(":")[0])

@@ -12,12 +12,18 @@ from dataclasses import dataclass
 
 from errormotion.errors import ProtocolError
 
-_NUMBER = r"[-+]?\s*(?:\d+\.?\d*|\.\d+)"
+LONGEST_LINE = 256
+"""Longest line, bytes; three positions, a time and a label have some 80."""
+_NUMBER = r"[-+]?+\s*+(?:\d++\.?+\d*+|\.\d++)"
 PATTERN = (
-    r"(?:N\s*(?P<number>\d+)\s*|[A-MO-W]\w*\s+)?"
-    rf"X\s*(?P<x>{_NUMBER})\s*Y\s*(?P<y>{_NUMBER})\s*Z\s*(?P<z>{_NUMBER})\s*(?:T\s*(?P<time>{_NUMBER}))?"
+    r"(?:N\s*+(?P<number>\d++)\s*+|[A-MO-W]\w*+\s++)?+"
+    rf"X\s*+(?P<x>{_NUMBER})\s*+Y\s*+(?P<y>{_NUMBER})\s*+Z\s*+(?P<z>{_NUMBER})\s*+"
+    rf"(?:T\s*+(?P<time>{_NUMBER}))?+"
 )
-"""Default pattern of a line: number of the touch or a label, position, time."""
+"""Default pattern of a line: number of the touch or a label, position, time.
+
+No part of it is matched in a second way (possessive quantifiers), so that the time grows with the length of the line.
+"""
 
 _CONTROL = bytes(range(32)) + b"\x7f%"  # characters of POPEN and PCLOS around the lines
 MM, MILLISECONDS = 1e-3, 1e-3
@@ -60,8 +66,10 @@ def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time:
     Raises
     ------
     ProtocolError
-        The line does not match the pattern.
+        The line is longer than `LONGEST_LINE`, or does not match the pattern.
     """
+    if len(text) > LONGEST_LINE:
+        raise ProtocolError(f"Expected a line of at most {LONGEST_LINE} characters; found {len(text)}: '{text[:60]}'")
     found = pattern.fullmatch(text.strip())
     if found is None:
         raise ProtocolError(f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'")

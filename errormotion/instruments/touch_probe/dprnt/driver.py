@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.touch_probe.dprnt.codec import Line, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, parse_line, text_of
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
@@ -20,8 +20,7 @@ from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
-_LINE_END = b"\n"
-_MAX_LINE_BYTES = 1024
+_LINE_ENDS = {"lf": b"\n", "cr": b"\r"}
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -169,7 +168,7 @@ class Dprnt(Driver):
         while True:
             try:
                 raw = self.transport.read_until(
-                    _LINE_END, limit=_MAX_LINE_BYTES, timeout=max(end - time.monotonic(), 0.0)
+                    _LINE_ENDS[self.settings.line_end], limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0)
                 )
                 text = text_of(raw)
                 if text:

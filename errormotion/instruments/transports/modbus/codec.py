@@ -6,7 +6,7 @@ After the Modbus application protocol 1.1b3 and the serial line guide 1.02. Pure
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from errormotion.errors import InstrumentError, ProtocolError
@@ -23,6 +23,8 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
+LONGEST_FRAME: Mapping[str, int] = {"tcp": 260, "rtu": 256}
+"""Bytes of the longest frame by framing."""
 _HEAD = 7  # bytes of an MBAP header
 _MAX_MBAP_LENGTH = 254  # bytes after its length field
 

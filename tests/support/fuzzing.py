@@ -1,0 +1,196 @@
+"""Mutants of the frames of one codec: errors by type, the slowest frame, the largest memory of a frame."""
+
+import gc
+import time
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import mutants
+
+from errormotion.errors import ErrormotionError
+
+SLOWEST = 10e-3
+"""Limit of one frame, s of CPU time."""
+SLOWEST_PIECE = 50e-3
+"""Limit of bytes that were lengthened: a piece as a connection delivers it, with up to some thousand frames, s."""
+REPEATS = 5
+"""A frame above the limit is read again so many times: what else the process does is no time of the codec."""
+LENGTHENED = 50
+"""Every so manieth mutant is made as long as the longest frame, or as a piece that a connection delivers."""
+SAMPLED = 200
+"""The memory of every so manieth mutant is measured."""
+OWN_MEMORY, MEMORY_PER_BYTE = 1 << 16, 64
+"""Largest memory of a frame: so many bytes, and so many for each byte of the longest frame that is tried."""
+SHOWN = 5
+"""Failures that are kept."""
+
+
+@dataclass(frozen=True)
+class Codec:
+    """A codec of the wire.
+
+    Attributes
+    ----------
+    device : str
+        Ids of the plugins that use it.
+    part : str
+        What is decoded.
+    read : callable
+        Takes the received bytes.
+    seeds : callable
+        Returns good bytes.
+    longest : int
+        Longest frame that the codec's module states, bytes.
+    tried : int
+        Length up to which frames are lengthened, bytes; longer ones are documents or files, which take their time.
+    """
+
+    device: str
+    part: str
+    read: Callable[[bytes], object]
+    seeds: Callable[[], Sequence[bytes]]
+    longest: int
+    tried: int = 1 << 16
+
+    @property
+    def name(self) -> str:
+        """Name in tables and tests."""
+        return f"{self.device}: {self.part}"
+
+    @property
+    def lengthened(self) -> int:
+        """Length to which frames are lengthened, bytes."""
+        return min(self.longest, self.tried)
+
+    @property
+    def memory(self) -> int:
+        """Largest memory while a frame is read, bytes."""
+        return OWN_MEMORY + MEMORY_PER_BYTE * self.lengthened
+
+
+@dataclass
+class Found:
+    """What was found; results of several processes can be added.
+
+    Attributes
+    ----------
+    frames, lengthened : int
+        Number of mutants, and of those as long as the longest frame.
+    slowest, slowest_piece : float
+        Longest CPU time of one frame, and of one that was lengthened, s.
+    size, size_piece : int
+        Length of these, bytes.
+    memory : int
+        Largest memory while one of the sampled frames was read, bytes.
+    sampled : int
+        Number of these.
+    errors : Counter
+        Number of the project's errors by class.
+    failures : list of str
+        What was not allowed.
+    """
+
+    frames: int = 0
+    lengthened: int = 0
+    slowest: float = 0.0
+    size: int = 0
+    slowest_piece: float = 0.0
+    size_piece: int = 0
+    memory: int = 0
+    sampled: int = 0
+    errors: Counter[str] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
+
+    def __add__(self, other: "Found") -> "Found":
+        slower = max(self, other, key=lambda found: found.slowest)
+        slower_piece = max(self, other, key=lambda found: found.slowest_piece)
+        return Found(
+            self.frames + other.frames,
+            self.lengthened + other.lengthened,
+            slower.slowest,
+            slower.size,
+            slower_piece.slowest_piece,
+            slower_piece.size_piece,
+            max(self.memory, other.memory),
+            self.sampled + other.sampled,
+            self.errors + other.errors,
+            [*self.failures, *other.failures][:SHOWN],
+        )
+
+
+def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED) -> Found:
+    """Read the mutants of these numbers; every result follows from seed and number."""
+    seeds = codec.seeds()
+    accepted = [data for data in seeds if _outcome(codec, data) is None]  # compiles what is compiled at its first use
+    if not accepted:
+        raise AssertionError(f"{codec.name}: none of its good frames is accepted")
+    found = Found()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        for number in numbers:
+            good = seeds[number % len(seeds)]
+            data = mutants.mutant(good, seed, number, mutants.FRAME_CHANGES)
+            piece = number % LENGTHENED == 0
+            if piece:
+                data = mutants.lengthen(data, seed, number, codec.lengthened)
+            _read(codec, data, number, found, piece=piece)
+            if number % sampled == 0:
+                _measure(codec, data, number, found)
+            if number % 1000 == 0:
+                gc.collect()
+    finally:
+        gc.enable()
+        gc.unfreeze()
+    return found
+
+
+def _read(codec: Codec, data: bytes, number: int, found: Found, *, piece: bool) -> None:
+    found.frames += 1
+    found.lengthened += piece
+    start = time.thread_time()
+    error = _outcome(codec, data)
+    took = time.thread_time() - start
+    for _ in range(REPEATS if took > SLOWEST else 0):
+        start = time.thread_time()
+        _outcome(codec, data)
+        took = min(took, time.thread_time() - start)
+    if piece and took > found.slowest_piece:
+        found.slowest_piece, found.size_piece = took, len(data)
+    elif not piece and took > found.slowest:
+        found.slowest, found.size = took, len(data)
+    if isinstance(error, ErrormotionError):
+        found.errors[type(error).__name__] += 1
+    elif error is not None:
+        _fail(found, number, data, f"{type(error).__name__}: {str(error)[:200]}")
+    if took > (SLOWEST_PIECE if piece else SLOWEST):
+        _fail(found, number, data, f"{1e3 * took:.1f} ms for {len(data)} bytes")
+
+
+def _measure(codec: Codec, data: bytes, number: int, found: Found) -> None:
+    tracemalloc.start()
+    try:
+        _outcome(codec, data)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    found.sampled += 1
+    found.memory = max(found.memory, peak)
+    if peak > codec.memory:
+        _fail(found, number, data, f"{peak} bytes of memory for {len(data)} bytes; expected at most {codec.memory}")
+
+
+def _outcome(codec: Codec, data: bytes) -> BaseException | None:
+    try:
+        codec.read(data)
+    except Exception as error:  # noqa: BLE001 - judged by the caller
+        return error
+    return None
+
+
+def _fail(found: Found, number: int, data: bytes, what: str) -> None:
+    if len(found.failures) < SHOWN:
+        found.failures.append(f"mutant {number}: {what}; {data[:200]!r}")

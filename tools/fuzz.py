@@ -1,0 +1,155 @@
+"""Damaged frames of every codec: ``make fuzz`` tries them, and writes a section of ``docs/reliability.md``.
+
+``make fuzz ARGS="--frames 1e5 --only shdr"`` tries other numbers of frames, or some codecs, and leaves the rows of the
+others. Codecs and good frames are those of ``tests/support/wire_codecs.py``; a failure is repeated with the seed and
+the number of its mutant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import platform
+import re
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "tests" / "support"))
+
+import fuzzing  # noqa: E402
+from wire_codecs import CODECS  # noqa: E402
+
+PAGE = ROOT / "docs" / "reliability.md"
+TITLE = "Damaged frames"
+PART = 25_000
+"""Frames of one task."""
+HEADING = """\
+# Reliability
+
+Every figure on this page comes from a run; none is typed in.
+"""
+TABLE = (
+    "| codec | frames | slowest frame | slowest piece | largest memory | longest frame | errors of the project |",
+    "|---|---|---|---|---|---|---|",
+)
+
+
+def tasks(codecs: Sequence[int], frames: int) -> Iterator[tuple[int, int, int]]:
+    """Yield codec, first and last number of the mutants."""
+    for codec in codecs:
+        for start in range(0, frames, PART):
+            yield codec, start, min(start + PART, frames)
+
+
+def work(task: tuple[int, int, int]) -> tuple[int, fuzzing.Found]:
+    """Try the mutants of one task."""
+    codec, start, end = task
+    return codec, fuzzing.fuzz(CODECS[codec], range(start, end))
+
+
+def row(codec: fuzzing.Codec, found: fuzzing.Found) -> str:
+    """Return a row of the table."""
+    errors = ", ".join(f"{name} {count}" for name, count in found.errors.most_common()) or "none"
+    cells = (
+        codec.name,
+        f"{found.frames}",
+        f"{1e3 * found.slowest:.2f} ms",
+        f"{1e3 * found.slowest_piece:.2f} ms, {found.size_piece} bytes",
+        f"{found.memory / 1024:.0f} KiB",
+        f"{codec.longest} bytes",
+        errors,
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
+    """Return the section of the page from the rows of the table by codec."""
+    frames = sum(int(text.split("|")[2]) for text in rows.values())
+    lines = [
+        f"{frames} damaged frames of {len(rows)} codecs: bits and bytes changed, stretches cut, repeated, exchanged "
+        "and inserted, numbers replaced by unusual ones, lengths and counts that are not true. Every one must be "
+        f"read, or refused with an error of the project, within {1e3 * fuzzing.SLOWEST:.0f} ms of processor time and "
+        f"within {fuzzing.OWN_MEMORY >> 10} KiB of memory and {fuzzing.MEMORY_PER_BYTE} bytes for each byte of the "
+        f"longest frame that was tried. One in {fuzzing.LENGTHENED} was lengthened to the longest frame, or to a piece "
+        "of up to 64 KiB as a connection delivers it, with up to some thousand frames: these have "
+        f"{1e3 * fuzzing.SLOWEST_PIECE:.0f} ms. Memory was measured with one in {fuzzing.SAMPLED}. Good frames are the "
+        "golden vectors, frames of the codecs themselves and of the simulators.",
+        "",
+        *TABLE,
+        *rows.values(),
+        "",
+        "A document or file may be longer than a piece; it takes its time by its length. `InstrumentTimeoutError`: the "
+        "frame was cut off, and the rest of it did not arrive.",
+        "",
+        *(["Failures:", "", *failures] if failures else ["No failure."]),
+        "",
+        f"`make fuzz`, seed 1, {platform.machine()}, Python {platform.python_version()}.",
+        "",
+        "Whole drivers are tried by the conformance kit: it records a session with the simulated device and replays it "
+        "with damaged frames ([Check a plugin](how-to/check-a-plugin.md)). Files that are imported have tests of the "
+        "same kind.",
+    ]
+    return "\n".join(lines)
+
+
+def sections(page: Path) -> tuple[str, dict[str, str]]:
+    """Return the start of the page and its sections by title."""
+    text = page.read_text(encoding="utf-8") if page.exists() else HEADING
+    head, *parts = re.split(r"^## (.+)\n", text, flags=re.MULTILINE)
+    return head, {name: part.strip("\n") for name, part in zip(parts[::2], parts[1::2], strict=True)}
+
+
+def updated(body: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> str:
+    """Return the section with the rows and failures of these codecs; those of other codecs stay."""
+    names = [codec.name for codec in CODECS]
+    before = {line[2:].partition(" |")[0]: line for line in body.splitlines() if line.startswith("| ")}
+    rows = before | {codec.name: row(codec, found) for codec, found in results}
+    tried = {codec.name for codec, _ in results}
+    kept = [
+        line for line in body.splitlines() for name in names if line.startswith(f"* {name}: ") and name not in tried
+    ]
+    failures = [f"* {codec.name}: `{text}`" for codec, found in results for text in found.failures]
+    return section({name: rows[name] for name in names if name in rows}, [*kept, *failures])
+
+
+def write(page: Path, title: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> None:
+    """Replace the rows of a section of the page."""
+    head, found = sections(page)
+    found[title] = updated(found.get(title, ""), results)
+    text = "".join(f"\n## {name}\n\n{part}\n" for name, part in found.items())
+    page.write_text(head.rstrip("\n") + "\n" + text, encoding="utf-8")
+
+
+def main() -> None:
+    """Try the codecs, print the table, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=lambda text: int(float(text)), default=1_000_000, help="of each codec")
+    parser.add_argument("--only", default="", help="codecs whose name this regular expression finds; other rows stay")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--out", type=Path, default=PAGE)
+    options = parser.parse_args()
+    chosen = [number for number, codec in enumerate(CODECS) if re.search(options.only, codec.name)]
+    if not chosen:
+        parser.error(f"expected a part of a name: {', '.join(codec.name for codec in CODECS)}")
+    found = {number: fuzzing.Found() for number in chosen}
+    start, failed = time.monotonic(), False
+    with multiprocessing.get_context("spawn").Pool(options.processes) as pool:
+        for number, part in pool.imap_unordered(work, tasks(chosen, options.frames)):
+            found[number] += part
+            if found[number].frames < options.frames:
+                continue
+            write(options.out, TITLE, [(CODECS[number], found[number])])  # what is ready is kept, whatever ends the run
+            failed = failed or bool(found[number].failures)
+            print(row(CODECS[number], found[number]), f"{time.monotonic() - start:.0f} s", flush=True)
+            for text in found[number].failures:
+                print(f"    {text}", flush=True)
+    print(f"written to {options.out}")
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()
