@@ -1,5 +1,6 @@
 import json
 
+import numpy as np
 from pydantic import BaseModel
 
 from errormotion.datasets import hash_dataset, provenance
@@ -34,3 +35,19 @@ def test_instruments_come_from_the_raw_dataset_unless_given(drift) -> None:
 
 def test_an_error_dataset_carries_its_provenance(errors) -> None:
     assert provenance.of(errors())["settings"] == {"average": 0.5}
+
+
+def test_an_identity_is_that_of_the_calibration_and_the_part() -> None:
+    a, C = np.arange(3.0), np.eye(3)
+    one = provenance.identity(a, C, part="part 1", along=(0.6, -0.8))
+    assert one == provenance.identity(a.copy(), C, part="part 1", along=(0.6 + 1e-12, -0.8))
+    assert one.startswith("sha256:")
+    assert one.endswith("/part 1")
+    others = [
+        provenance.identity(a, C, part="part 2", along=(0.6, -0.8)),
+        provenance.identity(a, C, part="part 1", along=(-0.6, 0.8)),
+        provenance.identity(a + 1e-15, C, part="part 1", along=(0.6, -0.8)),
+        provenance.identity(C, a, part="part 1", along=(0.6, -0.8)),
+        provenance.identity("certificate 4711", part="part 1"),
+    ]
+    assert len({one, *others}) == 6
