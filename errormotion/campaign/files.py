@@ -23,6 +23,7 @@ from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 from errormotion.kinematics.description import MachineDescription
+from errormotion.tolerances.table import Tolerances
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
@@ -68,6 +69,7 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
+    tolerances: Tolerances | None = None
 
     @field_validator("runs")
     @classmethod
@@ -147,6 +149,7 @@ class CampaignPlan:
     text: str
     folder: Path
     """Folder of the files that the settings name."""
+    tolerances: Tolerances | None = None
 
     @property
     def sha256(self) -> str:
@@ -256,7 +259,9 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
         tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
-    return CampaignPlan(table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve())
+    return CampaignPlan(
+        table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve(), table.tolerances
+    )
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:

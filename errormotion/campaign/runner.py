@@ -30,7 +30,13 @@ from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
 from errormotion.datasets.files.folders import looking_beside
+from errormotion.datasets.merit import figures_of, stored
 from errormotion.errors import RunError
+from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.table import from_run
+
+MOST_RESULTS = 200
+"""Figures of merit in a run.json."""
 
 log = logging.getLogger(__name__)
 
@@ -228,6 +234,7 @@ class _Session:
                 "method": {"id": info.id, "version": info.version, "status": info.status},
                 "settings": settings,
                 "settings_hash": settings_hash(settings, info.id, info.version),
+                "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
                 "inputs": {},
                 "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
@@ -310,14 +317,16 @@ class _Session:
         self.progress.stage("identifying")
         method = test.method()
         path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
-        if not (folder.path / path).exists():  # else: computed, but the process ended before run.json was written
+        if (folder.path / path).exists():  # computed, but the process ended before run.json was written
+            errors = datasets.load(folder.path / path)
+        else:
             with datasets.load(folder.raw) as raw:
                 errors = method.identify(raw, test.settings)
             datasets.validate(errors)
             (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
             datasets.save(errors, folder.path / path)
         folder.step("identify", "done")
-        folder.save(errors=path)
+        folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
         log.info("identified", extra={"data": {"errors": path}})
 
     def _report(self, folder: RunFolder) -> None:
@@ -411,6 +420,24 @@ def _in_order() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def results_of(errors: xr.Dataset) -> list[dict[str, Any]] | None:
+    """Return the figures of merit for ``run.json``, SI, at most MOST_RESULTS; None if the method fails to state them.
+
+    A failure is only logged, since the measurement is valid without them.
+    """
+    try:
+        return [stored(figure) for figure in figures_of(errors)[:MOST_RESULTS]]
+    except Exception:
+        log.exception("the figures of merit failed")
+        return None
+
+
+def conformity_of(folder: RunFolder, errors: xr.Dataset) -> dict[str, Any] | None:
+    """Return the decision on the tolerances of a run for its ``run.json``; None without tolerances."""
+    table = from_run(folder.data)
+    return None if table is None else judge(errors, table).plain()
+
+
 def settings_hash(settings: Mapping[str, Any], method: str, method_version: str) -> str:
     """Return twelve hexadecimal digits of the hash of effective settings, method and version."""
     text = json.dumps([method, method_version, settings], sort_keys=True, ensure_ascii=False)
@@ -422,4 +449,5 @@ def _stored_plan(folder: RunFolder) -> CampaignPlan:
     campaign, bench = folder.data["campaign"], folder.data["bench"]
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     found = parse_campaign(campaign["text"], folder.path / f"run.json ({campaign['file']})", plan)
+    found = replace(found, tolerances=from_run(folder.data) or found.tolerances)
     return replace(found, folder=Path(campaign["folder"])) if "folder" in campaign else found

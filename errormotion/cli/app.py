@@ -38,6 +38,10 @@ Runs = Annotated[
     Path | None, typer.Option("--runs", help="Folder for run folders; default: the folder that the campaign names.")
 ]
 
+Tolerances = Annotated[
+    Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
+]
+
 
 def _version(value: bool) -> None:
     if value:
@@ -84,6 +88,7 @@ def run(
     runs: Runs = None,
     yes: Annotated[bool, typer.Option("--yes", help="Assume that every request to the operator is done.")] = False,
     report: Annotated[bool, typer.Option(help="Write a report for each test.")] = True,
+    tolerances: Tolerances = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Report path and duration only; nothing is opened or moved.")
     ] = False,
@@ -104,7 +109,7 @@ def run(
         raise typer.Exit(USAGE)
     from errormotion.cli.commands import run as command
 
-    command.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, as_json=json_)
+    command.run(campaign, resume=resume, runs=runs, yes=yes, with_report=report, tolerances=tolerances, as_json=json_)
 
 
 @app.command()
@@ -280,12 +285,13 @@ def replay(
 def report(
     run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
     out: Annotated[Path | None, typer.Option(help="The page to write; default: report.html in the run folder.")] = None,
+    tolerances: Tolerances = None,
     json_: Json = False,
 ) -> None:
     """Write the report of a run."""
     from errormotion.cli.commands import data
 
-    data.report(run, out, json_)
+    data.report(run, out, tolerances, json_)
 
 
 @app.command()
@@ -342,6 +348,40 @@ def compare(
         point = (x, y, z)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
     command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
+
+
+@app.command()
+@guarded
+def runs(
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Run folders, or folders of runs; default: runs.", show_default=False)
+    ] = None,
+    machine: Annotated[str | None, typer.Option(help="Only the runs of this machine.")] = None,
+    method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    since: Annotated[str | None, typer.Option(metavar="DATE", help="Only runs from this date on, UTC.")] = None,
+    json_: Json = False,
+) -> None:
+    """List the runs of folders, newest first, each with its figure of merit."""
+    from errormotion.cli.commands import runs as command
+
+    command.runs(folders or [], machine, method, since, json_)
+
+
+@app.command()
+@guarded
+def history(
+    machine: Annotated[str, typer.Option(help="The machine.")],
+    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
+    ] = None,
+    method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    json_: Json = False,
+) -> None:
+    """Show a figure of a machine over time, with its trend and a step."""
+    from errormotion.cli.commands import history as command
+
+    command.history(folders or [], machine, figure, method, json_)
 
 
 @app.command()

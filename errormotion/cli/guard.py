@@ -20,6 +20,8 @@ from errormotion.cli import output
 from errormotion.errors import ErrormotionError
 
 OK, ERROR, USAGE, INVALID, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 70, 130
+NONCONFORMING, UNDECIDED = 4, 5
+"""Decisions on tolerances; see ``commands.tolerances``."""
 
 P = ParamSpec("P")
 

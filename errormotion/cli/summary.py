@@ -9,26 +9,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion import plugins
 from errormotion.cli.output import table
-from errormotion.datasets.merit import is_planned, last_values
 from errormotion.plugins import FigureOfMerit
 
 FIELD_UNITS = {"m": (1e6, "um"), "rad": (648000 / np.pi, "arcsec")}
 """Factor and name of the unit in which a quantity is printed, by its SI unit."""
 LONG = 1e-3
 """Lengths from here on are printed in mm, m."""
-
-
-def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
-    """Return the figures of merit: those of the plugin that made the dataset, else the last values over time.
-
-    A plan states no errors and has none.
-    """
-    if is_planned(errors):
-        return []
-    owner = plugins.owner_of_method(str(errors.attrs.get("method")))
-    return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
 
 
 def as_printed(figure: FigureOfMerit) -> dict[str, Any]:
@@ -45,15 +32,20 @@ def as_printed(figure: FigureOfMerit) -> dict[str, Any]:
     }
 
 
+def digits_of(figure: dict[str, Any]) -> tuple[str, str]:
+    """Return value and expanded uncertainty of a printed figure, to the digits of the uncertainty."""
+    u = figure["expanded_uncertainty"]
+    digits = max(0, 1 - math.floor(math.log10(u))) if math.isfinite(u) and u > 0 else 2
+    return f"{figure['value']:.{digits}f}", f"{u:.{digits}f}" if math.isfinite(u) else "unknown"
+
+
 def figure_table(figures: Sequence[dict[str, Any]]) -> str:
     """Return printed figures as a table, each value to the digits of its uncertainty."""
     rows = []
     for figure in figures:
-        u = figure["expanded_uncertainty"]
-        digits = max(0, 1 - math.floor(math.log10(u))) if math.isfinite(u) and u > 0 else 2
-        stated = f"{u:.{digits}f}" if math.isfinite(u) else "unknown"
+        value, stated = digits_of(figure)
         limit = "" if figure["limit"] is None else f"{figure['limit']:g}"
-        rows.append([figure["name"], f"{figure['value']:.{digits}f}", stated, figure["unit"], limit])
+        rows.append([figure["name"], value, stated, figure["unit"], limit])
     if any(row[-1] for row in rows):
         return table(["", "value", "U (k=2)", "unit", "limit"], rows)
     return table(["", "value", "U (k=2)", "unit"], [row[:-1] for row in rows])

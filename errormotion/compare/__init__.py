@@ -60,8 +60,9 @@ def compare(
     for each in pairs:
         wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
         heat = _temperatures(datasets, ground) if wanted else {}
+        a, b = by_name[each.a], by_name[each.b]
         found.append(
-            diagnose(by_name[each.a], by_name[each.b], ground.freedoms, time=time, temperatures=heat) if wanted else []
+            diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
         )
     return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found)
 

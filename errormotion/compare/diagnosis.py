@@ -112,6 +112,7 @@ def diagnose(
     *,
     time: Array | None = None,
     temperatures: Mapping[str, Array] | None = None,
+    turns: Mapping[str, Array] | None = None,
 ) -> list[Cause]:
     """Return the causes that could explain the difference of two estimates, the most likely one first.
 
@@ -125,6 +126,8 @@ def diagnose(
         s; without it no cause in time is tried.
     temperatures : mapping of str to ndarray (n,), optional
         Recorded temperatures, degC, for an expansion.
+    turns : mapping of str to ndarray (n, 3), optional
+        Rotations by the name of the dataset, rad: for its functional point, where rotations are not compared.
 
     Returns
     -------
@@ -138,7 +141,7 @@ def diagnose(
     whole = white.square(d.value)
     count = max(white.degrees, 2)
     fitted = []
-    for candidate in _candidates(a, b, freedoms, time, temperatures or {}):
+    for candidate in _candidates(a, b, freedoms, time, temperatures or {}, turns or {}):
         if found := _fitted(candidate, d, white, whole, count):
             fitted.append(found)
     fitted.sort(key=lambda each: -each[0].score)
@@ -198,11 +201,20 @@ def _with_alike(cause: Cause, effect: Array, fitted: Sequence[tuple[Cause, Array
 
 
 def _candidates(
-    a: Estimate, b: Estimate, freedoms: Sequence[str], time: Array | None, temperatures: Mapping[str, Array]
+    a: Estimate,
+    b: Estimate,
+    freedoms: Sequence[str],
+    time: Array | None,
+    temperatures: Mapping[str, Array],
+    turns: Mapping[str, Array],
 ) -> Iterator[_Candidate | _Corrected]:
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
     yield from _geometric(mean, k)
+    if not set(freedoms) & set(DOF[3:]):
+        for each in (a, b):
+            if each.name in turns:
+                yield from _functional_point(turns[each.name], k, f"functional point of '{each.name}'")
     yield from _scales(mean, k, freedoms)
     yield from _fixed(a, b, freedoms)
     n = len(a.value)
@@ -222,18 +234,22 @@ def _candidates(
 
 def _geometric(E: Array, k: list[int]) -> Iterator[_Candidate]:
     shift, turn = E[:, :3], E[:, 3:]
-    if np.abs(turn).max(initial=0.0) > 0:
-        lever = np.zeros((3, len(E), 6))
-        for axis in range(3):
-            lever[axis, :, :3] = np.cross(turn, np.eye(3)[axis])
-        used = [axis for axis in range(3) if np.abs(lever[axis][:, k]).max() > 0]
-        labels = tuple(("XYZ"[axis], "m") for axis in used)
-        yield _Candidate("functional point", lever[used][:, :, k], labels)
+    yield from _functional_point(turn, k, "functional point")
     for axis, name in enumerate(
         ("roll of the frame (about X)", "pitch of the frame (about Y)", "yaw of the frame (about Z)")
     ):
         rotated = np.concatenate([np.cross(np.eye(3)[axis], part) for part in (shift, turn)], axis=1)
         yield _Candidate(name, rotated[None][:, :, k], (("angle", "rad"),))
+
+
+def _functional_point(turn: Array, k: list[int], name: str) -> Iterator[_Candidate]:
+    if np.abs(turn).max(initial=0.0) > 0:
+        lever = np.zeros((3, len(turn), 6))
+        for axis in range(3):
+            lever[axis, :, :3] = np.cross(turn, np.eye(3)[axis])
+        used = [axis for axis in range(3) if np.abs(lever[axis][:, k]).max() > 0]
+        labels = tuple(("XYZ"[axis], "m") for axis in used)
+        yield _Candidate(name, lever[used][:, :, k], labels)
 
 
 def _scales(E: Array, k: list[int], freedoms: Sequence[str]) -> Iterator[_Candidate]:

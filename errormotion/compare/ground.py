@@ -44,6 +44,8 @@ class Ground:
     since : float or None
         Time of the common reference state, s on ``time``; None where the errors have no common reference in time.
     notes : list of str
+    turns : dict of str to ndarray (n, 3)
+        Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
     """
 
     estimates: list[Estimate]
@@ -57,6 +59,7 @@ class Ground:
     since: float | None
     start: str = ""
     notes: list[str] = field(default_factory=list)
+    turns: dict[str, Array] = field(default_factory=dict)
 
 
 def common_ground(
@@ -133,6 +136,7 @@ def common_ground(
         since=reference,
         start=str(grid.attrs.get("start", "")),
         notes=notes,
+        turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
     )
 
 
@@ -274,6 +278,11 @@ def _known(ds: xr.Dataset) -> Array:
 
 def _seen(ds: xr.Dataset) -> list[str]:
     return [name for name in DOF if np.isfinite(ds[name].values).any()]
+
+
+def _turns(ds: xr.Dataset) -> Array:
+    found: Array = np.nan_to_num(ds.em.twist().values.reshape(-1, 6)[:, 3:])
+    return found
 
 
 def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:

@@ -1,4 +1,4 @@
-"""The plugin ``comparison``: results of comparisons as datasets."""
+"""The plugin ``error_comparison``: results of comparisons as datasets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class ComparisonDataset:
     """Comparisons of error datasets."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
-        id="comparison",
+        id="error_comparison",
         summary="Comparison of several error datasets: differences, consensus, causes",
         schemas=("errormotion.comparison/1",),
     )

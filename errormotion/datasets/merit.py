@@ -1,11 +1,12 @@
-"""Figures of merit that several methods state in the same way: the six freedoms at one instant or of one beam."""
+"""Figures of merit of any error dataset, and those that several methods state in the same way."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion import plugins
 from errormotion.plugins import FigureOfMerit
 
 if TYPE_CHECKING:
@@ -15,6 +16,26 @@ if TYPE_CHECKING:
 def is_planned(errors: xr.Dataset) -> bool:
     """Return whether a dataset states an expected covariance, and nothing was measured."""
     return "planned" in str(errors.attrs.get("reference", ""))
+
+
+def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
+    """Return the figures of merit: those of the plugin that made the dataset, else the last values over time.
+
+    A plan states no errors and has none.
+    """
+    if is_planned(errors):
+        return []
+    owner = plugins.owner_of_method(str(errors.attrs.get("method")))
+    return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
+
+
+def stored(figure: FigureOfMerit) -> dict[str, Any]:
+    """Return a figure for a JSON file, SI; a number that is not known is None."""
+    numbers = {"value": figure.value, "expanded_uncertainty": figure.expanded_uncertainty, "limit": figure.limit}
+    known = {
+        key: None if number is None or not np.isfinite(number) else float(number) for key, number in numbers.items()
+    }
+    return {"name": figure.name, **known, "unit": figure.unit}
 
 
 def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:

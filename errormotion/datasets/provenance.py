@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
@@ -9,12 +10,14 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, cast
 
+import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
 from errormotion.datasets.files.hashing import hash_dataset, plain
 
-__all__ = ["hash_dataset", "make", "of", "plain"]
+__all__ = ["hash_dataset", "identity", "make", "of", "plain"]
 
 _PACKAGES = ("errormotion", "numpy", "scipy", "xarray", "zarr", "h5netcdf", "numba")
 
@@ -61,6 +64,35 @@ def make(
         "seed": seed,
         "steps": plain(steps),
     }
+
+
+def identity(*calibrated: ArrayLike | str, part: str, along: ArrayLike = ()) -> str:
+    """Return the identity of a source: equal in two datasets that use the same calibration.
+
+    Parameters
+    ----------
+    *calibrated : array_like or str
+        What was calibrated: values and covariance as the calibration states them, or its hash.
+    part : str
+        Which of the independent parts of its uncertainty.
+    along : array_like, optional
+        Direction of this part among the calibrated parameters; it counts to 1e-6, with its sign, so that a part whose
+        direction is reversed is another source.
+
+    Returns
+    -------
+    str
+        For ``source_ids`` of `errormotion.datasets.build_errors`.
+    """
+    digest = hashlib.sha256()
+    for each in (*calibrated, np.round(np.asarray(along, dtype=float), 6) + 0.0):
+        if isinstance(each, str):
+            data, shape = each.encode(), "text"
+        else:
+            array = np.ascontiguousarray(each, dtype="<f8")
+            data, shape = array.tobytes(), str(array.shape)
+        digest.update(f"{shape} {len(data)}:".encode() + data)
+    return f"sha256:{digest.hexdigest()[:32]}/{part}"
 
 
 def of(ds: xr.Dataset) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
+import xarray as xr
+
 from errormotion.errors import DatasetError
 
 
@@ -30,3 +32,14 @@ def between(start: str, end: str) -> float:
     """Return the seconds from one instant to another; DatasetError as of `later`."""
     first, last = (datetime.fromisoformat(later(each, 0.0) or "x") for each in (start, end))
     return (last - first).total_seconds()
+
+
+def start_of(ds: xr.Dataset, seconds: float = 0.0) -> str:
+    """Return the instant some seconds after the attribute ``start`` of a dataset, in UTC.
+
+    Empty where the dataset states no start, or one without an offset from UTC.
+    """
+    try:
+        return later(str(ds.attrs.get("start", "")), seconds)
+    except DatasetError:
+        return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -21,6 +22,8 @@ from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Cell, Part, Source, Table
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH
+from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.table import Tolerances, from_run
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.
 COMPONENTS = {"beam": beams.part}
@@ -66,7 +69,17 @@ def write_report(
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
         sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
-    return write_page(sources, [part for source in sources for part in chapters(source)], Path(out), title)
+    tolerances = from_run(run or {})
+    parts = [part for source in sources for part in _judged(chapters(source), source, tolerances)]
+    return write_page(sources, parts, Path(out), title)
+
+
+def _judged(parts: list[Part], source: Source, tolerances: Tolerances | None) -> list[Part]:
+    """Return the chapters of a source; the summary of the first one starts with the decision on the tolerances."""
+    if tolerances is None or not parts or str(source.errors.attrs.get("schema")) != plugins.ERRORS_SCHEMA:
+        return parts
+    lines = judge(source.errors, tolerances).lines()
+    return [replace(parts[0], summary=[*lines, *parts[0].summary]), *parts[1:]]
 
 
 def chapters(source: Source) -> list[Part]:

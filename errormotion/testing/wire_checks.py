@@ -18,8 +18,8 @@ from errormotion.testing.kit import require
 from errormotion.testing.sessions import numbers
 
 LATE = "late"
-LATE_ANSWER = 20
-"""Number of the answer that is late: by then most instruments are open."""
+LATE_ANSWERS = (12, 20, 30, 45, 70, 110)
+"""Numbers of the answer that is late: the first one for which the instrument is open by then."""
 READINGS = 24
 READINGS_AFTER_ERROR = 4
 MOST_FAILURES = 12
@@ -27,7 +27,7 @@ PAUSE = 0.1
 """After a failed reading, s."""
 QUICK, SLOW = 0.2, 1.3
 """Time limits that are tried, s; the default of a transport lies between them."""
-SPEEDS = (19200, 57600, 115200, 230400)
+SPEEDS = (19200, 57600, 115200, 230400, 2000000)
 TCP_FORMS = ("tcp://{}", "modbus+tcp://{}?unit=1", "http://{}/")
 SERIAL_FORMS = ("serial://{}", "modbus+rtu://{}?unit=1")
 
@@ -64,13 +64,23 @@ def late_answers(subject: InstrumentSubject) -> str:
         limit = 1.0
     sound = _readings(subject, "")
     seen = [
-        _require_in_step(sound, _readings(subject, f"{LATE}&fault_at={LATE_ANSWER}{when}"), how)
+        _require_in_step(sound, _late_readings(subject, when), how)
         for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
     ]
     return "; ".join(seen)
 
 
 Reading = tuple[float, ...] | Exception
+
+
+def _late_readings(subject: InstrumentSubject, when: str) -> list[Reading]:
+    """Return readings of which one answer is late, after the instrument was opened."""
+    found: list[Reading] = []
+    for number in LATE_ANSWERS:
+        found = _readings(subject, f"{LATE}&fault_at={number}{when}")
+        if not isinstance(found[0], Exception):
+            break
+    return found
 
 
 def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:

@@ -21,6 +21,7 @@ from errormotion.campaign.files import BenchPlan, parse_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.monitor.watch import FLAGS, Monitor
 from errormotion.errors import BenchError, RunError
+from errormotion.instruments.thermometer import sensors
 
 HEAD = 'schema = "errormotion.bench/1"\nname = "Shop"\nmachine = "Mill 5"\n'
 TICK = 0.05
@@ -170,6 +171,23 @@ def test_an_open_sensor_is_unknown_and_flagged(tmp_path: Path) -> None:
     with datasets.load(monitor.folder.raw) as log:
         meanings = json.loads(log.attrs["flag_meanings"])
         assert meanings[int(log.temperature_flag.sel(sensor="column")[-1])] == seen.flags["column"]
+
+
+def test_a_faulty_sensor_is_logged_as_faulty(tmp_path: Path) -> None:
+    node = (
+        '[instruments.node]\ndriver = "can_temperature"\naddress = "sim://cframe/node?seed=11&open=0"\n'
+        'channels = ["spindle", "column"]\n'
+    )
+    with Monitor(bench(node), tmp_path, TICK) as monitor:
+        seen = list(islice(monitor.watch(), 3))[-1]
+    assert seen.flags["spindle"] == "faulty"  # the device does not distinguish an open sensor from a shorted one
+    with datasets.load(monitor.folder.raw) as log:
+        meanings = json.loads(log.attrs["flag_meanings"])
+        assert meanings[int(log.temperature_flag.sel(sensor="spindle")[-1])] == "faulty"
+
+
+def test_every_reason_of_a_thermometer_has_a_number_in_the_log() -> None:
+    assert set(sensors.FLAGS) - {sensors.GOOD, sensors.NOT_READ} <= set(FLAGS)
 
 
 def test_sensors_of_the_same_name_keep_the_names_of_their_instruments(tmp_path: Path) -> None:

@@ -8,8 +8,9 @@ import pytest
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.merit import figures_of
 from errormotion.methods.beam_direction import BeamDirection, Settings
 from errormotion.plugins import FigureOfMerit
 

@@ -229,3 +229,15 @@ def test_ten_thousand_instants_are_compared_in_seconds():
     t = np.linspace(0, 7200, 10_000)
     found = compare({"a": made(t, rng), "b": made(t, rng, name="b")}, causes=False)
     assert found.sizes["time"] == 10_000
+
+
+def test_a_wrong_functional_point_is_named_where_only_displacements_are_compared():
+    rng = np.random.default_rng(12)
+    wrong = made(T2, rng, name="b").em.at((0, 0, 0.05)).assign_attrs(functional_point=np.zeros(3))
+    found = compare({"drift": made(T1, rng), "probing": wrong}, freedoms=["EX", "EY", "EZ"])
+    first = found.isel(pair=0, rank=0)
+    assert first["cause"].item().startswith("functional point")
+    size, u = np.abs(first["size"].values), first["size_u"].values
+    assert abs(size[2] - 0.05) < 4 * u[2]
+    both = {first["cause"].item(), *first["alike"].item().split("; ")}
+    assert both == {"functional point of 'drift'", "functional point of 'probing'"}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from errormotion.compare.result import TABLE
 from errormotion.datasets.calibrations import inclination as calibration
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RawSchema, Row, raw_schemas
 from errormotion.methods.spindle_drift.log_import.import_map import (
@@ -43,6 +44,12 @@ def test_the_table_of_each_raw_dataset_is_the_schema(raw: RawSchema) -> None:
     assert len(sections) == len(RAW_SCHEMAS)
     of_schema = [section for section in sections if f"`{raw.id}`" in section]
     assert [line(row) for row in raw.rows] in [rows_of(section) for section in of_schema]
+
+
+def test_the_table_of_comparisons_is_the_schema() -> None:
+    section = PAGE.partition("\n## Comparison")[2].partition("\n## ")[0]
+    rows = [row for row in section.splitlines() if row.startswith("| `")]
+    assert rows == [f"| `{name}` | {', '.join(dims)} | {meaning} |" for name, (dims, meaning) in TABLE.items()]
 
 
 def test_the_table_of_calibrations_is_the_schema() -> None:

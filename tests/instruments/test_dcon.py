@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.simulators import world
@@ -33,6 +34,24 @@ def test_vectors() -> None:
     assert encode("#01") == b"#01\r"
     assert parse_temperatures(decode(b">+025.12+026.00\r")) == [25.12, 26.0]
     assert format_temperatures([25.12, 26.0]) == ">+025.12+026.00"
+
+
+@pytest.mark.parametrize("vector", vectors("dcon_temperature", "reading"), ids=str)
+def test_readings_that_makers_print(vector: Vector) -> None:
+    found = parse_temperatures(decode(vector.data))
+    assert found == pytest.approx(vector.expected["values"], abs=1e-12, nan_ok=True)
+
+
+@pytest.mark.parametrize("vector", vectors("dcon_temperature", "checked line"), ids=str)
+def test_lines_with_checksum_that_makers_print(vector: Vector) -> None:
+    assert decode(vector.data, with_checksum=True) == vector.expected["text"]
+    assert encode(vector.expected["text"], with_checksum=True) == vector.data
+
+
+@pytest.mark.parametrize("vector", vectors("dcon_temperature", "line"), ids=str)
+def test_lines_that_makers_print(vector: Vector) -> None:
+    assert decode(vector.data) == vector.expected["text"]
+    assert encode(vector.expected["text"]) == vector.data
 
 
 def test_checksum_is_the_sum_of_the_characters() -> None:

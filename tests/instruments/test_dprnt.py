@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.virtual import VirtualController
@@ -49,6 +50,14 @@ def test_lines_are_read_as_controls_print_them(text: str, line: Line) -> None:
     assert found.position == pytest.approx(line.position, abs=1e-15)
     assert found.number == line.number
     assert found.time == pytest.approx(line.time, nan_ok=True)
+
+
+@pytest.mark.parametrize("vector", vectors("dprnt"), ids=str)
+def test_lines_after_the_manual_of_haas(vector: Vector) -> None:
+    found = parse_line(text_of(vector.data), re.compile(vector.expected.get("pattern", PATTERN)))
+    assert found.position == pytest.approx([value * 1e-3 for value in vector.expected["position"]], abs=1e-15)
+    assert found.number == vector.expected.get("number")
+    assert found.time == pytest.approx(vector.expected.get("time", math.nan), nan_ok=True)
 
 
 @given(
@@ -154,6 +163,15 @@ def machine() -> Iterator[Machine]:
     made = Machine()
     yield made
     made.server.close()
+
+
+@pytest.mark.parametrize(("line_end", "end"), [("cr", b"\r"), ("lf", b"\n"), ("lf", b"\r\n"), ("lf", b"\n\r\r")])
+def test_lines_end_as_the_settings_say(machine: Machine, line_end: str, end: bytes) -> None:
+    settings = DprntSettings(timeout=2.0, start_timeout=2.0, line_end=line_end)
+    with Dprnt(machine.server.url, settings) as probe:
+        machine.say(*(printed(k).encode() + end for k in range(2)))
+        found = [each.position for each in probe.measure(TOUCHES[:2])]
+    assert found == [pytest.approx((2e-3, 0.01 * k, 0.0)) for k in range(2)]
 
 
 @pytest.fixture

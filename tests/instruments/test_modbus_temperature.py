@@ -26,7 +26,9 @@ from errormotion.instruments.simulators.thermometer.modbus import SimulatedModbu
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.instruments.thermometer.registers import ModbusSettings, encode_number
 from errormotion.instruments.transports import parse_address
-from errormotion.instruments.transports.modbus.codec import ModbusRefusal
+from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.transports.modbus.client import ModbusLine
+from errormotion.instruments.transports.modbus.codec import ModbusRefusal, crc16
 
 LOGGER = "sim://cframe/logger?seed=3&map=logger-16"
 # long enough for the pauses of a garbage collection (0.3 s on a slow computer), during which no simulator answers
@@ -361,3 +363,65 @@ def test_a_session_with_gaps_plays_back_with_the_same_gaps(tmp_path: Path) -> No
         sessions.append(found)
     assert sessions[0] == sessions[1]
     assert sessions[0].count("gap") == 2
+
+
+class Answering(Transport):
+    """A serial line whose device answers as a function of the request says."""
+
+    def __init__(self, answer: Callable[[int], list[bytes]]) -> None:
+        super().__init__("serial://test", 0.1)
+        self.counts: list[int] = []
+        self._answer, self._waiting = answer, b""
+
+    def _send(self, data: bytes) -> None:
+        self.counts.append(int.from_bytes(data[4:6], "big"))
+        self._waiting += b"".join(self._answer(self.counts[-1]))
+
+    def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        if not self._waiting:
+            time.sleep(timeout)
+            raise InstrumentTimeoutError("nothing")
+        data, self._waiting = self._waiting[:max_bytes], self._waiting[max_bytes:]
+        return data
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def rtu(*values: int) -> bytes:
+    frame = bytes((1, 3, 2 * len(values))) + b"".join(value.to_bytes(2, "big") for value in values)
+    return frame + crc16(frame)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_answer_that_waits_for_the_next_request_is_not_taken_for_its_answer(count: int) -> None:
+    held: list[bytes] = []
+
+    def answer(n: int) -> list[bytes]:
+        frame = rtu(*[len(device.counts)] * n)
+        if len(device.counts) == 2:
+            held.append(frame)
+            return []
+        found = [*held, frame]
+        held.clear()
+        return found
+
+    device = Answering(answer)
+    line = ModbusLine(device, "rtu", 1)
+    assert line.registers(3, 0, count) == [1] * count
+    with pytest.raises(InstrumentTimeoutError):
+        line.registers(3, 0, count)
+    assert line.registers(3, 0, count) == [4] * count  # the third request is that with an answer of another length
+    assert device.counts == [count, count, 3 - count, count]
+    assert line.registers(3, 0, count) == [5] * count
+
+
+def test_a_device_that_is_silent_at_the_other_length_is_read_again() -> None:
+    device = Answering(lambda n: [rtu(*[7] * n)] if n == 2 and len(device.counts) != 2 else [])
+    line = ModbusLine(device, "rtu", 1)
+    assert line.registers(3, 0, 2) == [7, 7]
+    for _ in range(2):
+        with pytest.raises(InstrumentTimeoutError):
+            line.registers(3, 0, 2)
+    assert line.registers(3, 0, 2) == [7, 7]
+    assert device.counts == [2, 2, 1, 2]

@@ -36,8 +36,8 @@ from errormotion.errors import BenchError
 
 TEST = "monitor"
 
-FLAGS = ("known", "open", "shorted", "out of range", "no answer", "unknown")
-"""Reasons of unknown temperatures; the log contains the index in this list."""
+FLAGS = ("known", "open", "shorted", "out of range", "no answer", "unknown", "faulty")
+"""Reasons of unknown temperatures; the log contains the index in this list, and the list itself."""
 
 OLDEST_READING = 2.5
 """Greatest age of a reading that is logged, in intervals: one interval may pass without a new reading, two may not."""

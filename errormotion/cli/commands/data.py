@@ -15,7 +15,8 @@ from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
-from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.datasets.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
 
@@ -129,24 +130,40 @@ def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
             show(f"  note: {note}")
 
 
-def report(run: Path, out: Path | None, as_json: bool) -> None:
-    """Write the report of a run folder or of one file of errors."""
+def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) -> None:
+    """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
     from errormotion.campaign.folder import RunFolder
+    from errormotion.cli.tolerances import end_with, lines_of
     from errormotion.report import write_report, write_run_report
+    from errormotion.tolerances.conformity import judge
+    from errormotion.tolerances.table import from_run, load_tolerances
 
+    limits = load_tolerances(tolerances) if tolerances is not None else None
+    found = None
     if run.is_dir():
         folder = RunFolder.open(run)
+        stored = limits or from_run(folder.data)
+        if stored is not None and folder.errors is not None:
+            found = judge(datasets.load(folder.errors), stored)
+            folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
         path = write_run_report(run, out)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        path = write_report(datasets.load(run), out or run.with_suffix(".html"))
+        errors = datasets.load(run)
+        found = judge(errors, limits) if limits is not None else None
+        state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+        path = write_report(errors, out or run.with_suffix(".html"), run=state)
     if as_json:
-        show_json({"ok": True, "report": str(path)})
+        show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
     else:
+        for line in lines_of(found) if found is not None else []:
+            show(line)
         show(str(path))
+    if found is not None:
+        end_with([found.plain()])
 
 
 def validate(file: Path) -> list[str]:
@@ -165,11 +182,14 @@ def validate(file: Path) -> list[str]:
 def _of_toml(file: Path) -> list[str]:
     from errormotion.campaign.files import load_bench, load_campaign
     from errormotion.datasets.files.tomlfile import read_toml
+    from errormotion.tolerances.table import load_tolerances
 
     try:
         schema = str(read_toml(file).get("schema", ""))
         if schema.startswith("errormotion.campaign/"):
             load_campaign(file)
+        elif schema.startswith("errormotion.tolerances/"):
+            load_tolerances(file)
         else:
             load_bench(file)
     except ErrormotionError as error:

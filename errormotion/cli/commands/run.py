@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +16,50 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
-from errormotion.cli.summary import as_printed, figure_table, figures_of, notes_of
+from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.cli.tolerances import end_with, remarks
+from errormotion.datasets.merit import figures_of
+from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.table import from_run, load_tolerances
 
 
-def run(campaign: Path | None, *, resume: bool, runs: Path | None, yes: bool, with_report: bool, as_json: bool) -> None:
+def run(
+    campaign: Path | None,
+    *,
+    resume: bool,
+    runs: Path | None,
+    yes: bool,
+    with_report: bool,
+    tolerances: Path | None,
+    as_json: bool,
+) -> None:
     """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
         typer.echo("Give a campaign file, or --resume to go on with the newest unfinished one.", err=True)
         raise typer.Exit(USAGE)
+    if tolerances is not None and (resume or campaign is None):
+        typer.echo(
+            "--tolerances is not allowed with --resume. Resume first, then: errormotion report RUN --tolerances FILE",
+            err=True,
+        )
+        raise typer.Exit(USAGE)
+    limits = load_tolerances(tolerances) if tolerances else None
     plan = load_campaign(campaign) if campaign else None
+    if plan is not None and limits is not None:
+        plan = replace(plan, tolerances=limits)
     folders = work(plan, resume=resume, runs=runs, yes=yes, with_report=with_report, quiet=as_json)
+    decisions = [folder.data["conformity"] for folder in folders if folder.data.get("conformity")]
     if as_json:
         show_json({"ok": True, "tests": [describe(folder) for folder in folders]})
+        end_with(decisions)
         return
     for folder in folders:
         show(f"\n{folder.data['test']} ({folder.data['method']['id']}): {folder.data['status']} in {folder.path}")
         for line in _lines(folder):
             show(f"  {line}")
+    for line in remarks(decisions):
+        show(line)
+    end_with(decisions)
 
 
 def work(
@@ -76,6 +104,7 @@ def describe(folder: RunFolder) -> dict[str, Any]:
         "report_error": report_error(folder),
         "results": [as_printed(figure) for figure in figures_of(result)] if result is not None else [],
         "notes": notes_of(result) if result is not None else [],
+        "conformity": data.get("conformity"),
     }
 
 
@@ -87,7 +116,9 @@ def report_error(folder: RunFolder) -> str | None:
 
 def _lines(folder: RunFolder) -> list[str]:
     found = describe(folder)
-    lines = [f"report  {found['report']}"] if found["report"] else []
+    table = from_run(folder.data)
+    lines = judge(datasets.load(found["errors"]), table).lines() if table is not None and found["errors"] else []
+    lines += [f"report  {found['report']}"] if found["report"] else []
     if found["report_error"]:
         lines.append(f"no report: {found['report_error']}; after the correction: errormotion report {folder.path}")
     lines.append(f"errors  {found['errors']}")

@@ -20,6 +20,7 @@ from errormotion.datasets.checks import dims, magnitude_violations, storable_vio
 from errormotion.datasets.schemas import DOF, Row
 from errormotion.datasets.storage import load as load_dataset
 from errormotion.datasets.storage import reading, save
+from errormotion.datasets.timing import start_of
 from errormotion.errors import DatasetError
 
 SCHEMA = "errormotion.model.thermal/1"
@@ -189,6 +190,7 @@ class ThermalModel:
         unknown = ~np.isfinite(X).all(axis=1)
         values[unknown] = np.nan
         influence, names, kinds = self._influence(np.nan_to_num(X))
+        own_hash = provenance.hash_dataset(ds)
         covariance = np.einsum("stj,stk->tjk", influence, influence)
         span = ds["feature_high"].values - ds["feature_low"].values
         features_outside = (ds["feature_high"].values + EXTRAPOLATION * span < X) | (
@@ -221,12 +223,15 @@ class ThermalModel:
                 {"variant": ds.attrs["variant"]},
                 None,
                 instruments_of([data, ds]),
-                steps=[{"model": provenance.hash_dataset(ds)}],
+                steps=[{"model": own_hash}],
             ),
             influence=influence,
             sources=names,
             source_groups=kinds,
             extras=extras,
+            start=start_of(data),
+            source_ids=self._identities(names, kinds, own_hash),
+            reference_interval=(float(inputs.time[0]), float(inputs.time[0])),
         )
         notes = [f"{int(unknown.sum())} of {n} times have no prediction: an input is unknown"] if unknown.any() else []
         if outside.any():
@@ -235,6 +240,20 @@ class ThermalModel:
         if notes:
             result.attrs["notes"] = json.dumps(notes)
         return result
+
+    def _identities(self, names: list[str], kinds: list[str], own_hash: str) -> dict[str, str]:
+        """Return the identity of the coefficients' parts, which all predictions of one model share; not of its misfit.
+
+        The parts are eigenvectors, whose sense is not determined: it is part of the identity.
+        """
+        found = {}
+        covariance = self.dataset["coefficient_covariance"].values
+        for name, kind in zip(names, kinds, strict=True):
+            if kind == "coefficients":
+                freedom, number = name.split()[-2:]
+                vectors = np.linalg.eigh(covariance[DOF.index(freedom)])[1]
+                found[name] = provenance.identity(own_hash, part=name, along=vectors[:, int(number) - 1])
+        return found
 
     def _influence(self, X: Array) -> tuple[Array, list[str], list[str]]:
         """Return the effects of one standard uncertainty of coefficients and misfit, (source, n, 6)."""

@@ -27,7 +27,7 @@ from errormotion.instruments.thermometer.sensors import NO_ANSWER, Thermometer, 
 from errormotion.instruments.transports.can.bus import CanNode, open_can
 from errormotion.instruments.transports.can.pdo import TransmitPdo
 from errormotion.instruments.transports.can.sdo import SdoRefusal
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 #: SDO abort codes of an input that has no value just now: hardware error, device state, no data.
 NO_VALUE = frozenset((0x06060000, 0x08000020, 0x08000021, 0x08000022, 0x08000024))
@@ -107,6 +107,11 @@ class CanTemperature(Thermometer):
     )
     Settings: ClassVar[type[CanSettings]] = CanSettings
     settings: CanSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
     def node(self) -> CanNode:

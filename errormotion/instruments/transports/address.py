@@ -13,8 +13,8 @@ BYTES = ("serial", "tcp", "sim", "replay")
 MODBUS = ("modbus+tcp", "modbus+rtu", "modbus+rtu-tcp")
 CAN = "can"
 HTTP = "http"
-OPCUA = "opc.tcp"
-SCHEMES = (*BYTES, *MODBUS, CAN, HTTP, OPCUA)
+OPC = "opc.tcp"
+SCHEMES = (*BYTES, *MODBUS, CAN, HTTP, OPC)
 MODBUS_PORT = 502
 _EXAMPLES = "serial:///dev/ttyUSB0?baudrate=921600, tcp://192.168.0.2:23, sim://cframe/X1?seed=3, replay://session.rec"
 _FORMS = {
@@ -120,7 +120,7 @@ def parse_address(url: str) -> Address:
     if scheme == "modbus+tcp" and port is None:
         port = MODBUS_PORT
     needed = {"tcp": parts.hostname and port is not None, "can": parts.hostname and path, "http": parts.hostname}
-    needed[OPCUA] = parts.hostname
+    needed[OPC] = parts.hostname
     needed["modbus+tcp"] = needed["modbus+rtu-tcp"] = needed["tcp"]
     if not (path.strip("/") if serial else needed.get(scheme, True)):
         raise InstrumentError(f"Expected {_FORMS[scheme]}; found '{url}'")

@@ -6,6 +6,7 @@ import xarray as xr
 from ballbar_test import circles, evaluation, result
 from ballbar_test.simulation import Machine, measure
 from errormotion.datasets import provenance
+from errormotion.datasets.timing import start_of
 
 MISFIT = 2.0
 """Chi-square of the model by degree of freedom from which a note reports it."""
@@ -32,6 +33,7 @@ def identify(raw, settings, method, version):
         method=method,
         method_version=version,
         provenance=provenance.make(effective(settings, read), raw, None, steps=steps(found)),
+        start=start_of(raw),
     )
     return errors.assign_attrs(notes=[*notes, *remarks(found, read)] or [""], **limits(settings))
 

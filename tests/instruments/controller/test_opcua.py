@@ -178,6 +178,51 @@ def test_a_value_with_a_bad_status_is_unknown_and_named(own):
     assert state["unavailable"] == ["position", "spindle_speed", "estop"]
 
 
+def test_with_the_simulated_control_all_quantities_of_the_model_are_known():
+    with OpcUa("sim://cframe/opcua?seed=3") as cnc:
+        state = cnc.state()
+    assert state["homed"] is True  # IsReferenced of every axis, OPC 40502, Table 14
+    assert state["program"] == ""
+    assert state["unavailable"] == ["estop"]  # that no program is selected is known
+
+
+def test_a_program_that_waits_is_running(shared):
+    server = shared(cnc_model)
+    found = {}
+    with OpcUa(server.url) as cnc:
+        for status in (0, 2, 3, 4, 1):  # CncChannelProgramStatus, OPC 40502, Table 26
+            server.set("ActProgramStatus", status)
+            found[status] = cnc.state()["running"]
+    assert found == {0: False, 1: True, 2: True, 3: False, 4: False}
+
+
+@pytest.mark.parametrize("units", ["model", "ua"])
+def test_the_unit_is_found_in_either_namespace(units):
+    with OpcUa(f"sim://cframe/opcua?seed=3&units={units}") as cnc:
+        cnc.transport._device.world.move_to([0.010, 0.0, 0.0], 0.05)
+        cnc.transport._device.world.elapse(10.0)
+        assert cnc.state()["position"] == pytest.approx([0.010, 0.0, 0.0])
+
+
+def test_a_sinumerik_is_read_with_the_settings_of_its_page():
+    nodes = {
+        **{
+            f"position.{axis}": f"ns=2;s=/Channel/GeometricAxis/actToolBasePos[u1,{i}]"
+            for i, axis in enumerate("XYZ", 1)
+        },
+        "spindle_speed": "ns=2;s=/Channel/Spindle/actSpeed[u1,1]",
+        "execution": "ns=2;s=/Channel/State/progStatus[u1]",
+    }
+    settings = OpcUaSettings(nodes=nodes, units={"position": "mm", "spindle_speed": "1/min"}, running=("3",))
+    with OpcUa("sim://cframe/opcua?seed=3&style=sinumerik", settings) as cnc:
+        world = cnc.transport._device.world
+        world.run_program("G1 X20 F300\nM2\n")
+        world.elapse(2.0)
+        state = cnc.state()
+    assert 0.0 < state["position"][0] < 0.020
+    assert state["running"] is True
+
+
 def test_the_encoder_of_the_motor_is_read_where_the_settings_say_so(shared):
     server = shared(cnc_model)
     server.set("X.PosIndirect.ActPos", 99.0)

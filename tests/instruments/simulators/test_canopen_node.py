@@ -380,3 +380,13 @@ def test_a_late_answer_precedes_the_next_one() -> None:
 def test_unknown_variants_are_refused(wrong):
     with pytest.raises(InstrumentError, match=next(iter(wrong))), simulated(**wrong):
         pass
+
+
+@pytest.mark.parametrize("delay", [{}, {"late_by": 0.15}])
+def test_a_late_answer_comes_before_the_next_one_or_after_its_delay(delay):
+    with raw(fault="late", fault_at=0, pdo="none", **delay) as ask:
+        assert ask("40 00 10 00 00 00 00 00", wait=0.05) is None
+        first = ask("40 18 10 00 00 00 00 00")
+        second = ask("40 01 10 00 00 00 00 00")
+    assert first.startswith("43 00 10 00")  # the device type, that was asked for first
+    assert second.startswith("4f 18 10 00")

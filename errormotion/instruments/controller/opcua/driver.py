@@ -13,7 +13,7 @@ from errormotion.instruments.controller.opcua import model
 from errormotion.instruments.controller.opcua.settings import NUMBERS, TEXTS, OpcUaSettings
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
-from errormotion.instruments.transports.opcua import Credentials, open_opcua, request
+from errormotion.instruments.transports.opc import Credentials, open_session, request
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 
@@ -42,7 +42,7 @@ class OpcUa(Driver):
     @classmethod
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
-        return InstrumentSubject(cls, "sim://cframe/opcua")
+        return InstrumentSubject(cls, "sim://cframe/opcua", {"timeout": 1.5})
 
     def __init__(self, address: str, settings: OpcUaSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
@@ -78,8 +78,8 @@ class OpcUa(Driver):
             ``commanded_position`` (X, Y, Z, m), ``position_time`` (when the position last changed, s on the same
             clock), ``spindle_speed`` (1/min), ``spindle_load`` (fraction), ``feed`` (m/s), ``mode`` (``manual``,
             ``mdi``, ``automatic``, the server's own word, or empty), ``program``, ``running``, ``estop`` (None where
-            no node reports it), ``homed``, ``enabled`` (None: not read), ``alarms`` (empty: not read), and
-            ``unavailable``: names of what is unknown. Unknown numbers are NaN.
+            no node reports it), ``homed`` (all axes are; None where no node reports it), ``enabled`` (None: not read),
+            ``alarms`` (empty: not read), and ``unavailable``: names of what is unknown. Unknown numbers are NaN.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class OpcUa(Driver):
             "mode": model.MODES.get(text["mode"], "") if "mode" in self._in_model else text["mode"],
             "program": text["program"],
             "running": text["execution"] in self.settings.running,
-            "homed": None,
+            "homed": _all_of([values[key].get("value") for key in keys if key.startswith(model.HOMED)]),
             "enabled": None,
             "estop": text["estop"] in self.settings.stopped if text["estop"] else None,
             "alarms": [],
@@ -117,7 +117,7 @@ class OpcUa(Driver):
         state["unavailable"] = [
             *(key for key in ("position", "commanded_position") if any(math.isnan(x) for x in state[key])),
             *(key for key in ("spindle_speed", "spindle_load", "feed") if math.isnan(state[key])),
-            *(key for key in TEXTS if not text[key]),
+            *(key for key in TEXTS if values.get(key, {}).get("value") is None),
         ]
         return state
 
@@ -149,7 +149,7 @@ class OpcUa(Driver):
 
     def _connect(self) -> Transport:
         settings = self.settings
-        return open_opcua(
+        return open_session(
             self.address,
             Credentials(settings.security, settings.user, _first_line(settings.password_file)),
             timeout=settings.timeout,
@@ -207,6 +207,13 @@ def _seconds(time: Any) -> float:
         return datetime.fromisoformat(time).timestamp()
     except (TypeError, ValueError, OverflowError):
         return math.nan
+
+
+def _all_of(answers: Sequence[Any]) -> bool | None:
+    """Return whether all answers are true; None where one is not known, or there is none."""
+    if not answers or not all(isinstance(answer, bool) for answer in answers):
+        return None
+    return all(answers)
 
 
 def _text(answer: Mapping[str, Any] | None) -> str:

@@ -20,6 +20,8 @@ NODE_TIME = "i=2258"
 """The time of the server."""
 MODES = {"0": "manual", "1": "mdi", "2": "automatic"}
 """CncOperationMode."""
+HOMED = "homed."
+"""Beginning of the quantities that report whether an axis is referenced."""
 IDENTITY = {"VendorName": "manufacturer", "CncTypeName": "model", "VendorRevision": "firmware"}
 
 #: Units by the code of the property EngineeringUnits: the characters of the UNECE code (Recommendation 20) as a number.
@@ -76,7 +78,7 @@ def quantities(root: str, browse: Browse, settings: OpcUaSettings) -> tuple[dict
         axis_parts = children(browse, _one("axis", axes, name))
         position = children(browse, axis_parts.get(f"Pos{settings.feedback.capitalize()}", ""))
         both = {"ActPos": f"position.{axis}", "CmdPos": f"commanded_position.{axis}"}
-        found |= _present(position, both)
+        found |= _present(position, both) | _present(axis_parts, {"IsReferenced": f"{HOMED}{axis}"})
         if UNIT in position:
             units |= dict.fromkeys(both.values(), position[UNIT])
     spindle = children(browse, _one("spindle", children(browse, parts.get("CncSpindleList", "")), settings.spindle))

@@ -38,8 +38,8 @@ class OpcUaSettings(PluginSettings):
         default="direct", description="measuring system of the axes: scale (direct) or motor encoder (indirect)"
     )
     running: tuple[str, ...] = Field(
-        default=("1", "True", "Running", "ACTIVE"),
-        description="values of the node 'execution' that mean that a program runs",
+        default=("1", "2", "True", "Running", "Waiting", "ACTIVE"),
+        description="values of the node 'execution' that mean that a program runs or waits",
     )
     stopped: tuple[str, ...] = Field(
         default=("1", "True", "TRIGGERED"), description="values of the node 'estop' that mean an emergency stop"

@@ -25,7 +25,7 @@ from errormotion.instruments.point_lds.optoncdt.models import MODELS
 from errormotion.instruments.point_lds.optoncdt.settings import OptoSettings
 from errormotion.instruments.streaming import count_reasons
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 if TYPE_CHECKING:
     from errormotion.instruments.streaming import Reader
@@ -70,6 +70,11 @@ class OptoNCDT(Driver):
     _layout = Layout(())
     _termination = "TERMOFF"
     _master = False  # sends pulses
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     @property
     def rate(self) -> float:

@@ -1,7 +1,7 @@
-"""The printer port of the virtual machine's control: what NC programs print, on a pty or TCP.
+"""The printer port of the virtual machine's control: what NC programs print.
 
-A line goes out as soon as the world's clock has come to it. Beyond the menu of `faults` there is ``duplicate``: lines
-come twice. ``fault_at`` and ``fault_every`` count lines.
+The port is a pty, or TCP where ``port`` or ``host`` is stated. A line goes out as soon as the world's clock has come to
+it. Beyond the menu of `faults` there is ``duplicate``: lines come twice. ``fault_at`` and ``fault_every`` count lines.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ class SimulatedPrinter(SimulatedDevice):
 
     def __init__(self, address: Address) -> None:
         self._ended = threading.Event()
+        wire = "tcp" if "port" in address.params or "host" in address.params else "pty"
         super().__init__(
-            replace(address, params={"wire": "pty", **address.params}), line_end=b"\n", default_name="printer"
+            replace(address, params={"wire": wire, **address.params}), line_end=b"\n", default_name="printer"
         )
         self._sent: dict[int, Any] = {id(each): each for each in self.world.printed if each[0] <= self.world.time}
         self._lines = 0

@@ -20,7 +20,7 @@ from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
-_LINE_END = b"\n"
+_LINE_ENDS = {"lf": b"\n", "cr": b"\r"}
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -167,7 +167,9 @@ class Dprnt(Driver):
         pattern = re.compile(self.settings.pattern)
         while True:
             try:
-                raw = self.transport.read_until(_LINE_END, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0))
+                raw = self.transport.read_until(
+                    _LINE_ENDS[self.settings.line_end], limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0)
+                )
                 text = text_of(raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]

@@ -31,6 +31,9 @@ class DprntSettings(ProbeSettings):
     most_unreadable: int = Field(
         default=10, description="largest accepted number of unreadable lines in one cycle", ge=0
     )
+    line_end: Literal["lf", "cr"] = Field(
+        default="lf", description="last character of a line: line feed (FANUC), or carriage return (Haas)"
+    )
     baudrate: int = Field(default=4800, description="of a serial line", gt=0)
     control: str = Field(default="FANUC", description="name of the control, for the record")
 

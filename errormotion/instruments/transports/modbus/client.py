@@ -64,6 +64,7 @@ class ModbusLine(Transport):
         self.framing, self.unit, self.repeated = framing, unit, 0
         self._line, self._retries, self._number = line, retries, 0
         self._unanswered_at: float | None = None
+        self._passed_over = False  # whether the last request without an answer was that of `_skip_late_answers`
 
     def registers(self, function: int, register: int, count: int) -> list[int]:
         """Return ``count`` registers from ``register`` on, by function 3 (holding) or 4 (input).
@@ -106,7 +107,7 @@ class ModbusLine(Transport):
             self._settle()
             raise ProtocolError(f"{self.url}: {error}") from None
         except InstrumentTimeoutError:
-            self._unanswered_at = time.monotonic()
+            self._unanswered_at, self._passed_over = time.monotonic(), False
             disconnect_after_timeout(self._line)
             raise
 
@@ -114,7 +115,8 @@ class ModbusLine(Transport):
         """Discard unread bytes; after a timeout, make sure that no late answer is taken for the next one.
 
         An RTU frame has no number. What arrives within a further time limit is discarded. If nothing arrives, another
-        number of registers is read, so that its answer and one that is later still differ in length.
+        number of registers is read, so that its answer and one that is later still differ in length. A device that does
+        not answer that is sent the next request without it.
         """
         since, self._unanswered_at = self._unanswered_at, None
         if since is None or self.framing == "tcp":
@@ -128,9 +130,11 @@ class ModbusLine(Transport):
                 raise
             except InstrumentError:  # the connection was dropped: the answer is lost with it
                 return
-            self._skip_late_answers(function, register, 1 if count > 1 else 2)
-        except (ProtocolError, InstrumentTimeoutError):
+            if not self._passed_over:
+                self._skip_late_answers(function, register, 1 if count > 1 else 2)
+        except (ProtocolError, InstrumentTimeoutError) as error:
             self._unanswered_at = time.monotonic()
+            self._passed_over = isinstance(error, InstrumentTimeoutError)
             raise
 
     def _skip_late_answers(self, function: int, register: int, count: int) -> None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.provenance import identity
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import across, tilt, turned
 from errormotion.methods.beam_direction.identification.direction import Direction, solve
@@ -32,6 +33,8 @@ CALIBRATION, TRIANGULATION, SCALE = "inclination calibration", "triangulation pl
 _STEP = 1e-5
 _LARGEST = 0.2
 _NEGLIGIBLE = 1e-12
+SAME_TILT = 0.01
+"""Difference of tilts, rad, up to which a part of the calibration has the same effect in two datasets."""
 
 
 @dataclass(frozen=True)
@@ -226,6 +229,26 @@ def _slope_sources(sensor: Sensor, q: Array) -> tuple[tuple[str, ...], tuple[str
         by_source = np.concatenate([by_source, [(ahead - behind) / 2]])
         sources, groups = (*sources, TRIANGULATION), (*groups, TRIANGULATION)
     return sources, groups, by_source
+
+
+def identities(converged: Converged, sensor: Sensor | None) -> dict[str, str]:
+    """Return the identity of each source that is a part of the sensor's calibration, by its name.
+
+    Part i is a combination of the calibrated coefficients that depends on the tilts of the planes. It is the same draw
+    in two datasets with the same calibration and the same tilts, to `SAME_TILT`, if it has the same sense on the plane
+    that it moves most.
+    """
+    if sensor is None or converged.tilt is None:
+        return {}
+    tilts = np.round(converged.tilt / SAME_TILT) + 0.0
+    reference = sensor.calibration.reference()["hash"]
+    found = {}
+    for i, (name, row) in enumerate(zip(converged.sources, converged.slope_by_source, strict=True)):
+        if name.startswith(CALIBRATION):
+            most = int(np.argmax(np.abs(row)))
+            along = (most, np.sign(row[most]))
+            found[name] = identity(reference, tilts, part=f"part {i + 1}", along=along)
+    return found
 
 
 def _check_slopes(slope: Array, names: Sequence[str]) -> None:

@@ -18,12 +18,15 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from errormotion.arrays import Array
+from errormotion.datasets.provenance import identity
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import adjoint_of
 from errormotion.kinematics.twists import adjoint, cross_matrix, transform, transform_covariance
 
 #: names of the influences and what they belong to in the budget
 SOURCES = (*(f"profiler pose {k}" for k in range(1, 7)), "lever x", "lever y", "lever z")
+POSE_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
+"""Sizes of (a, b, g, dx, dy, dz) that count alike in the parts of its covariance, rad and m."""
 SOURCE_GROUPS = ("profiler pose",) * 6 + ("lever",) * 3
 
 
@@ -165,6 +168,19 @@ def calibration_effect(errors: ArrayLike, profiler_pose: RigidTransform, lever: 
     return commutator(np.asarray(change, dtype=float) @ pose_twists(profiler_pose, lever), errors)
 
 
+def pose_identities(profiler_pose: RigidTransform, covariance: ArrayLike | None) -> dict[str, str]:
+    """Return the identity of each source of a calibrated pose by its name; none for a pose that counts as exact."""
+    if covariance is None:
+        return {}
+    rows = root(covariance)
+    size = np.linalg.norm(rows / POSE_UNIT, axis=1, keepdims=True)
+    along = rows / POSE_UNIT / np.where(size > 0, size, 1.0)
+    return {
+        name: identity(profiler_pose.as_matrix(), covariance, part=f"part {k + 1}", along=along[k])
+        for k, name in enumerate(SOURCES[:6])
+    }
+
+
 def root(covariance: ArrayLike | None) -> Array:
     """Return rows whose outer products add up to the covariance, (6, 6), largest first in units of 10 um and 1 mrad."""
     if covariance is None:
@@ -172,6 +188,5 @@ def root(covariance: ArrayLike | None) -> Array:
     C = np.asarray(covariance, dtype=float)
     if C.shape != (6, 6) or not np.allclose(C, C.T, rtol=1e-6, atol=0) or np.any(np.diag(C) < 0):
         raise MethodError(f"The covariance of the profiler's pose is a symmetric (6, 6); found shape {C.shape}.")
-    unit = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
-    size, vectors = np.linalg.eigh(C / np.outer(unit, unit))
-    return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0)) * unit[:, None]).T[::-1])
+    size, vectors = np.linalg.eigh(C / np.outer(POSE_UNIT, POSE_UNIT))
+    return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0)) * POSE_UNIT[:, None]).T[::-1])

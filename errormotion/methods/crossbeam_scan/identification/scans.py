@@ -14,10 +14,11 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
 from errormotion.datasets import DOF, build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, ArtefactCheck, check_artefacts
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig, carriage
-from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
+from errormotion.methods.crossbeam_scan.identification.chain import SOURCES, pose_identities
 from errormotion.methods.crossbeam_scan.identification.curves import curves
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registrations import Maps, Registrations, register_all
@@ -162,6 +163,10 @@ def _dataset(
         sources=axis.sources,
         source_groups=axis.source_groups,
         extras=_extras(found, axis, rig, rows, cold, reason, own, curve | check.extras()),
+        start=warm_up_start(raw, found.time, cold),
+        source_ids=pose_identities(rig.pose, rig.pose_covariance),
+        reference_sources=axis.sources[len(SOURCES) :],
+        reference_interval=(0.0, 0.0),
     )
     return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain)
 
@@ -185,6 +190,23 @@ def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None)
     if np.any(np.diff(time) <= 0):
         raise MethodError(f"time: expected cycles one after the other; found {np.round(time, 1).tolist()} s")
     return time
+
+
+def warm_up_start(raw: xr.Dataset, scan_time: Array, cold: list[int]) -> str:
+    """Return the instant of time 0 in UTC; empty where the raw data do not determine it.
+
+    The attribute ``start`` is the start of the record. The lines of the warm cycles state both the time since the
+    warm-up started (``line_time``) and the time since that attribute (``line_clock``). Where the cold scans come after
+    time 0 of the raw data, the errors count from the cold scans, see `cycle_times`.
+    """
+    if "line_clock" not in raw:
+        return ""
+    warm = np.flatnonzero(~np.isin(np.asarray(raw["cycle_of_line"].values), cold))
+    clock, since = (np.asarray(raw[name].values, dtype=float)[warm] for name in ("line_clock", "line_time"))
+    offset = (clock - since)[np.isfinite(clock - since)]
+    cold_scans = scan_time[cold[0]]
+    shift = max(float(np.nanmean(cold_scans)), 0.0) if np.isfinite(cold_scans).any() else 0.0
+    return start_of(raw, float(offset[0]) + shift) if offset.size else ""
 
 
 def _planned(raw: xr.Dataset, cycles: int) -> Array | None:

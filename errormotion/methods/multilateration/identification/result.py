@@ -13,6 +13,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import uncertainty
 from errormotion.methods.multilateration.identification.parameters import fit_machine
@@ -70,6 +71,7 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
         reference=DATUM,
         method=method,
         method_version=version,
+        start=start_of(state.raw),
         provenance=provenance.make(state.settings, state.raw, None, steps=_steps(state)),
         sources=made.names,
         source_groups=made.groups,

@@ -12,6 +12,7 @@ from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.normal_vector.identification import normals, rigid
 from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
@@ -73,6 +74,7 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
         raise MethodError("procedure = normals: " + notes[-1])
     chosen = other if settings.procedure == "normals" and other is not None else best
     influence = _sources(chosen)
+    cold = [f"cold reference {i + 1}" for i in range(len(influence))]
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -89,9 +91,12 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
         method_version=version,
         provenance=provenance.make(settings, raw, None, steps=_steps(cleaned, settings)),
         influence=influence,
-        sources=[f"cold reference {i + 1}" for i in range(len(influence))],
+        sources=cold,
         source_groups=["cold reference"] * len(influence),
         extras=_extras(data, cleaned, measured, factor, best, other),
+        start=start_of(raw),
+        reference_sources=cold,
+        reference_interval=(float(time[0]), float(time[0])),
     )
     return ds.assign_attrs(notes=notes or [""], tool_axes=data.tool_axes)
 

@@ -12,6 +12,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.files.hashing import DatasetHasher
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification import iso230_3
 from errormotion.methods.spindle_drift.identification.bar import SIDE, end_point, fit_axis
@@ -31,6 +32,7 @@ from errormotion.methods.spindle_drift.identification.record import (
     settling,
 )
 from errormotion.methods.spindle_drift.identification.uncertainty import (
+    REFERENCE,
     Frame,
     State,
     beam_sources,
@@ -91,7 +93,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     sigma = noise(raw, averages, settings, notes)
     sources = [
         *reading_sources(np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size),
-        *beam_sources(bar.covariance, bar.source),
+        *beam_sources(bar.origin, bar.direction, bar.covariance, bar.source, calibrated=settings.beams != "nominal"),
         *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
     ]
     frame = Frame(bar.origin, bar.direction, bar.levels, point)
@@ -153,6 +155,10 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         sources=[name for name, _ in names],
         source_groups=[group for _, group in names],
         extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time),
+        start=start_of(raw, zero),
+        source_ids={s.name: s.identity for s in sources if s.identity},
+        reference_sources=[s.name for s in sources if s.group == REFERENCE],
+        reference_interval=(float(time[reference[0]]), float(time[reference[-1]])),
     )
     return ds.assign_attrs(
         notes=list(notes) or [""],

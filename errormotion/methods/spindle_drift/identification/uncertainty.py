@@ -21,8 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.provenance import identity
 from errormotion.methods.spindle_drift.identification.bar import PARAMETERS, state_jacobian
 from errormotion.methods.spindle_drift.schema import CHANNELS
+
+REFERENCE = "reference state"
+"""Group of the sources that are the uncertainty of the reference state."""
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,13 +39,15 @@ _BLOCK = 1024
 class Source:
     """One standard uncertainty of a quantity that all instants share, as a change of the 36 parameters.
 
-    ``now`` acts on the state of each instant, ``then`` on the reference state; (36,) in SI.
+    ``now`` acts on the state of each instant, ``then`` on the reference state; (36,) in SI. ``identity`` is empty for a
+    source that no other record has.
     """
 
     name: str
     group: str
     now: Array
     then: Array
+    identity: str = ""
 
 
 @dataclass(frozen=True)
@@ -141,12 +147,16 @@ def reading_sources(sigma: Array) -> list[Source]:
     for i, name in enumerate(CHANNELS):
         change = np.zeros(PARAMETERS)
         change[i] = sigma[i]
-        found.append(Source(f"reference {name}", "reference state", np.zeros(PARAMETERS), change))
+        found.append(Source(f"reference {name}", REFERENCE, np.zeros(PARAMETERS), change))
     return found
 
 
-def beam_sources(covariance: Array, group: str) -> list[Source]:
-    """Return the covariance (5, 6, 6) of (origin, direction) of the beams as sources: the columns of its factors."""
+def beam_sources(origin: Array, direction: Array, covariance: Array, group: str, *, calibrated: bool) -> list[Source]:
+    """Return the covariance (5, 6, 6) of (origin, direction) of the beams as sources: the columns of its factors.
+
+    The parts of beams that were ``calibrated`` are the same draws in all records with this calibration. Those of
+    nominal beams have no identity: every set-up is off its nominal beams in its own way.
+    """
     found = []
     for i, name in enumerate(CHANNELS):
         # Scaled, so that metres and radians have the same weight in the decision on the rank.
@@ -156,7 +166,10 @@ def beam_sources(covariance: Array, group: str) -> list[Source]:
         for k in np.flatnonzero(values > 1e-12):
             change = np.zeros(PARAMETERS)
             change[5 + 6 * i : 11 + 6 * i] = unit * vectors[:, k] * np.sqrt(values[k])
-            found.append(Source(f"beam {name}.{k}", group, change, change))
+            one = ""
+            if calibrated:
+                one = identity(origin[i], direction[i], covariance[i], part=f"part {k + 1}", along=vectors[:, k])
+            found.append(Source(f"beam {name}.{k}", group, change, change, one))
     return found
 
 

@@ -122,12 +122,12 @@ class Space:
         item = ua.AddNodesItem(
             RequestedNewNodeId=node,
             BrowseName=name,
-            NodeClass=_class_of(attributes),
             ParentNodeId=parent or ua.NodeId(),
             ReferenceTypeId=number(reference),
             TypeDefinition=definition or ua.NodeId(),
             NodeAttributes=attributes,
         )
+        item.NodeClass = _class_of(attributes)  # no argument of older versions of the package
         left = list(self._nodes.try_add_nodes([item], check=False))
         if left or node not in self._held:
             raise InstrumentError(f"the simulated OPC UA server cannot add the node {node.to_string()}")

@@ -10,6 +10,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
 
@@ -75,6 +76,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         reference="nominal beam; a check bar does not tell its errors",
         method=method,
         method_version=version,
+        start=start_of(raw),
         provenance=provenance.make(settings, raw, None, steps=["check bar"])
         | ({"calibration": calibration.reference()} if calibration is not None else {}),
         extras=extras,

@@ -9,6 +9,7 @@ import xarray as xr
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 
@@ -62,6 +63,7 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
         reference="nominal pose of the profiler",
         method=method,
         method_version=version,
+        start=start_of(raw),
         provenance=provenance.make(settings, raw, None, steps=["edges of the pocket", "fit pose"]),
         extras={
             "profiler_pose": xr.DataArray(found.matrix, dims=square[0]),

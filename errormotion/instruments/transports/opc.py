@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.transports import load_simulator
-from errormotion.instruments.transports.address import OPCUA, parse_address
+from errormotion.instruments.transports.address import OPC, parse_address
 from errormotion.instruments.transports.base import Transport
 from errormotion.instruments.transports.recording import Recorder, RecordingTransport, ReplayTransport
 
@@ -86,14 +86,12 @@ class OpcUaTransport(Transport):
     def __init__(self, url: str, credentials: Credentials, *, timeout: float, simulator: str | None = None) -> None:
         super().__init__(url, timeout)
         address = parse_address(url)
-        if address.scheme not in (OPCUA, "sim"):
+        if address.scheme not in (OPC, "sim"):
             raise InstrumentError(f"Expected an address such as opc.tcp://192.168.0.5:4840; found '{url}'")
         try:
             import asyncua  # noqa: F401 - an extra
         except ImportError:
-            raise InstrumentError(
-                "OPC UA needs the package asyncua: install errormotion with the extra 'opcua'"
-            ) from None
+            raise InstrumentError("OPC UA needs the package asyncua: pip install asyncua") from None
         logging.getLogger("asyncua").setLevel(logging.ERROR)  # its warnings concern what no user can change
         self.simulated = address.scheme == "sim"
         self._device: Any = None
@@ -105,7 +103,7 @@ class OpcUaTransport(Transport):
         self._client: Client | None = None
         self._answer = b""
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="opcua", daemon=True)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="opc-ua", daemon=True)
         self._thread.start()
         try:
             self._wait(self._connected())
@@ -275,7 +273,7 @@ def text(value: Any) -> str:
     return str(value)[:MOST_TEXT]
 
 
-def open_opcua(
+def open_session(
     url: str, credentials: Credentials, *, timeout: float, simulator: str | None = None, record: Path | None = None
 ) -> Transport:
     """Open a session with a server, or play one back; see `OpcUaTransport`.

@@ -1,0 +1,142 @@
+"""Requests and replies of GeoCOM in ASCII: ``%R1Q,<call>,<number>:<parameters>`` and ``%R1P,...``."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.laser_tracker.leica_geocom import codes
+
+LINE_END = b"\r\n"
+LONGEST_REPLY = 1024
+"""Bytes, line end included."""
+LARGEST_TRANSACTION = 7
+"""Transaction numbers run from 1 to this; 0 is the number of a reply to a request without one."""
+
+_REPLY = re.compile(r"%R1P,(\d{1,5})(?:,(\d{1,5}))?:(\d{1,5})(?:,(.*))?", re.ASCII | re.DOTALL)
+_NUMBER = re.compile(r"[+-]?\d{1,40}(?:\.\d{0,40})?(?:[eE][+-]?\d{1,3})?", re.ASCII)
+_WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
+_HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}", re.ASCII)
+_BYTE = re.compile(r"'([0-9a-fA-F]{2})'", re.ASCII)
+_FIELD = re.compile(r'"(?:[^"\\]|\\.)*"|[^,"]*', re.DOTALL)
+_ESCAPE = re.compile(r"\\(?:[xX]([0-9a-fA-F]{2})|(.))", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """One reply.
+
+    Attributes
+    ----------
+    communication : int
+        Return code of the communication; 0: the call was made.
+    transaction : int
+        Number of the request, 0 where it had none.
+    code : int
+        Return code of the call.
+    values : tuple of str
+        What follows, as it came.
+    """
+
+    communication: int
+    transaction: int
+    code: int
+    values: tuple[str, ...] = ()
+
+    def number(self, index: int) -> float:
+        """Return a finite value; ProtocolError where there is none."""
+        text = self._value(index)
+        if _HEX.fullmatch(text):
+            return float(int(text, 16))
+        value = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if not math.isfinite(value):
+            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a number; found {text[:40]!r}")
+        return value
+
+    def whole(self, index: int) -> int:
+        """Return a whole value, also of a byte or in hexadecimal; ProtocolError where there is none."""
+        text = self._value(index)
+        if byte := _BYTE.fullmatch(text):
+            return int(byte[1], 16)
+        if _HEX.fullmatch(text):
+            return int(text, 16)
+        if not _WHOLE.fullmatch(text):
+            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a whole number; found {text[:40]!r}")
+        return int(text)
+
+    def text(self, index: int) -> str:
+        """Return a string without its quotation marks; ProtocolError where there is none."""
+        text = self._value(index)
+        if len(text) < 2 or text[0] != '"' or text[-1] != '"':
+            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a string; found {text[:40]!r}")
+        return _ESCAPE.sub(lambda found: chr(int(found[1], 16)) if found[1] else found[2], text[1:-1])
+
+    def _value(self, index: int) -> str:
+        if index >= len(self.values):
+            raise ProtocolError(f"A GeoCOM reply has {len(self.values)} values; expected at least {index + 1}")
+        return self.values[index]
+
+
+def request(call: int, transaction: int, *parameters: int | float) -> bytes:
+    """Return a request; floats have as many digits as they need.
+
+    Raises
+    ------
+    InstrumentError
+        A parameter is not finite.
+    """
+    if not all(math.isfinite(each) for each in parameters):
+        raise InstrumentError(f"GeoCOM call {call}: expected finite parameters; found {parameters}")
+    values = ",".join(str(each) if isinstance(each, int) else _decimal(each) for each in parameters)
+    return f"%R1Q,{call},{transaction}:{values}".encode("ascii") + LINE_END
+
+
+def _decimal(value: float) -> str:
+    text = f"{value:.15f}".rstrip("0")
+    return text + "0" if text.endswith(".") else text
+
+
+def reply(line: bytes) -> Reply:
+    """Return one reply, given with or without its line end.
+
+    Raises
+    ------
+    ProtocolError
+        No GeoCOM reply, or a longer one than ``LONGEST_REPLY``.
+    """
+    if len(line) > LONGEST_REPLY:
+        raise ProtocolError(f"A GeoCOM reply of {len(line)} bytes; expected at most {LONGEST_REPLY}")
+    text = line.decode("latin-1").rstrip("\r\n").lstrip("\n")
+    found = _REPLY.fullmatch(text)
+    if found is None:
+        raise ProtocolError(
+            f"Expected a GeoCOM reply, '%R1P,code,number:code,...'; found {text[:60]!r}. Check that the interface of "
+            "the station is set to GeoCOM"
+        )
+    communication, transaction, code, values = found.groups()
+    return Reply(int(communication), int(transaction or 0), int(code), _fields(values))
+
+
+def _fields(values: str | None) -> tuple[str, ...]:
+    if values is None:
+        return ()
+    fields, start = [], 0
+    while True:
+        found = _FIELD.match(values, start)
+        end = start if found is None else found.end()
+        if found is None or (end < len(values) and values[end] != ","):
+            raise ProtocolError(f"A GeoCOM reply has an unfinished value: {values[start : start + 40]!r}")
+        fields.append(found[0])
+        if end == len(values):
+            return tuple(fields)
+        start = end + 1
+
+
+def check(call: int, found: Reply) -> None:
+    """Raise InstrumentError where the communication failed: the call was not made."""
+    if found.communication:
+        raise InstrumentError(
+            f"GeoCOM call {codes.name(call)} failed: code {found.communication}, {codes.text(found.communication)}"
+        )

@@ -1,0 +1,46 @@
+"""Return codes of GeoCOM: Reference Manual TPS1200/TS30/TM30 1.50, sections 3.7, 7, 17, and its table of codes."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Code(IntEnum):
+    """Return codes that the simulated station uses."""
+
+    OK = 0
+    IVPARAM = 2
+    FATAL = 4
+    NOT_IMPL = 5
+    NA = 27
+    TMC_NO_FULL_CORRECTION = 1283
+    TMC_ANGLE_OK = 1285  # no distance
+    TMC_ANGLE_NO_FULL_CORRECTION = 1288
+    TMC_DIST_ERROR = 1292  # no aim
+    TMC_BUSY = 1293
+    TMC_SIGNAL_ERROR = 1294
+    MOT_NOT_OCONST = 1794
+    COM_CANT_DECODE_REQ = 3080
+    COM_PROC_UNAVAIL = 3081
+    COM_NO_BINARY = 3086
+    COM_NOT_GEOCOM = 3094
+    COM_OVERRUN = 3100
+    COM_SRVR_IS_SLEEPING = 3108
+    COM_SRVR_IS_OFF = 3109
+    COM_NO_CHECKSUM = 3110
+    AUT_NO_TARGET = 8710
+    AUT_NOT_ENABLED = 8714
+
+
+class RefusedError(Exception):
+    """The station refuses a call.
+
+    Attributes
+    ----------
+    code : int
+        Its return code.
+    """
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code

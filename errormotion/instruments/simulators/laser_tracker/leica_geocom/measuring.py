@@ -1,0 +1,297 @@
+"""The calls of theodolite measurement and calculation (TMC): angles, distances, coordinates and their corrections.
+
+Reference Manual TPS1200/TS30/TM30 1.50, section 17. A distance is started by one call and read by another, which waits
+for it no longer than is stated; meanwhile the world's clock runs, unless a stream drives it.
+"""
+
+# ruff: noqa: D102 -- a getter or setter without further rules is described by its name, which is the manual's
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import Telescope, atmospheric_ppm
+
+if TYPE_CHECKING:
+    from errormotion.instruments.simulators.virtual_world.world import VirtualWorld
+
+STOP, DEFAULT, TRACK, CLEAR, SIGNAL, MEASURE, RAPID, RED, FREQUENCY = 0, 1, 2, 3, 4, 6, 8, 10, 11
+PROGRAMS = (STOP, DEFAULT, TRACK, CLEAR, SIGNAL, MEASURE, RAPID, RED, FREQUENCY)
+INCLINATIONS = 3
+EDM_MODES = range(1, 15)
+STANDARD, CONTINUOUS = 2, (6, 7, 8, 9)
+DURATIONS = {3: 0.8, 6: 0.3, 7: 0.3, 8: 0.3, 9: 0.15, 13: 7.0}
+"""Duration of one distance in some EDM modes, s; in the others 2.4 (technical data of the TPS1200)."""
+DURATION = 2.4
+EXCHANGE = 0.05
+"""Time that passes with a call that does not wait, s."""
+LONGEST_WAIT = 60_000
+"""Time that a call waits at most, ms, whatever is asked (assumed)."""
+ACCURACY = 2.4e-6
+"""Standard deviation of angles and inclinations that is stated, rad."""
+WAVELENGTH = 6.58e-7
+EARTH, REFRACTION = 6_378_000.0, 0.13
+
+Numbers = tuple[float, ...]
+
+
+class Measuring:
+    """The measuring calls.
+
+    Parameters
+    ----------
+    world : VirtualWorld
+    telescope : Telescope
+
+    Attributes
+    ----------
+    warning : int
+        Return code of the last call that was executed: 0, or what its values lack.
+    prism_constant : float
+        m.
+    """
+
+    def __init__(self, world: VirtualWorld, telescope: Telescope) -> None:
+        self.world, self.telescope = world, telescope
+        self.warning = 0
+        self.prism_constant = 0.0
+        self._station = (0.0, 0.0, 0.0, 0.0)
+        self._height = 0.0
+        self._air = (WAVELENGTH, 1013.25, 12.0, 8.55)
+        self._refraction: tuple[int, float, float] = (0, EARTH, REFRACTION)
+        self._edm = STANDARD
+        self._compensator = 1
+        self._ready: float | None = None  # time at which the distance is there, s; None: none was started
+        self._signal = False
+        self._distance: float | None = None
+        self._continuous = False
+
+    # ------------------------------------------------------------------ distances
+
+    def TMC_DoMeasure(self, program: int, inclination: int) -> None:
+        """Start, stop or clear a distance."""
+        _check(program in PROGRAMS and 0 <= inclination < INCLINATIONS)
+        self._signal = program == SIGNAL
+        if program != STOP:
+            self._distance = None
+        self._ready = None
+        self._continuous = program in (TRACK, RAPID, RED) or (program == DEFAULT and self._edm in CONTINUOUS)
+        if program in (DEFAULT, TRACK, MEASURE, RAPID, RED):
+            duration = 0.3 if program in (TRACK, RAPID, RED) else DURATIONS.get(self._edm, DURATION)
+            self._ready = self.world.time + duration
+
+    def _wait(self, milliseconds: int) -> float | None:
+        """Return the distance, or None where there is none within the time.
+
+        Raises
+        ------
+        RefusedError
+            No signal.
+        """
+        if self._distance is not None and not self._continuous:
+            return self._distance
+        if self._ready is None:
+            return self._distance
+        patience = min(milliseconds, LONGEST_WAIT) / 1000.0
+        missing = max(0.0, self._ready - self.world.time)
+        self._pass(min(missing, max(patience, EXCHANGE)))
+        if missing > max(patience, EXCHANGE) and not self.world.streaming:
+            return None
+        if not self._continuous:
+            self._ready = None
+        self._distance = None
+        self._distance = self.telescope.distance(self.prism_constant, self._ppm())
+        return self._distance
+
+    def _pass(self, seconds: float) -> None:
+        if seconds > 0 and not self.world.streaming:
+            self.world.elapse(seconds)
+
+    def _ppm(self) -> float:
+        return atmospheric_ppm(*self._air[1:])
+
+    def _measured(self, wait: int, inclination: int) -> tuple[float, float, float]:
+        """Return directions and distance, 0 where there is none, and set the warning."""
+        _check(wait >= 0 and 0 <= inclination < INCLINATIONS)
+        if self._signal:
+            raise RefusedError(Code.TMC_BUSY)
+        failed = False
+        try:
+            distance = self._wait(wait)
+        except RefusedError:
+            failed, distance = True, None
+        angles = self.telescope.direction()
+        if failed:
+            self.warning = Code.TMC_DIST_ERROR
+        elif distance is None:
+            self.warning = Code.TMC_ANGLE_OK if self._compensator else Code.TMC_ANGLE_NO_FULL_CORRECTION
+        elif not self._compensator:
+            self.warning = Code.TMC_NO_FULL_CORRECTION
+        return (*angles, distance or 0.0)
+
+    def measure_at_once(self, mode: int) -> tuple[float, float, float]:
+        """Measure directions and, as the mode of the basic application states, a distance."""
+        if mode == 6:
+            self.TMC_DoMeasure(STOP, 1)
+        elif mode == 5:
+            self.TMC_DoMeasure(CLEAR, 1)
+        elif mode >= 2:
+            self.TMC_DoMeasure({2: DEFAULT, 3: TRACK, 4: RAPID}[mode], 1)
+        if mode == 1:
+            return (*self.telescope.direction(), 0.0)
+        found = self._measured(LONGEST_WAIT, 1)
+        if self.warning == Code.TMC_DIST_ERROR:
+            raise RefusedError(Code.TMC_DIST_ERROR)
+        return found
+
+    def TMC_GetSimpleMea(self, wait: int, inclination: int) -> Numbers:
+        """Return directions, rad, and the distance, m."""
+        return self._measured(wait, inclination)
+
+    def TMC_GetFullMeas(self, wait: int, inclination: int) -> tuple[float | int, ...]:
+        """Return directions, their accuracy, both inclinations, their accuracy, distance and its time, ms."""
+        horizontal, zenith, distance = self._measured(wait, inclination)
+        return horizontal, zenith, ACCURACY, 0.0, 0.0, ACCURACY, distance, self._clock()
+
+    def TMC_QuickDist(self) -> Numbers:
+        """Return directions and a distance that is measured at once, by tracking."""
+        if self._ready is None or not self._continuous:
+            self.TMC_DoMeasure(RAPID, 1)
+        return self._measured(LONGEST_WAIT, 1)
+
+    def EDM_IsContMeasActive(self, kind: int) -> int:
+        """Whether a continuous measurement is running: of a signal (1), frequency (2), distances (3) or any (4)."""
+        _check(1 <= kind <= 4)
+        distances = self._continuous and self._ready is not None
+        return int({1: self._signal, 2: False, 3: distances, 4: distances or self._signal}[kind])
+
+    def TMC_GetSignal(self) -> tuple[float | int, ...]:
+        """Return the intensity of the signal, %, in that program only."""
+        if not self._signal:
+            raise RefusedError(Code.TMC_SIGNAL_ERROR)
+        return 62.0, self._clock()
+
+    # ------------------------------------------------------------------ angles
+
+    def TMC_GetAngle5(self, inclination: int) -> Numbers:
+        """Return the directions, rad."""
+        self._incline(inclination)
+        return self.telescope.direction()
+
+    def TMC_GetAngle1(self, inclination: int) -> tuple[float | int, ...]:
+        """Return directions, accuracy and time (ms), inclinations, accuracy and time, and the face."""
+        self._incline(inclination)
+        time = self._clock()
+        return (*self.telescope.direction(), ACCURACY, time, 0.0, 0.0, ACCURACY, time, self.telescope.face)
+
+    def _incline(self, inclination: int) -> None:
+        _check(0 <= inclination < INCLINATIONS)
+        if self._signal:
+            raise RefusedError(Code.TMC_BUSY)
+        if not self._compensator:
+            self.warning = Code.TMC_NO_FULL_CORRECTION
+
+    def _clock(self) -> int:
+        return round(1000.0 * self.world.time) % 2**31
+
+    def TMC_GetFace(self) -> int:
+        return self.telescope.face
+
+    def TMC_GetAngSwitch(self) -> tuple[int, ...]:
+        """Return whether the corrections of inclination, standing axis, collimation and tilting axis are on."""
+        return self._compensator, 1, 1, 1
+
+    def TMC_GetInclineSwitch(self) -> int:
+        return self._compensator
+
+    def TMC_SetInclineSwitch(self, on: int) -> None:
+        _check(on in (0, 1))
+        self._compensator = on
+
+    # ------------------------------------------------------------------ coordinates
+
+    def _coordinates(self, horizontal: float, zenith: float, distance: float) -> tuple[float, float, float]:
+        east, north, height, instrument = self._station
+        across = distance * math.sin(zenith)
+        height += instrument + distance * math.cos(zenith) - self._height
+        return east + across * math.sin(horizontal), north + across * math.cos(horizontal), height
+
+    def TMC_GetCoordinate(self, wait: int, inclination: int) -> tuple[float | int, ...]:
+        """Return coordinates and their time, ms, of the distance, and of the continuous angles."""
+        measured = self._measured(wait, inclination)
+        place = self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
+        return (*place, self._clock(), *place, self._clock())
+
+    def TMC_GetSimpleCoord(self, wait: int, inclination: int) -> Numbers:
+        """Return the coordinates; all 0 without a distance."""
+        measured = self._measured(wait, inclination)
+        return self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
+
+    def TMC_GetStation(self) -> Numbers:
+        return self._station
+
+    def TMC_SetStation(self, east: float, north: float, height: float, instrument: float) -> None:
+        """Take the coordinates of the station; a distance must have been cleared."""
+        self._cleared()
+        self._station = east, north, height, instrument
+
+    def TMC_SetOrientation(self, horizontal: float) -> None:
+        """Let the present direction read an angle; a distance must have been cleared."""
+        self._cleared()
+        self.telescope.orientate(horizontal)
+
+    def _cleared(self) -> None:
+        if self._distance is not None or self._ready is not None:
+            raise RefusedError(Code.TMC_BUSY)
+
+    def TMC_GetHeight(self) -> float:
+        return self._height
+
+    def TMC_SetHeight(self, height: float) -> None:
+        self._cleared()
+        self._height = height
+
+    # ------------------------------------------------------------------ corrections
+
+    def TMC_GetEdmMode(self) -> int:
+        return self._edm
+
+    def TMC_SetEdmMode(self, mode: int) -> None:
+        _check(mode in EDM_MODES)
+        self._edm = mode
+
+    def TMC_GetPrismCorr(self) -> float:
+        return self.prism_constant
+
+    def TMC_SetPrismCorr(self, constant: float) -> None:
+        self.prism_constant = constant
+
+    def TMC_GetAtmCorr(self) -> Numbers:
+        return self._air
+
+    def TMC_SetAtmCorr(self, wavelength: float, pressure: float, dry: float, wet: float) -> None:
+        """Take wavelength, m, pressure, mbar, and dry and wet temperature, degC; the limits are assumed."""
+        _check(wavelength > 0 and 400.0 <= pressure <= 1200.0 and -60.0 <= wet <= 80.0 and -60.0 <= dry <= 80.0)
+        self._air = wavelength, pressure, dry, wet
+
+    def TMC_GetAtmPpm(self) -> float:
+        return self._ppm()
+
+    def TMC_GetSlopeDistCorr(self) -> Numbers:
+        """Return the total correction of distances, 1e-6, and the prism constant, m."""
+        return self._ppm(), self.prism_constant
+
+    def TMC_GetRefractiveCorr(self) -> tuple[float | int, ...]:
+        return self._refraction
+
+    def TMC_SetRefractiveCorr(self, on: int, radius: float, coefficient: float) -> None:
+        """Take the refraction correction; it concerns heights over long distances, so nothing changes here."""
+        _check(on in (0, 1) and radius > 0)
+        self._refraction = on, radius, coefficient
+
+
+def _check(right: bool) -> None:
+    if not right:
+        raise RefusedError(Code.IVPARAM)

@@ -1,0 +1,5 @@
+"""A machine's record: every run of one or more folders with its figures of merit.
+
+``entry`` reads what a run folder states, ``index`` keeps it for the next call, ``listing`` selects, ``history``
+follows one figure over time.
+"""

@@ -1,0 +1,248 @@
+"""The driver of the confocalDT: its codec against documents, and the driver against the simulator."""
+
+import random
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from wire_vectors import Vector, vectors
+
+from errormotion.errors import ErrormotionError, InstrumentError, ProtocolError
+from errormotion.instruments import simulators
+from errormotion.instruments.point_lds.confocaldt import ConfocalDT, ConfocalSettings, codec
+from errormotion.instruments.point_lds.confocaldt.blocks import (
+    DISTANCE_1,
+    HEADER,
+    LONGEST_GAP,
+    MAX_BLOCK_BYTES,
+    MEASURED,
+    BlockDecoder,
+    Sequence,
+    reasons,
+    scale,
+)
+from errormotion.instruments.point_lds.optoncdt.commands import RefusedCommandError, parse_answer
+
+
+def layer(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("vector", vectors("confocaldt", name), ids=str)
+
+
+def block(counter: int, *values: int) -> bytes:
+    header = HEADER.pack(b"SAEM", 2418004, 11020009, MEASURED | DISTANCE_1, 0, 4, len(values), counter)
+    return header + np.array(values, dtype="<i4").tobytes()
+
+
+# ---------------------------------------------------------------------- codec
+
+
+@layer("facts")
+def test_identity(vector: Vector) -> None:
+    facts = codec.facts_of(parse_answer(vector.expected["command"], vector.data))
+    assert codec.model_of(facts) == vector.expected["name"]
+    assert (facts["serial"], facts["version"]) == (vector.expected["serial"], vector.expected["version"])
+
+
+def test_controllers_with_another_grammar_are_refused() -> None:
+    with pytest.raises(InstrumentError, match="IFC2421"):
+        codec.model_of({"name": "IFC2421"})
+
+
+@layer("sensor")
+def test_sensor(vector: Vector) -> None:
+    facts = codec.facts_of(parse_answer(vector.expected["command"], vector.data))
+    assert facts["name"] == vector.expected["name"]
+    assert codec.range_of(facts) == pytest.approx(vector.expected["range_mm"] * 1e-3)
+
+
+@layer("rate")
+def test_rate(vector: Vector) -> None:
+    assert codec.rate_of(parse_answer("MEASRATE", vector.data)) == vector.expected["hertz"]
+
+
+@layer("reduction")
+def test_reduction(vector: Vector) -> None:
+    assert codec.reduction_of(parse_answer("OUTREDUCE", vector.data)) == vector.expected["factor"]
+
+
+@layer("error")
+def test_refusals_have_the_text_of_the_controller(vector: Vector) -> None:
+    with pytest.raises(RefusedCommandError, match=vector.expected["message"]):
+        parse_answer(vector.expected["command"], vector.data)
+
+
+@pytest.mark.parametrize(
+    ("rate", "command"), [(2500.0, "MEASRATE 2.5"), (330.0, "MEASRATE 0.3"), (7e4, "MEASRATE 70.0")]
+)
+def test_a_rate_has_one_decimal_place_of_a_kilohertz(rate: float, command: str) -> None:
+    assert codec.rate_request(rate) == command
+
+
+@pytest.mark.parametrize("answer", [[], ["MEASRATE"], ["MEASRATE fast"], ["MEASRATE -1"], ["MEASRATE 0"], ["9" * 300]])
+def test_a_rate_that_is_none_is_an_error(answer: list[str]) -> None:
+    with pytest.raises(ProtocolError):
+        codec.rate_of(answer)
+
+
+@layer("block")
+def test_blocks(vector: Vector) -> None:
+    (found,) = BlockDecoder().feed(vector.data, last=True)
+    values, codes = scale(found.values)
+    assert found.counter == vector.expected["counter"]
+    np.testing.assert_allclose(values * 1e6, vector.expected["micrometres"], rtol=1e-12)
+    assert reasons(codes) == vector.expected["reasons"]
+
+
+@layer("other")
+def test_other_values_are_refused_with_their_size(vector: Vector) -> None:
+    with pytest.raises(InstrumentError, match=f"frames of {vector.expected['size']} bytes"):
+        BlockDecoder().feed(vector.data, last=True)
+
+
+@given(st.lists(st.lists(st.integers(-(2**30), 2**30), min_size=1, max_size=9), min_size=1, max_size=6), st.data())
+def test_blocks_are_found_however_they_arrive(parts: list[list[int]], data: st.DataObject) -> None:
+    stream, counter = b"", 5
+    for part in parts:
+        stream += block(counter, *part)
+        counter += len(part)
+    decoder, found = BlockDecoder(), []
+    while stream:
+        size = data.draw(st.integers(1, len(stream)))
+        found += decoder.feed(stream[:size], last=size == len(stream))
+        stream = stream[size:]
+    assert [each.values.tolist() for each in found] == parts
+    assert decoder.stray == 0
+
+
+def test_a_gap_of_the_counter_is_counted_as_lost_and_a_jump_back_refused() -> None:
+    sequence = Sequence()
+    for each in BlockDecoder().feed(block(2**32 - 1, 10, 20) + block(3, 30), last=True):
+        sequence.add(each)
+    values, codes = sequence.take(5)
+    np.testing.assert_allclose(values * 1e9, [10, 20, np.nan, np.nan, 30])
+    assert reasons(codes) == {"lost": 2}
+    for counter in (3, 4 + LONGEST_GAP + 1):
+        with pytest.raises(ProtocolError, match="counter"):
+            sequence.add(BlockDecoder().feed(block(counter, 1), last=True)[0])
+
+
+def test_a_damaged_block_is_counted_as_garbled() -> None:
+    first, second = block(0, 1, 2, 3), block(3, 4)
+    sequence = Sequence()
+    for each in BlockDecoder().feed(first[:-5] + second, last=True):
+        sequence.add(each)
+    values, codes = sequence.take(4)
+    assert reasons(codes) == {"garbled": 3}
+    assert values[3] == pytest.approx(4e-9)
+
+
+def test_mutated_blocks_raise_only_errors_of_the_project_and_are_bounded_in_time() -> None:
+    rng = random.Random(7)
+    whole = b"".join(block(9 * k, *range(9)) for k in range(20))
+    start = time.monotonic()
+    for _ in range(2000):
+        data = bytearray(whole)
+        for _ in range(rng.randrange(1, 8)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        decoder = BlockDecoder()
+        try:
+            for each in decoder.feed(bytes(data), last=True):
+                assert len(each.values) * 4 + HEADER.size <= MAX_BLOCK_BYTES
+        except ErrormotionError:
+            continue
+        assert len(decoder._buffer) <= MAX_BLOCK_BYTES
+    assert time.monotonic() - start < 20.0  # 10 ms a frame
+
+
+def test_noise_is_not_kept() -> None:
+    decoder = BlockDecoder()
+    for _ in range(50):
+        assert decoder.feed(b"\x00SAE" * 10_000) == []
+    assert len(decoder._buffer) < HEADER.size
+
+
+# ---------------------------------------------------------------------- driver
+
+
+@pytest.fixture(autouse=True)
+def ended() -> Iterator[None]:
+    yield
+    simulators.reset()
+
+
+ADDRESS = "sim://cframe/X1?seed=3"
+
+
+def test_reads_the_distance_that_the_machine_has() -> None:
+    with ConfocalDT(ADDRESS) as sensor:
+        world = simulators.world("cframe", 3)
+        low, high = sensor.measuring_range
+        assert low == 0.0
+        value = sensor.read()
+        assert low < value < high
+        world.set_target("plane", 0.0, 0.0)
+        reading = sensor.read()
+        assert np.isfinite(reading) != bool(sensor.no_value)
+
+
+def test_another_range_is_refused() -> None:
+    with ConfocalDT(ADDRESS) as sensor:
+        span = sensor.measuring_range[1]
+    with pytest.raises(InstrumentError, match="measuring_range"):
+        ConfocalDT(ADDRESS, ConfocalSettings(measuring_range=10 * span)).open()
+
+
+def test_writes_the_rate_and_states_it() -> None:
+    with ConfocalDT(ADDRESS, ConfocalSettings(rate=2500.0)) as sensor:
+        assert sensor.rate == 2500.0
+        samples = next(sensor.stream(block=100))
+        assert samples.values.shape == (1, 100)
+        assert samples.rate == 2500.0
+
+
+def test_restores_the_outputs_that_it_found() -> None:
+    with ConfocalDT(ADDRESS) as sensor:
+        dialogue = sensor._commands()
+        dialogue._before.clear()  # as another client that leaves its choice behind
+        dialogue.command("OUTADD_ETH COUNTER INTENSITY")
+        dialogue.command("OUTREDUCE 10 ETHERNET")
+        sensor._start_session()
+        assert dialogue.command("OUTADD_ETH") == ["OUTADD_ETH NONE"]
+        assert np.isfinite(sensor.read())
+        opened = sensor._commands()
+        opened.restore()
+        assert opened.command("OUTADD_ETH") == ["OUTADD_ETH COUNTER INTENSITY"]
+        assert codec.reduction_of(opened.command("OUTREDUCE")) == 10
+
+
+def test_values_that_an_earlier_output_left_are_not_read() -> None:
+    with ConfocalDT(ADDRESS) as sensor:
+        stream = sensor.stream(block=50)
+        next(stream)
+        stream.close()
+        first = sensor.read()
+        assert abs(first - sensor.read()) < 20e-6  # noise and drift of the bar at rest
+
+
+def test_refuses_a_master_value() -> None:
+    with pytest.raises(InstrumentError, match="master value"):
+        ConfocalDT(f"{ADDRESS}&left=MASTERMV+MASTER+0.5").open()
+
+
+@pytest.mark.parametrize("left", ["ECHO+OFF", "OUTADD_ETH+COUNTER+INTENSITY", "OUTPUT+ETHERNET", "OUTREDUCE+10"])
+def test_reads_whatever_another_client_left(left: str) -> None:
+    with ConfocalDT(ADDRESS) as sensor:
+        expected = sensor.read()
+    simulators.reset()
+    with ConfocalDT(f"{ADDRESS}&left={left}") as sensor:
+        assert sensor.read() == pytest.approx(expected, abs=20e-6)
+        assert next(sensor.stream(block=20)).dropped == 0
+
+
+@pytest.mark.parametrize("left", ["MEASMODE+THICKNESS", "SWITCHMD2+1"])
+def test_refuses_other_values_than_one_distance(left: str) -> None:
+    with ConfocalDT(f"{ADDRESS}&left={left}") as sensor, pytest.raises(InstrumentError, match="one distance"):
+        sensor.read()

@@ -1,0 +1,195 @@
+"""Limits are checked with the key of each mistake, and decide on figures and freedoms of any method."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion import datasets, plugins
+from errormotion.datasets import provenance
+from errormotion.errors import BenchError
+from errormotion.plugins import FigureOfMerit
+from errormotion.report import write_report
+from errormotion.tolerances.conformity import judge, matches
+from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE
+from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
+
+HEAD = 'schema = "errormotion.tolerances/1"\n[tolerances]\n'
+
+
+def limits(tmp_path: Path, text: str) -> Tolerances:
+    file = tmp_path / "limits.toml"
+    file.write_text(HEAD + text)
+    return load_tolerances(file)
+
+
+@pytest.fixture
+def errors() -> xr.Dataset:
+    """EX of 0, 3 and 5 um and EA of 10 urad, U = 1 um and 2 urad; the last EA is unknown, EY altogether."""
+    values = np.full((3, 6), np.nan)
+    values[:, 0], values[:2, 3] = [0.0, 3e-6, 5e-6], 10e-6
+    return datasets.build_errors(
+        values,
+        np.tile(np.diag([0.25e-12, 1e-12, 1e-12, 1e-12, 1e-12, 1e-12]), (3, 1, 1)),
+        dims=("time",),
+        coords={"time": [0.0, 60.0, 120.0]},
+        component="tool",
+        machine="m",
+        frame="machine",
+        functional_point=np.zeros(3),
+        reference="cold",
+        method="foreign",
+        method_version="1",
+        provenance=provenance.make({}, None, None),
+    )
+
+
+class Foreign:
+    """The method of another distribution."""
+
+    @staticmethod
+    def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
+        return [FigureOfMerit("G(CW), run 1", 5e-6, 1e-6, "m"), FigureOfMerit("hysteresis", 0.2, 0.01, "1")]
+
+
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins, "owner_of_method", {"foreign": Foreign}.get)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "tolerances: expected limits in 'figures', 'freedoms' or both; found none"),
+        ('freedoms = { EX = "10" , EY = 5 }', "tolerances.freedoms.EY: expected a limit with its unit in quotes"),
+        ('freedoms = { EX = "10 bananas" }', "tolerances.freedoms.EX: expected a limit with its unit"),
+        ('freedoms = { EX = "-10 um" }', "above 0; found '-10 um'"),
+        ('freedoms = { EX = "nan" }', "tolerances.freedoms.EX"),
+        ('freedoms = { EX = { lower = "5 um", upper = "1 um" } }', "expected 'lower' below 'upper'"),
+        ('freedoms = { EX = { lower = "5 um", upper = "1 rad" } }', "expected one unit; found m and rad"),
+        ("freedoms = { EX = {} }", "expected 'lower', 'upper' or both"),
+        ('freedoms = { EX = { uper = "5 um" } }', "did you mean 'upper'?"),
+        ('rule = "iso14253"\nfreedoms = { EX = "1 um" }', "tolerances.rule: expected 'iso 14253-1'"),
+        ('guard_factor = -1.0\nfreedoms = { EX = "1 um" }', "tolerances.guard_factor"),
+        ('guard_factor = nan\nfreedoms = { EX = "1 um" }', "tolerances.guard_factor"),
+    ],
+)
+def test_each_mistake_is_reported_with_file_and_key(tmp_path: Path, text: str, expected: str) -> None:
+    with pytest.raises(BenchError) as failure:
+        limits(tmp_path, text)
+    assert str(failure.value).startswith(f"{tmp_path / 'limits.toml'}: 1 mistake")
+    assert expected in str(failure.value)
+
+
+def test_limits_are_read_in_any_unit(tmp_path: Path) -> None:
+    found = limits(tmp_path, 'freedoms = { EX = "10 um", EA = { upper = "1 arcsec" } }\nfigures = { "h*" = "0.3" }')
+    assert found.freedoms["EX"].interval == pytest.approx((-1e-5, 1e-5))
+    assert found.freedoms["EA"].interval == pytest.approx((-np.inf, np.pi / 648000))
+    assert (found.figures["h*"].unit, found.figures["h*"].interval) == ("1", (-0.3, 0.3))
+
+
+def test_stored_limits_are_those_that_were_read(tmp_path: Path) -> None:
+    found = limits(tmp_path, 'rule = "simple"\nfreedoms = { EX = "10 um", EA = { upper = "1 arcsec" } }')
+    stored = json.loads(json.dumps({"tolerances": found.model_dump(mode="json")}))
+    assert from_run(stored) == found
+    assert from_run({"tolerances": None}) is None
+    with pytest.raises(BenchError, match=r"run\.json"):
+        from_run({"tolerances": {"rule": 3}})
+
+
+def test_figures_of_a_foreign_method_are_decided(tmp_path: Path, errors: xr.Dataset, foreign: None) -> None:
+    table = limits(tmp_path, 'figures = { "G(CW)*" = "7 um", hysteresis = "0.205", other = "1 um" }')
+    found = judge(errors, table)
+    assert [(row.name, row.decision) for row in found.rows] == [("G(CW), run 1", INSIDE), ("hysteresis", OPEN)]
+    assert found.unused == ("other",)
+    assert found.verdict == "neither proved"
+    assert found.lines()[0] == (
+        "Tolerances: neither proved (ISO 14253-1, guard band 1 U (k = 2)); of 2 limits: "
+        "1 neither proved, 1 conformity proved."
+    )
+    assert "G(CW), run 1: 5 um, U = 1 um, limits ±7 um: conformity proved" in found.lines()
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"), [("3.9 um", OUTSIDE), ("4.1 um", OPEN), ("5.9 um", OPEN), ("6.1 um", INSIDE)]
+)
+def test_the_worst_point_decides_on_a_freedom(tmp_path: Path, errors: xr.Dataset, limit: str, expected: int) -> None:
+    (row,) = judge(errors, limits(tmp_path, f'freedoms = {{ EX = "{limit}" }}')).rows
+    assert row.decision == expected
+    assert row.value == pytest.approx(5e-6)
+    assert row.guard == pytest.approx(1e-6)
+
+
+def test_unknown_points_are_counted_and_an_unknown_freedom_is_not_decided(tmp_path: Path, errors: xr.Dataset) -> None:
+    known, unknown = judge(errors, limits(tmp_path, 'freedoms = { EA = "20 urad", EY = "20 um" }')).rows
+    assert (known.decision, known.remark) == (INSIDE, "2 of 3 points known")
+    assert (unknown.decision, unknown.remark) == (OPEN, "the value is unknown")
+
+
+def test_a_limit_in_another_unit_decides_nothing(tmp_path: Path, errors: xr.Dataset) -> None:
+    found = judge(errors, limits(tmp_path, 'freedoms = { EX = "20 arcsec" }'))
+    assert found.decision == OPEN
+    assert "the limit is in rad, the value in m" in found.lines()[1]
+
+
+def test_one_sided_limits(tmp_path: Path, errors: xr.Dataset) -> None:
+    lower, upper = 'freedoms = { EX = { lower = "-2 um" } }', 'freedoms = { EX = { upper = "2 um" } }'
+    assert judge(errors, limits(tmp_path, lower)).decision == INSIDE
+    assert judge(errors, limits(tmp_path, upper)).decision == OUTSIDE
+
+
+def test_words_of_rules_without_guard_band_state_no_proof(tmp_path: Path, errors: xr.Dataset) -> None:
+    for rule, guard in (("simple", "simple acceptance, no guard band"), ("shared risk", "at most 0.33 of half")):
+        found = judge(errors, limits(tmp_path, f'rule = "{rule}"\nfreedoms = {{ EX = "5.1 um" }}'))
+        assert found.verdict == "within limits"
+        assert guard in found.lines()[0]
+
+
+def test_figures_that_fail_leave_the_decision_open(
+    tmp_path: Path, errors: xr.Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        @staticmethod
+        def figures(errors: xr.Dataset) -> Any:
+            raise KeyError("radius")
+
+    monkeypatch.setattr(plugins, "owner_of_method", {"foreign": Broken}.get)
+    found = judge(errors, limits(tmp_path, 'figures = { "*" = "1 m" }\nfreedoms = { EX = "1 m" }'))
+    assert found.decision == OPEN
+    assert "KeyError" in found.lines()[1]
+
+
+def test_without_a_limit_that_applies_there_is_no_verdict(tmp_path: Path, errors: xr.Dataset, foreign: None) -> None:
+    found = judge(errors, limits(tmp_path, 'figures = { other = "1 m" }'))
+    assert (found.decision, found.verdict, found.lines()) == (None, "", [])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "name", "expected"),
+    [
+        ("a", "a", True),
+        ("a", "ab", False),
+        ("a*", "ab", True),
+        ("*", "", True),
+        ("a*a", "a", False),
+        ("a*b*c", "a-b-c", True),
+        ("a*b*c", "a-c-b", False),
+        ("d(Z)*[1]", "d(Z) 60 [1]", True),
+        ("*a" * 50 + "b", "a" * 2000, False),
+    ],
+)
+def test_a_star_stands_for_any_characters(pattern: str, name: str, expected: bool) -> None:
+    assert matches(pattern, name) is expected
+
+
+def test_the_summary_of_a_report_starts_with_the_decision(tmp_path: Path, errors: xr.Dataset) -> None:
+    table = limits(tmp_path, 'freedoms = { EX = "3 um" }')
+    page = write_report(errors, tmp_path / "r.html", run={"tolerances": table.model_dump(mode="json")}).read_text()
+    summary = page[page.index('class="summary"') :]
+    sentence = "Tolerances: nonconformity proved (ISO 14253-1, guard band 1 U (k = 2))"
+    assert sentence in summary
+    assert summary.index(sentence) < summary.index("EX: 5 um, U = 1 um, limits ±3 um: nonconformity proved")
+    assert sentence not in write_report(errors, tmp_path / "s.html").read_text()
