@@ -108,8 +108,4 @@ def _fit(A: Array, y: Array, w: Array) -> tuple[Array, Array, int]:
     x, *_ = np.linalg.lstsq(A * w[:, None], y * w, rcond=None)
     scatter = float(np.sum((w * (y - A @ x)) ** 2)) / degrees
     inverse = np.linalg.inv((A * w[:, None]).T @ (A * w[:, None]))
-<<<<<<< HEAD
-    return np.asarray(x, dtype=float), np.asarray(np.sqrt(scatter * np.diag(inverse))), degrees
-=======
     return np.asarray(x, dtype=float), np.sqrt(scatter * np.diag(inverse)), degrees
->>>>>>> hist
