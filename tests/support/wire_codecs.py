@@ -16,6 +16,7 @@ from errormotion.instruments.controller.mtconnect import xml
 from errormotion.instruments.controller.shdr.codec import MOST_LINE_BYTES
 from errormotion.instruments.laser_tracker import table_reader
 from errormotion.instruments.laser_tracker.leica_emscon import codec as emscon
+from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
 from errormotion.instruments.line_profiler.keyence_ljx import codec as ljx
 from errormotion.instruments.point_lds.capancdt import blocks
 from errormotion.instruments.point_lds.capancdt import codec as capancdt
@@ -25,7 +26,7 @@ from errormotion.instruments.point_lds.optoncdt.codec import encode_value
 from errormotion.instruments.thermometer import dcon
 from errormotion.instruments.thermometer.scpi import codec as scpi
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, format_line
-from errormotion.instruments.transports import opcua
+from errormotion.instruments.transports import opc
 from errormotion.instruments.transports.base import CHUNK
 from errormotion.instruments.transports.can import sdo
 from errormotion.instruments.transports.http.answer import MOST_LINE_BYTES as MOST_HEAD_LINE
@@ -261,6 +262,7 @@ CODECS: Sequence[Codec] = (
         *("leica_emscon", "commands", emscon.decode_command, lambda: rows("leica_emscon", "command")),
         emscon.MAX_PACKET_BYTES,
     ),
+    Codec("leica_geocom", "replies", geocom.reply, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
     Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096),
     Codec(
         "dcon_temperature",
@@ -305,7 +307,7 @@ CODECS: Sequence[Codec] = (
     Codec(
         "shdr", "lines", readers.shdr_lines, lambda: [joined("shdr"), *rows("shdr", "line", "stream")], MOST_LINE_BYTES
     ),
-    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opcua.MOST_BYTES),
+    Codec("opcua", "lines of a session", readers.opcua_lines, lambda: [joined("opcua")], opc.MOST_BYTES),
     Codec("linuxcnc", "lines", readers.linuxcnc_line, linuxcnc_lines, linuxcnc.LONGEST_LINE),
     Codec("virtual_controller", "lines", readers.virtual_line, virtual_lines, virtual.LONGEST_LINE),
     Codec("dprnt", "lines", readers.dprnt_line, dprnt_lines, LONGEST_LINE),

@@ -193,7 +193,7 @@ class OpcUa(Driver):
 
 
 def _is_child(each: Any) -> bool:
-    """Whether this is a node as `transports.opcua` describes one."""
+    """Whether this is a node as `transports.opc` describes one."""
     return (
         isinstance(each, dict)
         and all(isinstance(each.get(name), str) for name in ("id", "name"))
