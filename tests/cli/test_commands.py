@@ -85,9 +85,9 @@ def test_plugin_check_prints_each_check_and_fails_with_the_plugin(
     from errormotion.testing.kit import CheckResult
 
     good, bad = CheckResult("open", True, "opens", 0.1), CheckResult("close", False, "a thread is left", 0.2)
-    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address: [good], raising=False)
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address, mutants: [good], raising=False)
     assert "dcon_temperature: passes" in run("plugins", "check", "dcon_temperature").stdout
-    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address: [good, bad], raising=False)
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address, mutants: [good, bad], raising=False)
     assert answer("plugins", "check", "dcon_temperature", code=3)["ok"] is False
     text = run("plugins", "check", "dcon_temperature", code=3).stdout
     assert "FAILED  close" in text
