@@ -7,11 +7,14 @@ from matplotlib.patches import FancyBboxPatch
 
 LAYERS = [
     [("cli", "the command errormotion")],
+    [("record", "runs of a machine")],
     [("campaign", "benches, tests, runs")],
     [("compensation", "thermal models")],
+    [("compare", "agreement of several results")],
     [("testing", "conformance kit for plugins")],
     [("methods", "one folder a method"), ("instruments", "one folder a kind, a device")],
     [("report", "elements of chapters")],
+    [("tolerances", "limits and decisions")],
     [("twin", "virtual machines, artefacts, sensors")],
     [("datasets", "schemas, units, provenance, files")],
     [("plugins", "contracts and registry")],
@@ -21,7 +24,7 @@ COLOURS = ("#dbe9f6", "#e8eef4")
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(7.6, 7.4), dpi=130)
+    figure, axes = plt.subplots(figsize=(7.6, 9.4), dpi=130)
     height, gap = 0.78, 0.22
     for level, row in enumerate(reversed(LAYERS)):
         width = 8.0 / len(row)
