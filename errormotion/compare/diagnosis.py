@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from errormotion.arrays import Array
@@ -40,6 +41,10 @@ TURNS = {
     "degrees taken as radians": 180 / np.pi,
     "radians taken as degrees": np.pi / 180,
 }
+SMALL_SHIFT = 1.0
+"""Shift in time for which the courses are straight lines, s."""
+SHIFTS = 3
+"""Repetitions of the estimate of a shift, each with the difference of the courses at the last one."""
 UNEXPLAINED = 1e-3
 """Probability of the rest below which a cause does not explain a difference."""
 
@@ -97,6 +102,21 @@ class _Candidate:
 
 
 @dataclass(frozen=True)
+class _Shift:
+    """A shift in time: the mean course (n, d) as a curve over time, s."""
+
+    course: CubicSpline
+    time: Array
+
+    def at(self, shift: float) -> _Candidate:
+        """Return the effect of 1 s for shifts of about this size, s: a difference that is central to both courses."""
+        effect = (self.course(self.time + shift / 2) - self.course(self.time - shift / 2)) / shift
+        return _Candidate(
+            "shift in time", (effect - effect[0])[None], (("shift", "s"),)
+        )  # changes since the first instant
+
+
+@dataclass(frozen=True)
 class _Corrected:
     """A cause without a size: the estimates as they would be without it."""
 
@@ -149,10 +169,17 @@ def diagnose(
 
 
 def _fitted(
-    candidate: _Candidate | _Corrected, d: Estimate, white: Whitener, whole: float, count: int
+    candidate: _Candidate | _Corrected | _Shift, d: Estimate, white: Whitener, whole: float, count: int
 ) -> tuple[Cause, Array] | None:
     if isinstance(candidate, _Corrected):
         return _corrected(candidate, d, whole)
+    if isinstance(candidate, _Shift):
+        found, span = _fitted(candidate.at(SMALL_SHIFT), d, white, whole, count), float(np.ptp(candidate.time))
+        for _ in range(SHIFTS):
+            if found is None or not SMALL_SHIFT < abs(found[0].sizes[0].value) < span / 4:
+                break
+            found = _fitted(candidate.at(found[0].sizes[0].value), d, white, whole, count)
+        return found
     effects = np.where(np.isfinite(d.value), np.nan_to_num(candidate.effects), 0.0)
     normal = white.product(effects, effects)
     scale = np.sqrt(np.diag(normal))
@@ -207,7 +234,7 @@ def _candidates(
     time: Array | None,
     temperatures: Mapping[str, Array],
     turns: Mapping[str, Array],
-) -> Iterator[_Candidate | _Corrected]:
+) -> Iterator[_Candidate | _Corrected | _Shift]:
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
     yield from _geometric(mean, k)
@@ -221,9 +248,7 @@ def _candidates(
     units = tuple((name, "m" if name in DOF[:3] else "rad") for name in freedoms)
     yield _Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units)
     if time is not None and n > 2:
-        slope = np.gradient(mean, time, axis=0)[:, k]
-        slope = slope - slope[0]  # both are changes since the first instant
-        yield _Candidate("shift in time", slope[None], (("shift", "s"),))
+        yield _Shift(CubicSpline(time, mean[:, k]), time)
         yield from _steps(n, len(k), units, time)
     for name, temperature in temperatures.items():
         change = temperature - temperature[0]

@@ -134,7 +134,7 @@ PLANTED = {
     "sign of EB": {"change": flipped(4)},
     "EX and EY exchanged": {"change": exchanged},
     "scale of the displacements": {"change": lambda v: v * [1.06, 1.06, 1.06, 1, 1, 1]},
-    "shift in time": {"start": "2026-03-01T08:01:30+00:00"},
+    "shift in time": {"start": "2026-03-01T08:03:00+00:00"},
     "unit of 'probing': urad taken as arcsec": {"change": lambda v: v * ([1] * 3 + [4.8481368] * 3)},
     "step at 3600 s (something moved)": {"change": stepped},
 }
