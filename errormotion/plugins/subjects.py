@@ -65,6 +65,9 @@ class InstrumentSubject:
         A fault must have become an error, or a counted loss, by then, s.
     dead_address : str
         An address at which nothing answers.
+    repeats : bool
+        Whether the device gives a reading that was lost once more, such as one whose simulated clock stood still: after
+        a late answer, equal readings are right.
     mutants : int
         How many times a recorded session is replayed with a changed frame; 0: never.
     """
@@ -82,6 +85,7 @@ class InstrumentSubject:
     blocks: int = 3
     time_limit: float = 10.0
     dead_address: str = "tcp://127.0.0.1:9"
+    repeats: bool = False
     mutants: int = 300
 
     def build(self, *, address: str = "", fault: str = "", record: Path | None = None) -> Any:

@@ -64,7 +64,7 @@ def late_answers(subject: InstrumentSubject) -> str:
         limit = 1.0
     sound = _readings(subject, "")
     seen = [
-        _require_in_step(sound, _late_readings(subject, when), how)
+        _require_in_step([] if subject.repeats else sound, _late_readings(subject, when), how)
         for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
     ]
     return "; ".join(seen)

@@ -62,6 +62,7 @@ def on_two_ports(printed: dict[str, Any], port: int) -> str:
 CASES = {
     "can_temperature": Case(("--set", "bus=udp_multicast"), settings={"timeout": 5.0}),
     "capancdt": Case(url=on_two_ports),
+    "confocaldt": Case(url=on_two_ports),
     "controller_probe": Case(),
     "dcon_temperature": Case(),
     "dprnt": Case(settings={"start_timeout": 0.3}, read=no_line_without_a_program),
@@ -72,6 +73,7 @@ CASES = {
     "linuxcnc": Case(("--set", "wait=60")),  # a computer has room for one
     "modbus_temperature": Case(url=lambda printed, port: f"modbus+tcp://127.0.0.1:{port}?unit=1"),
     "mtconnect": Case(url=lambda printed, port: f"http://127.0.0.1:{port}/"),
+    "leica_geocom": Case(),
     "opcua": Case(),
     "optoncdt": Case(),
     "scpi_temperature": Case(),

@@ -24,6 +24,7 @@ class TestKit(InstrumentConformance):
         "sim://cframe/station?seed=3",
         settings={"timeout": 0.7},
         name="station",
+        repeats=True,  # a station keeps its last measurement
         dead_address="tcp://127.0.0.1:9",
     )
 

@@ -23,7 +23,7 @@ from errormotion.instruments.spindle_frame.geometry import frame_geometry
 from errormotion.instruments.spindle_frame.settings import CHANNELS, FrameSettings
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.recording import read_index, write_index
-from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 WARM_UP = 2 * 3600.0
 """Time until a sensor is stable after it was switched on, s: it drifts by 10.5 um (Geiselhart et al. 2025)."""
@@ -51,6 +51,11 @@ class FiveSensorFrame:
     )
     Settings: ClassVar[type[FrameSettings]] = FrameSettings
     channels = CHANNELS
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines; the simulated clock stands still while no reading is given."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3", repeats=True)
 
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
         self.address = address

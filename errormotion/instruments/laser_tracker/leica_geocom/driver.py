@@ -12,7 +12,7 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.laser_tracker.leica_geocom import air, codec, codes
 from errormotion.instruments.laser_tracker.leica_geocom.settings import GeoComSettings
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment, Measurement
 
 HECTOPASCAL = 100.0  # Pa
@@ -53,6 +53,11 @@ class LeicaGeoCom(Driver):
     )
     Settings: ClassVar[type[GeoComSettings]] = GeoComSettings
     settings: GeoComSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines; a station keeps its last measurement and gives it once more."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3", repeats=True)
 
     _transaction = 0
     _clear = True  # whether unfinished requests may lie in the station's buffer

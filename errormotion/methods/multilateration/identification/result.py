@@ -254,6 +254,7 @@ def build(
     piece = pieces[0]
     whole: dict[str, Any] = {"covariance": covariance, "influence": influence}
     whole |= {name: values[:, k] for k, name in enumerate(piece["dof"].values)}
+    whole["target_index"] = np.arange(m)
     variables = {name: (piece[name].dims, array, piece[name].attrs) for name, array in whole.items()}
     own = {name: piece.coords[name] for name in piece.coords if "target" not in piece[name].dims}
     places = {
