@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from errormotion import datasets
+from errormotion.campaign.folder import RunFolder
 from errormotion.cli.app import app
 
 FEW = ("--freedoms", "EX,EY,EZ")
@@ -32,11 +33,14 @@ def files(tmp_path, results):
         datasets.save(ds, tmp_path / f"{name}.nc")
 
 
-def stored(folder: Path, ds, test=None, started=""):
-    folder.mkdir(parents=True)
-    datasets.save(ds, folder / "errors.nc")
-    if test is not None:
-        (folder / "run.json").write_text(json.dumps({"test": test, "started": started}))
+def stored(folder: Path, ds, test, created=""):
+    """Store a result in a run folder as a campaign leaves it."""
+    made = RunFolder.create(folder.parent, "test", "1", {"test": test})
+    made.path.rename(folder)
+    run = RunFolder.open(folder)
+    (folder / "errors" / "example-1").mkdir(parents=True)
+    datasets.save(ds, folder / "errors" / "example-1" / "errors.nc")
+    run.save(errors="errors/example-1/errors.nc", **({"created": created} if created else {}))
 
 
 def test_files_are_compared_and_the_result_is_written(run, files):
@@ -58,9 +62,9 @@ def test_a_result_is_never_overwritten(run, files):
 
 def test_a_run_folder_is_named_after_its_test(run, results, tmp_path):
     stored(tmp_path / "r1", results["drift"], "five sensors")
-    stored(tmp_path / "r2", results["probing"])
-    said = json.loads(run("compare", "r1", "r2/errors.nc", *FEW, "--json").stdout)
-    assert [pair["pair"] for pair in said["pairs"]] == ["five sensors - r2"]
+    stored(tmp_path / "r2", results["probing"], "balls")
+    said = json.loads(run("compare", "r1", "r2", *FEW, "--json").stdout)
+    assert [pair["pair"] for pair in said["pairs"]] == ["five sensors - balls"]
     assert said["agree"] is True
     assert said["pairs"][0]["p"] > 0.05
     assert set(said["pairs"][0]["p_of_freedoms"]) == {"EX", "EY", "EZ"}
@@ -71,7 +75,9 @@ def test_a_folder_of_runs_stands_for_the_newest_of_each_test(run, results, tmp_p
     stored(tmp_path / "runs" / "b", wrong, "drift", "2026-03-01T07:00:00+00:00")
     stored(tmp_path / "runs" / "a", results["drift"], "drift", "2026-03-02T07:00:00+00:00")
     stored(tmp_path / "runs" / "c", results["probing"], "probing", "2026-03-02T07:00:00+00:00")
-    run("compare", "runs", *FEW, "--out", "c.nc")
+    (tmp_path / "runs" / "damaged").mkdir()
+    (tmp_path / "runs" / "damaged" / "run.json").write_text("{")
+    assert "damaged/run.json: is not valid JSON" in run("compare", "runs", *FEW, "--out", "c.nc").stdout
     found = datasets.load("c.nc")
     assert found["dataset"].values.tolist() == ["drift", "probing"]
     assert np.nanmax(np.abs(found["value"].sel(dataset="drift", dof="EX").values)) < 5e-5
@@ -96,7 +102,7 @@ def test_names_and_the_functional_point_can_be_given(run, files):
         (("drift.nc", "unknown.nc"), 1, "no attribute 'start'"),
         (("drift.nc", "later.nc"), 1, "do not overlap"),
         (("drift.nc", "other.nc"), 1, "machine"),
-        (("drift.nc", "empty"), 1, "expected an error dataset"),
+        (("drift.nc", "empty"), 1, "expected a run folder"),
     ],
 )
 def test_refusals_say_what_was_expected(run, files, results, arguments, code, message):

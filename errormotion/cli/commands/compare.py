@@ -10,8 +10,8 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.cli.output import show, show_json, table
+from errormotion.cli.results import load
 from errormotion.compare import compare as compared
-from errormotion.compare.loading import load
 from errormotion.compare.text import cause_text, probability, verdict
 from errormotion.errors import DatasetError
 
@@ -37,7 +37,10 @@ def compare(
     for path in (out, report):
         if path is not None and path.exists():
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
-    found = compared(load(paths, _named(names)), at=at, freedoms=freedoms, since=since, same_start=same_start)
+    results, left_out = load(paths, _named(names))
+    found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start)
+    if left_out:
+        found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
     if out is not None:
         datasets.save(found, out)
     if report is not None:

@@ -1,0 +1,79 @@
+"""Error datasets by name: files, run folders, and folders of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.raw_paths import is_runs_folder
+from errormotion.errors import DatasetError, RunError
+
+
+def load(paths: Sequence[Path], names: Mapping[str, Path]) -> tuple[dict[str, xr.Dataset], list[str]]:
+    """Return error datasets by name, and the runs that were left out, one sentence each.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        An error dataset; a run folder; or a folder of runs, which stands for the newest result of each of its tests.
+    names : mapping of str to Path
+        Further ones, with their names.
+
+    Raises
+    ------
+    DatasetError, RunError
+        Nothing there, no error dataset, a run without errors.
+    """
+    found: dict[str, xr.Dataset] = {}
+    left_out: list[str] = []
+    for path in paths:
+        for name, file in _files(path, left_out):
+            _add(found, name, file)
+    for name, path in names.items():
+        files = _files(path, left_out)
+        if len(files) != 1:
+            raise DatasetError(f"{path}: expected one error dataset for the name '{name}'; found {len(files)}")
+        _add(found, name, files[0][1])
+    return found, left_out
+
+
+def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
+    own, number = name, 1
+    while own in found:
+        number += 1
+        own = f"{name} ({number})"
+    found[own] = datasets.load(file)
+
+
+def _files(path: Path, left_out: list[str]) -> list[tuple[str, Path]]:
+    """Return names and files of the error datasets that a path stands for."""
+    if path.is_file():
+        return [(path.stem, path)]
+    if not path.is_dir():
+        raise DatasetError(f"{path}: there is no such file or folder")
+    if not is_runs_folder(path):
+        folder = RunFolder.open(path)
+        return [(str(folder.data["test"]), _errors(folder))]
+    newest: dict[str, tuple[str, Path]] = {}
+    for file in sorted(path.glob("*/run.json")):
+        try:
+            folder = RunFolder.open(file.parent)
+            test, created, errors = str(folder.data["test"]), str(folder.data["created"]), _errors(folder)
+        except (RunError, KeyError) as error:
+            left_out.append(f"left out: {error}")
+            continue
+        if test not in newest or created >= newest[test][0]:
+            newest[test] = (created, errors)
+    if not newest:
+        raise DatasetError(f"{path}: none of its runs has errors; identify them first")
+    return [(test, errors) for test, (_, errors) in newest.items()]
+
+
+def _errors(folder: RunFolder) -> Path:
+    if folder.errors is None or not folder.errors.is_file():
+        raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
+    return folder.errors
