@@ -189,7 +189,8 @@ def _in_time(
     if missing and not same_start:
         raise DatasetError(
             f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times "
-            "have no relation to the others. State it, or state that all start at the same instant (same_start)"
+            "have no relation to the others. State it, or state that all start at the same instant "
+            "(same_start, --same-start)"
         )
     if missing:
         notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")

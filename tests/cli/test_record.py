@@ -165,6 +165,12 @@ def test_a_note_that_is_not_json_is_an_error_of_its_own(folder: Path) -> None:
         parts_of(Path("b.rec"))
 
 
+def test_a_file_that_is_no_recording_is_refused_as_that(folder: Path) -> None:
+    (folder / "errors.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(64))
+    with pytest.raises(ReplayError, match=r"errors\.nc is not a recording"):
+        read_note(folder / "errors.nc")
+
+
 def test_a_note_replaces_an_earlier_one(folder: Path) -> None:
     run("record", "bench.toml", "air", "--for", "0.1 s", "--out", "a.rec")
     frames = read_recording(Path("a.rec"))

@@ -306,6 +306,8 @@ def read_note(path: Path) -> dict[str, Any] | None:
             file.readline(MOST_NOTE_BYTES)
             line = file.readline(MOST_NOTE_BYTES)
         note = json.loads(line.removeprefix(NOTE)) if line.startswith(NOTE) else None
+    except UnicodeDecodeError:
+        raise ReplayError(f"{path} is not a recording: its first lines are not text") from None
     except (OSError, ValueError, RecursionError) as error:
         raise ReplayError(f"The note of the recording {path} cannot be read: {error}") from None
     if note is not None and not isinstance(note, dict):
