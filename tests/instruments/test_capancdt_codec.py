@@ -230,7 +230,7 @@ RANGE = codec.Channel("DL6220", "1", 0.0, 1e-3)
 def sequence(*data: bytes, channel: int = 1) -> Sequence:
     found = Sequence(channel, RANGE)
     for each in BlockDecoder().feed(b"".join(data), last=True):
-        found.add(each)
+        found.add_block(each)
     return found
 
 

@@ -120,20 +120,20 @@ def test_blocks_are_found_however_they_arrive(parts: list[list[int]], data: st.D
 def test_a_gap_of_the_counter_is_counted_as_lost_and_a_jump_back_refused() -> None:
     sequence = Sequence()
     for each in BlockDecoder().feed(block(2**32 - 1, 10, 20) + block(3, 30), last=True):
-        sequence.add(each)
+        sequence.add_block(each)
     values, codes = sequence.take(5)
     np.testing.assert_allclose(values * 1e9, [10, 20, np.nan, np.nan, 30])
     assert reasons(codes) == {"lost": 2}
     for counter in (3, 4 + LONGEST_GAP + 1):
         with pytest.raises(ProtocolError, match="counter"):
-            sequence.add(BlockDecoder().feed(block(counter, 1), last=True)[0])
+            sequence.add_block(BlockDecoder().feed(block(counter, 1), last=True)[0])
 
 
 def test_a_damaged_block_is_counted_as_garbled() -> None:
     first, second = block(0, 1, 2, 3), block(3, 4)
     sequence = Sequence()
     for each in BlockDecoder().feed(first[:-5] + second, last=True):
-        sequence.add(each)
+        sequence.add_block(each)
     values, codes = sequence.take(4)
     assert reasons(codes) == {"garbled": 3}
     assert values[3] == pytest.approx(4e-9)

@@ -153,7 +153,7 @@ def capancdt_blocks(data: bytes) -> None:
     decoder, sequence = blocks.BlockDecoder(), Sequence(1, capancdt.Channel("", "", 0.0, 1e-3))
     first, second = halves(data)
     for block in [*decoder.feed(first), *decoder.feed(second, last=True)]:
-        sequence.add(block)
+        sequence.add_block(block)
     values, codes = sequence.take(sequence.waiting)
     assert values.shape == codes.shape
 

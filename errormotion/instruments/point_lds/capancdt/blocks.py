@@ -24,7 +24,6 @@ BYTES_OF_VALUE = 4
 CHANNELS = 32
 MAX_BLOCK_BYTES = 65536
 """Longest block: it is one TCP packet (6200 p. 55)."""
-COUNTER = 1 << 32
 
 FULL_SCALE = 0xFFFFFF
 """Value at the end of the measuring range; it is 0 at its start (6200 p. 56)."""

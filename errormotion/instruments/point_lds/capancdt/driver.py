@@ -202,7 +202,7 @@ class CapaNCDT(Driver):
                 data = self._data.read(timeout=max(until - time.monotonic(), 0.0))
                 blocks = decoder.feed(data)
                 for each in blocks:
-                    sequence.add(each)
+                    sequence.add_block(each)
                 if blocks:
                     until = time.monotonic() + limit
             values, codes = sequence.take(size)

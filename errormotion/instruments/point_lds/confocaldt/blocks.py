@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError
+from errormotion.instruments.point_lds.counted import CountedReadings
 
 PREAMBLES = (b"SAEM", b"MEAS")
 PREAMBLE_BYTES = 4
@@ -26,7 +27,6 @@ HEADER = struct.Struct("<4sIIIIHHI")
 BYTES_OF_VALUE = 4
 MAX_BLOCK_BYTES = 65536
 """Longest block: it is one TCP packet (24x1 p. 115)."""
-COUNTER = 1 << 32
 LONGEST_GAP = 1_000_000
 """Readings: a larger jump of the counter is none that was lost, but another sequence."""
 
@@ -168,54 +168,15 @@ def scale(raws: Array) -> tuple[Array, Array]:
     return np.where(codes == VALID, raws * RESOLUTION, np.nan), codes
 
 
-class Sequence:
+class Sequence(CountedReadings):
     """Collects readings in the order of their counter; gaps are lost readings."""
 
     def __init__(self) -> None:
-        self._expected: int | None = None
-        self._parts: deque[tuple[Array, Array]] = deque()
-        self.waiting = 0
+        super().__init__(lost=LOST, garbled=GARBLED, longest_gap=LONGEST_GAP)
 
-    def add(self, block: Block) -> None:
-        """Add a block.
-
-        Raises
-        ------
-        ProtocolError
-            The counter jumps back, or too far.
-        """
-        count = len(block.values)
-        gap = 0 if self._expected is None else (block.counter - self._expected) % COUNTER
-        if gap > LONGEST_GAP:
-            raise ProtocolError(
-                f"The counter of measured values jumps from {self._expected} to {block.counter}; "
-                "was the controller set up by another program?"
-            )
-        self._expected = (block.counter + count) % COUNTER
-        if gap:
-            self._append(np.full(gap, np.nan), np.full(gap, LOST, dtype=np.int8))
-        if block.intact:
-            self._append(*scale(block.values))
-        else:
-            self._append(np.full(count, np.nan), np.full(count, GARBLED, dtype=np.int8))
-
-    def take(self, size: int) -> tuple[Array, Array]:
-        """Return the next ``size`` readings, m, and the code of each."""
-        values, codes = np.empty(size), np.empty(size, dtype=np.int8)
-        filled = 0
-        while filled < size:
-            head, code = self._parts.popleft()
-            used = min(len(head), size - filled)
-            values[filled : filled + used], codes[filled : filled + used] = head[:used], code[:used]
-            if used < len(head):
-                self._parts.appendleft((head[used:], code[used:]))
-            filled += used
-        self.waiting -= size
-        return values, codes
-
-    def _append(self, values: Array, codes: Array) -> None:
-        self._parts.append((values, codes))
-        self.waiting += len(values)
+    def add_block(self, block: Block) -> None:
+        """Add a block; ProtocolError where the counter jumps back, or too far."""
+        self.add(block.counter, len(block.values), (lambda: scale(block.values)) if block.intact else None)
 
 
 def reasons(codes: Array) -> dict[str, int]:

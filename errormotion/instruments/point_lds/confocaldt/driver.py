@@ -194,7 +194,7 @@ class ConfocalDT(Driver):
             while sequence.waiting < size:
                 blocks = decoder.feed(self._data.read(timeout=max(until - time.monotonic(), 0.0)))
                 for each in blocks:
-                    sequence.add(each)
+                    sequence.add_block(each)
                 if blocks:
                     until = time.monotonic() + limit
             values, codes = sequence.take(size)
