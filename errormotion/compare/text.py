@@ -11,6 +11,8 @@ import xarray as xr
 LIMIT = 0.05
 """Probability below which datasets contradict each other."""
 FIELD = {"m": (1e3, "mm"), "rad": (648000 / np.pi, "arcsec"), "s": (1.0, "s"), "1": (1.0, "")}
+SHORT = 1e-3
+"""Lengths below are printed in um, m: errors; those above are coordinates."""
 FIELD |= {"m/K": (1e6, "um/K"), "rad/K": (648000 / np.pi, "arcsec/K")}
 
 
@@ -83,6 +85,8 @@ def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:
         if str(label):
             what, _, unit = str(label).removesuffix(")").rpartition(" (")
             factor, field = FIELD.get(unit, (1.0, unit))
+            if unit == "m" and abs(value) < SHORT:
+                factor, field = 1e6, "um"
             parts.append(f"{what} {factor * value:.4g} ± {2 * factor * u:.2g} {field}".rstrip())
     return CauseText(
         name, ", ".join(parts), float(one["log_likelihood_ratio"]), float(one["cause_p"]), str(one["alike"].values)

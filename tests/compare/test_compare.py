@@ -1,10 +1,13 @@
 """Whole comparisons: methods that agree, planted mistakes and their causes, bad input, the dataset of the result."""
 
+import re
+
 import numpy as np
 import pytest
 
 from errormotion import datasets
 from errormotion.compare import compare
+from errormotion.compare.text import cause_text
 from errormotion.errors import DatasetError
 
 START = "2026-03-01T08:00:00+00:00"
@@ -241,3 +244,12 @@ def test_a_wrong_functional_point_is_named_where_only_displacements_are_compared
     assert abs(size[2] - 0.05) < 4 * u[2]
     both = {first["cause"].item(), *first["alike"].item().split("; ")}
     assert both == {"functional point of 'drift'", "functional point of 'probing'"}
+
+
+def test_sizes_are_printed_in_the_units_of_the_field():
+    rng = np.random.default_rng(5)
+    step = cause_text(compare(two(rng, change=stepped)), 0, 0)
+    assert step.name.startswith("step at 3600 s")
+    assert re.search(r"EZ 7\.\d+ ± 0\.\d+ um", step.size)
+    point = cause_text(compare(two(rng, functional_point=(0.0, 0.0, 0.03))), 0, 0)
+    assert re.search(r"Z -?[23]\d\.?\d* ± \d+ mm", point.size)
