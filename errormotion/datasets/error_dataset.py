@@ -135,7 +135,7 @@ def build_errors(
         attrs["reference_position"] = float(reference_position)
     if start:
         attrs["start"] = start
-    if notes:
+    if notes := [*notes, *provenance.get("interruptions", ())]:
         attrs["notes"] = list(notes)
     try:
         ds = xr.Dataset(variables, coords=own_coords, attrs=attrs)
