@@ -112,6 +112,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         reference="nominal beam; its errors are stated at its nominal zero point (nominal_origin)",
         method=method,
         method_version=version,
+        measured=raw.attrs,
         start=start_of(raw),
         source_ids=identities(converged, sensor),
         provenance=provenance.make(settings, raw, None, steps=steps)

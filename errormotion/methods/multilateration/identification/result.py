@@ -71,6 +71,7 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
         reference=DATUM,
         method=method,
         method_version=version,
+        measured={**state.raw.attrs, **({"chain": state.settings.chain} if state.settings.chain else {})},
         start=start_of(state.raw),
         provenance=provenance.make(state.settings, state.raw, None, steps=_steps(state)),
         sources=made.names,

@@ -144,6 +144,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         ),
         method=method,
         method_version=version,
+        measured=raw.attrs,
         provenance=provenance.make(
             settings,
             measured,
