@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
+from errormotion.compare import chain
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
 from errormotion.datasets.reduction import influence_of
@@ -100,11 +101,18 @@ def common_ground(
         for other in names[:i]:
             if datasets[name].identical(datasets[other]):
                 raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    notes: list[str] = []
+    datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
+    if chain.axis_of(datasets):
+        _same(datasets, "machine")
+        _same(datasets, "frame")
+        datasets = chain.on_axis(datasets, at=at, same_start=same_start, notes=notes)
+    for name, ds in datasets.items():
+        _check_dimensions(name, ds)
     first = datasets[names[0]]
     component = _same(datasets, "component", SAME_MOTION)
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
-    notes: list[str] = []
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
     moved = {name: ds if component == "beam" else ds.em.at(point) for name, ds in datasets.items()}
     reference: float | None = None
@@ -150,6 +158,9 @@ def _check(name: str, ds: xr.Dataset) -> None:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
         )
+
+
+def _check_dimensions(name: str, ds: xr.Dataset) -> None:
     if len(ds["EX"].dims) > 1:
         raise DatasetError(
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
@@ -163,7 +174,8 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     if len(values) > 1:
         stated = "; ".join(f"'{name}': {value}" for name, value in found.items())
         hint = {
-            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name)",
+            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name), or state the origin of "
+            "its frame in machine coordinates (attribute frame_origin, --origin NAME=x,y,z)",
             "component": ". The errors of an axis and of the tool need the kinematic chain; predict one from the other",
         }.get(attribute, "")
         raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
