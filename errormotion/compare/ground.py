@@ -47,6 +47,8 @@ class Ground:
     notes : list of str
     turns : dict of str to ndarray (n, 3)
         Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
+    labels : dict of str to str
+        Identity of a source to its name.
     """
 
     estimates: list[Estimate]
@@ -61,6 +63,7 @@ class Ground:
     start: str = ""
     notes: list[str] = field(default_factory=list)
     turns: dict[str, Array] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
 
 
 def common_ground(
@@ -145,6 +148,7 @@ def common_ground(
         start=str(grid.attrs.get("start", "")),
         notes=notes,
         turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
+        labels={identity: name for ds in moved.values() for identity, name in _labels(ds)},
     )
 
 
@@ -291,6 +295,13 @@ def _known(ds: xr.Dataset) -> Array:
 
 def _seen(ds: xr.Dataset) -> list[str]:
     return [name for name in DOF if np.isfinite(ds[name].values).any()]
+
+
+def _labels(ds: xr.Dataset) -> list[tuple[str, str]]:
+    if "source_id" not in ds.coords:
+        return []
+    pairs = zip(ds["source_id"].values.tolist(), ds["source"].values.tolist(), strict=True)
+    return [(str(identity), str(name)) for identity, name in pairs if identity]
 
 
 def _turns(ds: xr.Dataset) -> Array:

@@ -216,6 +216,7 @@ OPTIONAL_ATTRIBUTES = {
     "component_description": "what a component is that the schema does not list",
     "chain": "kinematic chain of the machine, such as `workpiece-X-Y-bed-Z-spindle-tool`",
     "operator": "who measured",
+    "certificates": "JSON object: certificates of artefacts and instruments, by item",
     "frame_origin": "origin of `frame` in machine coordinates with all axes at zero, m, where its directions are those "
     "of the machine",
     "lever_axes": "linear axes whose travel is a lever of the rotations, such as `Z`, where the errors are not those "
@@ -224,7 +225,7 @@ OPTIONAL_ATTRIBUTES = {
 }
 """Attributes that an error dataset may have."""
 
-CARRIED = ("chain", "operator")
+CARRIED = ("chain", "operator", "certificates")
 """Attributes of a raw dataset that its error dataset carries on."""
 
 
