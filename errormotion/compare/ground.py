@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
 from errormotion.datasets.reduction import influence_of
@@ -292,7 +292,7 @@ def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
     F = influence_of(ds)
     F = F.reshape(len(F), -1, 6)[..., k]
     total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
-    own = total - np.einsum("sni,snj->nij", F, F)
+    own = total - products(F)
     size = len(F)
     sources = ds["source"].values.tolist() if size else []
     ids = ds["source_id"].values.tolist() if size and "source_id" in ds.coords else [""] * size

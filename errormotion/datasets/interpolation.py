@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
 from errormotion.datasets.reduction import TOLERANCE, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
@@ -64,7 +64,7 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     )
     F = np.moveaxis(F, axis + 1, 1)
     total = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
-    own = total - np.einsum("s...i,s...j->...ij", F, F)
+    own = total - products(F)
     before, share, exact, inside = _neighbours(t, new)
     after = np.minimum(before + ~exact, len(t) - 1)
     w = share.reshape(-1, *[1] * (E.ndim - 1))
@@ -81,7 +81,7 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     values[~inside] = np.nan
     unknown = np.isnan(values)
     influence[:, unknown] = np.nan
-    covariance = rest + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    covariance = rest + products(influence)
     covariance[unknown[..., :, None] | unknown[..., None, :]] = np.nan
     base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
     base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
