@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.arrays import Array
-from errormotion.compare.normal import Information, Reduced, Solution, solve
+from errormotion.arrays import Array, filled
+from errormotion.compare.normal import Information, Reduced, Solution, short, solve
 from errormotion.compare.pairs import ChiSquare
 from errormotion.compare.stack import Estimate
 
@@ -54,11 +54,11 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
     count = known.sum(axis=0)
     degrees = int((count - (count > 0)).sum())
     left_degrees = [int((rest - (rest > 0)).sum()) for rest in count - known]
-    if len(keys) <= count.size:
+    if not short(parts, len(keys)):
         found = solve(parts, len(keys))
         left = [
-            max(solve([part for part in parts if part is not each], len(keys)).square, 0.0) if len(parts) > 1 else 0.0
-            for each in parts
+            max(solve([part for part in parts if part is not each], len(keys)).square, 0.0) if its else 0.0
+            for each, its in zip(parts, left_degrees, strict=True)
         ]
     else:
         reduced = Reduced.of(parts, len(keys))
@@ -107,14 +107,14 @@ def random_effects(estimates: Sequence[Estimate]) -> tuple[Array, Array, Array]:
         Standard deviation between datasets, m and rad.
     """
     y = np.array([each.value for each in estimates])
-    variance = np.array([np.diagonal(each.covariance(), axis1=1, axis2=2) for each in estimates])
+    variance = np.array([each.variance() for each in estimates])
     known = np.isfinite(y) & (variance > 0)
     w = np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
     total = w.sum(axis=0)
-    y = np.nan_to_num(y)
+    y = filled(y)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = (w * y).sum(axis=0) / total
-    Q = np.nansum((w * (y - np.nan_to_num(mean)) ** 2), axis=0)
+    Q = np.nansum((w * (y - filled(mean)) ** 2), axis=0)
     degrees = np.maximum(known.sum(axis=0) - 1, 0)
     c = np.where(total > 0, total - (w**2).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
     weight = c.sum(axis=0)

@@ -96,17 +96,17 @@ def common_ground(
         raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
     for name, ds in datasets.items():
         _check(name, ds)
-    for i, name in enumerate(names):
-        for other in names[:i]:
-            if datasets[name].identical(datasets[other]):
-                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    _once(datasets)
     first = datasets[names[0]]
     component = _same(datasets, "component", SAME_MOTION)
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
     notes: list[str] = []
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
-    moved = {name: ds if component == "beam" else ds.em.at(point) for name, ds in datasets.items()}
+    moved = {
+        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else ds.em.at(point)
+        for name, ds in datasets.items()
+    }
     reference: float | None = None
     if dim == "time":
         moved, reference = _in_time(moved, since, same_start, notes)
@@ -155,6 +155,17 @@ def _check(name: str, ds: xr.Dataset) -> None:
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
             "in ds.isel(position=3)"
         )
+
+
+def _once(datasets: Mapping[str, xr.Dataset]) -> None:
+    """Refuse one dataset under two names; only those with the same values are compared as a whole."""
+    seen: dict[bytes, list[str]] = {}
+    for name, ds in datasets.items():
+        alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
+        for other in alike:
+            if datasets[name].identical(datasets[other]):
+                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+        alike.append(name)
 
 
 def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str, str] | None = None) -> str:

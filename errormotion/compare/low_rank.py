@@ -6,8 +6,8 @@ By the matrix inversion lemma ``V^-1 = D^-1 - D^-1 F (1 + F' D^-1 F)^-1 F' D^-1`
 A direction without variance of its own, such as that of a reference state, has no inverse in D. There the sources must
 explain the whole value: with F = (G, H) on the directions with and without own variance, and the singular values
 ``H = U S W'``, the sources are ``z = W S^-1 U' h + W0 t`` with ``W0' W = 0``. The square of a vector (g, h) is then
-``|S^-1 U' h|^2`` plus that of ``g - G W S^-1 U' h`` with the covariance ``1 + G W0 W0' G'``. This is ``a' V^+ a`` with the
-pseudo-inverse for every vector that V can produce. What no variance allows has no weight.
+``|S^-1 U' h|^2`` plus that of ``g - G W S^-1 U' h`` with the covariance ``1 + G W0 W0' G'``. This is ``a' V^+ a`` with
+the pseudo-inverse for every vector that V can produce. What no variance allows has no weight.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled
 
 LEAST = 1e-12
 """Share of the largest variance of a freedom below which a direction counts as without variance of its own."""
@@ -61,9 +61,9 @@ class Whitener:
 
     def _white(self, a: Array) -> tuple[Array, Array, Array]:
         """Return what is squared: the rest with own variance, less what sources explain of it, and the sources."""
-        filled = np.nan_to_num(np.asarray(a, dtype=float)) / self.scale  # (p, n, d)
-        pinned = np.einsum("pmd,md->pm", filled[:, self.at], self.bound) @ self.pinned.T  # (p, r)
-        free = np.matmul(filled[:, :, None, :], self.root)[:, :, 0].reshape(len(filled), -1)
+        scaled = filled(a) / self.scale  # (p, n, d)
+        pinned = np.einsum("pmd,md->pm", scaled[:, self.at], self.bound) @ self.pinned.T  # (p, r)
+        free = np.matmul(scaled[:, :, None, :], self.root)[:, :, 0].reshape(len(scaled), -1)
         free = free - pinned @ self.carried.T
         return free, (free @ self.G) @ self.factor.T, pinned
 
@@ -74,7 +74,7 @@ def whitener(own: Array, influence: Array) -> Whitener:
     Directions with no variance at all carry no weight, so that a value that is known exactly on both sides of a
     difference (the zero of a reference state) is no evidence.
     """
-    own, F = np.nan_to_num(own), np.nan_to_num(influence)
+    own, F = filled(own), filled(influence)
     n, d = own.shape[:2]
     total = np.diagonal(own, axis1=1, axis2=2) + np.square(F).sum(axis=0)
     scale = np.sqrt(total.max(axis=0, initial=0.0))

@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled
 from errormotion.compare.stack import Estimate
 
 FLOOR = 1e-9
 """Variance of its own that every known value gets at least, as a share of its total variance."""
+MOST_VALUES = 6000
+"""Number of values (points by freedoms) up to which a matrix of all of them is formed: 300 MB."""
 CONVERGED = 1e-10
 """Residual at which the conjugate gradients of the datasets left out end, relative to the right-hand side."""
 
@@ -55,13 +57,13 @@ class Information:
     @classmethod
     def of(cls, each: Estimate, keys: dict[str, int]) -> Information:
         """Reduce an estimate; a value without any variance is exact by definition, and says nothing."""
-        total = np.nan_to_num(each.variance())
+        total = filled(each.variance())
         known = each.known & (total > 0)
-        own = np.nan_to_num(each.own) + FLOOR * total[:, :, None] * np.eye(total.shape[1])
+        own = filled(each.own) + FLOOR * total[:, :, None] * np.eye(total.shape[1])
         W = _inverse(own, known)
-        F = np.where(known[..., None], np.nan_to_num(np.moveaxis(each.influence, 0, -1)), 0.0)
+        F = np.where(known[..., None], filled(np.moveaxis(each.influence, 0, -1)), 0.0)
         WF = np.matmul(W, F)
-        y = np.where(known, np.nan_to_num(each.value), 0.0)
+        y = np.where(known, filled(each.value), 0.0)
         place = np.array([keys[key] for key in each.source], dtype=np.intp)
         s = F.shape[-1]
         inner = F.reshape(-1, s).T @ WF.reshape(-1, s)
@@ -97,6 +99,15 @@ def solve(parts: Sequence[Information], sources: int) -> Solution:
     influence = np.moveaxis((AB.reshape(n * d, -1) @ half.T).reshape(n, d, -1), -1, 0)
     square = sum(each.square for each in parts) - float((right * plain).sum()) - float(gradient @ z)
     return Solution(plain - AB @ z, own, influence, seen, square)
+
+
+def short(parts: Sequence[Information], sources: int) -> bool:
+    """Whether `Reduced` is quicker: many datasets of few values; its memory grows with the square of the values."""
+    m, size = len(parts), parts[0].y.size
+    rounds = 10  # of the conjugate gradients
+    by_sources = m * sources**2 * size * 2
+    by_values = size**3 / 3 + sources * size**2 + rounds * m * size**2 * 4
+    return m > 2 and size <= MOST_VALUES and by_values < by_sources
 
 
 @dataclass(frozen=True)
@@ -210,6 +221,6 @@ def _inverse(matrices: Array, kept: NDArray[np.bool_]) -> Array:
     both = kept[:, :, None] & kept[:, None, :]
     scale = np.sqrt(np.where(kept, np.diagonal(matrices, axis1=1, axis2=2), 1.0))
     outer = scale[:, :, None] * scale[:, None, :]
-    filled = np.where(both, matrices / outer, np.eye(matrices.shape[1]))
-    found: Array = np.where(both, np.linalg.inv(filled) / outer, 0.0)
+    whole = np.where(both, matrices / outer, np.eye(matrices.shape[1]))
+    found: Array = np.where(both, np.linalg.inv(whole) / outer, 0.0)
     return found

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.arrays import Array, products
+from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
@@ -58,9 +58,9 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
             f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
         )
     m = np.maximum(count, 1)
-    own = np.nan_to_num(C - products(F))
-    E_ref = np.where(used[..., None], np.nan_to_num(E), 0.0).sum(axis=0) / m[..., None]
-    F_ref = np.where(used[None, ..., None], np.nan_to_num(F), 0.0).sum(axis=1) / m[None, ..., None]
+    own = filled(C - products(F))
+    E_ref = np.where(used[..., None], filled(E), 0.0).sum(axis=0) / m[..., None]
+    F_ref = np.where(used[None, ..., None], filled(F), 0.0).sum(axis=1) / m[None, ..., None]
     own_ref = np.where(used[..., None, None], own, 0.0).sum(axis=0) / (m**2)[..., None, None]
     rows = _sources_of(own_ref)  # (part, ..., 6)
     rows = np.broadcast_to(rows[:, None], (len(rows), *E.shape)).copy()
@@ -111,9 +111,9 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     known = ~np.isnan(E)
     count = known.sum(axis=axis)
     weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
-    F = np.nan_to_num(influence_of(ds))
-    own = np.nan_to_num(np.asarray(ds["covariance"].values) - products(F))
-    value = (weight * np.nan_to_num(E)).sum(axis=axis)
+    F = filled(influence_of(ds))
+    own = filled(np.asarray(ds["covariance"].values) - products(F))
+    value = (weight * filled(E)).sum(axis=axis)
     value[count == 0] = np.nan
     influence = (weight[None] * F).sum(axis=axis + 1)
     influence[:, count == 0] = np.nan
