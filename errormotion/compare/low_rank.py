@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array, filled
 
@@ -30,17 +31,20 @@ class Whitener:
     ----------
     degrees : int
         Directions with variance: the rank of the covariance.
+    log_determinant : float
+        Of the covariance over these directions.
     """
 
     scale: Array  # (d,)
     root: Array  # (n, d, d): root_i' D_i root_i = projector
     bound: Array  # (m, d): the directions without own variance that sources move, scaled
-    at: Array  # (m,) their points
+    at: NDArray[np.intp]  # (m,) their points
     pinned: Array  # (r, m): S^-1 U'
     carried: Array  # (n d, r): G W
     G: Array  # (n d, k): whitened influence of what the bound directions leave free
     factor: Array  # (k, k) inverse Cholesky factor of 1 + G'G
     degrees: int
+    log_determinant: float
 
     def product(self, a: Array, b: Array) -> Array:
         """Return ``a' V^-1 b`` for arrays (p, n, d) and (q, n, d); NaN counts as unknown, and has no weight.
@@ -51,7 +55,8 @@ class Whitener:
         """
         first = self._white(a)
         second = first if b is a else self._white(b)
-        result: Array = sum(sign * x @ y.T for sign, x, y in zip((1, -1, 1), first, second, strict=True))
+        (free, explained, pinned), (its_free, its_explained, its_pinned) = first, second
+        result: Array = free @ its_free.T - explained @ its_explained.T + pinned @ its_pinned.T
         return result
 
     def square(self, a: Array) -> float:
@@ -97,4 +102,9 @@ def whitener(own: Array, influence: Array) -> Whitener:
     carried, G = (G @ fixed, G @ rest) if rank else (G[:, :0], G)
     root_of_inner = np.linalg.cholesky(np.eye(G.shape[1]) + G.T @ G)
     factor = np.linalg.inv(root_of_inner)
-    return Whitener(scale, root, bound, at, pinned, carried, G, factor, int(strong.sum()) + rank)
+    log_determinant = (
+        2 * float((total > 0).sum(axis=0) @ np.log(scale))
+        + float(np.log(power[strong]).sum())
+        + 2 * float(np.log(size[:rank]).sum() + np.log(np.diag(root_of_inner)).sum())
+    )
+    return Whitener(scale, root, bound, at, pinned, carried, G, factor, int(strong.sum()) + rank, log_determinant)

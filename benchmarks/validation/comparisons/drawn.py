@@ -43,6 +43,7 @@ class Drawn:
     ids: Mapping[str, str] = field(default_factory=dict)
     factor: float = 1.0
     start: str = START
+    mapping: np.ndarray = field(default_factory=lambda: np.eye(6))  # of what was measured to what is stated
 
     def dataset(self, rng: np.random.Generator | None, shared: Mapping[str, float] | None = None) -> xr.Dataset:
         """Return the dataset, drawn with a generator or exact without one; ``shared`` sources are given."""
@@ -53,16 +54,17 @@ class Drawn:
             given = shared or {}
             z = [given.get(name, own) for name, own in zip(self.sources, z, strict=True)]
             values = values + np.tensordot(z, F, axes=1) + noise * rng.normal(size=values.shape)
-        names = list(self.sources)
+        names, A = list(self.sources), self.mapping
+        F = F @ A.T
+        recorded = {
+            "temperature": (("time", "sensor"), self.temperature, {"units": "degC"}),
+            "sensor": list(SENSORS),
+        }
         return datasets.build_errors(
-            values,
-            np.diag(noise**2) + np.einsum("sti,stj->tij", F, F),
+            values @ A.T,
+            A @ np.diag(noise**2) @ A.T + np.einsum("sti,stj->tij", F, F),
             dims=("time",),
-            coords={
-                "time": self.time,
-                "temperature": (("time", "sensor"), self.temperature, {"units": "degC"}),
-                "sensor": list(SENSORS),
-            },
+            coords={"time": self.time, **(recorded if self.temperature.size else {})},
             influence=F,
             sources=names,
             source_groups=names,
