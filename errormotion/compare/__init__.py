@@ -18,7 +18,7 @@ from errormotion.compare.result import build
 from errormotion.compare.stack import Estimate
 from errormotion.errors import DatasetError
 
-__all__ = ["compare"]
+__all__ = ["compare", "temperatures"]
 
 SUSPICIOUS = 0.05
 """Probability of a pair below which causes are looked for, divided by the number of pairs."""
@@ -67,7 +67,7 @@ def compare(
     time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     for each in pairs:
         wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
-        heat = _temperatures(datasets, ground) if wanted else {}
+        heat = temperatures(datasets, ground) if wanted else {}
         a, b = by_name[each.a], by_name[each.b]
         found.append(
             diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
@@ -88,7 +88,7 @@ def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
     return [(first, each) for each in estimates if each is not first]
 
 
-def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
+def temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
     """Return the recorded temperatures of all datasets at the instants of the grid, by name."""
     if ground.dim != "time":
         return {}

@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2, ncx2
-from validation.comparisons.drawn import Drawn, at
-from validation.comparisons.pool import mapped
 
-from errormotion.compare import compare
+from errormotion.compare import compare, temperatures
+from errormotion.compare.diagnosis import CLOSE, diagnose
 from errormotion.compare.ground import common_ground
 from errormotion.compare.low_rank import whitener
 from errormotion.compare.stack import difference
 from errormotion.datasets.timing import later
 from errormotion.kinematics import twists
+from validation.comparisons.drawn import Drawn, at
+from validation.comparisons.pool import mapped
 
 LEVEL, POWER = 0.05, 0.9
 STEP_AT = 3600.0
@@ -39,8 +40,8 @@ class Mistake:
     fixed: bool = False
 
 
-def _point(b: Drawn, size: float) -> Drawn:
-    return replace(b, mapping=twists.adjoint(shift=np.array([0.0, 0.0, size])))
+def _point(axis: int) -> Callable[[Drawn, float], Drawn]:
+    return lambda b, size: replace(b, mapping=twists.adjoint(shift=size * np.eye(3)[axis]))
 
 
 def _yaw(b: Drawn, size: float) -> Drawn:
@@ -69,7 +70,8 @@ def _expansion(b: Drawn, size: float) -> Drawn:
 
 
 MISTAKES = (
-    Mistake("functional point off along Z", "functional point", _point, 0.02, (1e3, "mm")),
+    Mistake("functional point off along X", "functional point", _point(0), 0.02, (1e3, "mm")),
+    Mistake("functional point off along Z", "functional point", _point(2), 0.02, (1e3, "mm")),
     Mistake("yaw of the frame", "yaw of the frame (about Z)", _yaw, 1e-3, (1e3, "mrad"), fixed=True),
     Mistake("radius: displacements scaled", "scale of the displacements", _scaled(slice(0, 3)), 0.02, (1e2, "%")),
     Mistake("sign of EY", "sign of EY", _scaled(slice(1, 2)), -2.0, (1, ""), fixed=True),
@@ -129,6 +131,18 @@ def planned(mistake: Mistake) -> tuple[float, float]:
     return float(size), float(factor)
 
 
+def margin(mistake: Mistake, size: float, factor: float) -> float:
+    """Return by how much the score of the planted cause exceeds that of the next one without noise."""
+    a, b = (replace(each, factor=factor) for each in pair(0))
+    sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
+    ground = common_ground(sets)
+    time = np.asarray(ground.coords["time"].values, dtype=float)
+    heat = temperatures(sets, ground)
+    causes = diagnose(*ground.estimates, ground.freedoms, time=time, temperatures=heat)
+    planted = next(cause.score for cause in causes if _same(cause.name, mistake.cause))
+    return planted - max(cause.score for cause in causes if not _same(cause.name, mistake.cause))
+
+
 def one(task: tuple[int, int, float, float]) -> dict:
     """Return what a comparison says of one machine with one mistake (or none, -1)."""
     seed, number, size, factor = task
@@ -154,44 +168,49 @@ def one(task: tuple[int, int, float, float]) -> dict:
 def section(seeds: int, workers: int) -> list[str]:
     """Return the lines of the section."""
     plans = [planned(mistake) for mistake in MISTAKES]
+    margins = [margin(mistake, *plan) for mistake, plan in zip(MISTAKES, plans, strict=True)]
     alarms = mapped(one, [(seed, -1, 0.0, 1.0) for seed in range(2 * seeds)], workers)
     rows = []
-    for number, (mistake, (size, factor)) in enumerate(zip(MISTAKES, plans, strict=True)):
+    for number, (mistake, (size, factor), ahead) in enumerate(zip(MISTAKES, plans, margins, strict=True)):
         runs = mapped(one, [(seed, number, size, factor) for seed in range(seeds)], workers)
-        rows.append(_row(mistake, size, factor, runs))
+        rows.append(_row(mistake, size, factor, ahead, runs))
     degrees = noncentrality(*pair(0))[1]
     false = np.mean([run["p"] < LEVEL for run in alarms])
+    spread = np.sqrt(LEVEL * (1 - LEVEL) / len(alarms))
     return [
         f"{seeds} virtual gantries warm up for two hours at 12000 /min. Two datasets of six freedoms are drawn from "
-        "their own covariance about the true errors: A every minute with the radius of a bar as a shared source, B every "
-        "4 minutes with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint chi-square has "
+        "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all values; "
+        "B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint chi-square has "
         f"{degrees} degrees of freedom. With the effect d of the mistake and the covariance V its non-centrality is "
         f"d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the level {LEVEL:g}. Sizes "
-        "are those of this power on the first machine; where a mistake has no size, all uncertainties are multiplied by "
-        "the factor instead. `right first`: among those detected, the planted cause has the first rank; `or named as "
-        "alike`: it has, or the first one is said to be indistinguishable from it.",
+        "are those of this power on the first machine; where a mistake has no size, all uncertainties are multiplied "
+        "by the factor instead. `margin`: by how much the score of the planted cause (twice the logarithm of the "
+        "likelihood ratio, less the penalties) exceeds that of the next one without noise; below "
+        f"{CLOSE:g} the two cannot be told apart at this size. `right first`: among those detected, the planted cause "
+        "has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
         "",
-        "| mistake | size | uncertainties | predicted power | detected | right first | or named as alike | otherwise first "
-        "| said to be alike |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike | first instead "
+        "| named as alike |",
+        "|---|---|---|---|---|---|---|---|---|---|",
         *rows,
         "",
-        f"Without a mistake {false:.1%} of {2 * seeds} comparisons are alarms at the level {LEVEL:g} (standard deviation "
-        f"{np.sqrt(LEVEL * (1 - LEVEL) / (2 * seeds)):.1%}).",
+        f"Without a mistake {false:.1%} of {len(alarms)} comparisons are alarms at the level {LEVEL:g} (standard "
+        f"deviation {spread:.1%}).",
     ]
 
 
-def _row(mistake: Mistake, size: float, factor: float, runs: list[dict]) -> str:
+def _row(mistake: Mistake, size: float, factor: float, ahead: float, runs: list[dict]) -> str:
     hits = [run for run in runs if run["p"] < LEVEL]
     first = [run for run in hits if _same(run["cause"], mistake.cause)]
     named = [run for run in hits if any(_same(name, mistake.cause) for name in (run["cause"], *run["alike"]))]
     wrong = Counter(_short(run["cause"]) for run in hits if not _same(run["cause"], mistake.cause))
     alike = Counter(_short(name) for run in first for name in run["alike"])
     scale, unit = mistake.unit
+    right, alike_too = len(first) / max(len(hits), 1), len(named) / max(len(hits), 1)
     return (
         f"| {mistake.name} | {f'{scale * size:.3g} {unit}' if unit else '-'} | {factor:.3g} | "
-        f"{np.mean([run['predicted'] for run in runs]):.0%} | {len(hits) / len(runs):.0%} | "
-        f"{len(first) / max(len(hits), 1):.0%} | {len(named) / max(len(hits), 1):.0%} | {_most(wrong)} | {_most(alike)} |"
+        f"{np.mean([run['predicted'] for run in runs]):.0%} | {len(hits) / len(runs):.0%} | {ahead:+.0f} | "
+        f"{right:.0%} | {alike_too:.0%} | {_most(wrong)} | {_most(alike)} |"
     )
 
 
