@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array, products
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
+from errormotion.datasets.interpolation import bracket
 from errormotion.datasets.reduction import influence_of
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
@@ -227,9 +228,16 @@ def _in_time(
         grid = np.concatenate([[since], grid])
         if not first <= since <= last:
             raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+    others = [name for name in names if name != sparse]
+    kept = _apart(grid, [shifted[name]["time"].values for name in others])
+    if (~kept).any():
+        notes.append(
+            f"{int((~kept).sum())} of {grid.size} instants are left out, so that no two interpolated values share a "
+            "measured one."
+        )
+        grid = grid[kept]
     if grid.size < 2:
         raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
-    others = [name for name in names if name != sparse]
     notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
     start = starts[names[0]]
@@ -237,6 +245,19 @@ def _in_time(
         ds["time"] = ("time", grid, ds["time"].attrs)
         ds.attrs["start"] = start
     return placed, float(grid[0])
+
+
+def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return which instants of a grid are kept so that each value of a dataset serves for one of them at most."""
+    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, instant)
+    kept = np.ones(grid.size, dtype=bool)
+    if (used[:, 0, 1:] > used[:, 1, :-1]).all():
+        return kept
+    last = np.full(len(times), -1)
+    for i in range(grid.size):
+        kept[i] = bool((used[:, 0, i] > last).all())
+        last = used[:, 1, i] if kept[i] else last
+    return kept
 
 
 def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:

@@ -4,10 +4,9 @@ Between two neighbours the errors are taken as an integrated Wiener process of i
 line. At the share w of an interval of length h, with nothing known of the slope, it adds the variance
 ``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
 ``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
-``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a
-warm-up starts, so the intensity of an interval is that of the second differences at its
-ends. Sources that are one draw for
-many values go through the same weights. Nothing is extrapolated.
+``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a warm-up starts, so the
+intensity of an interval is that of the second differences at its ends. Sources that are one draw for many values go
+through the same weights. Nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -130,6 +129,12 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
     found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
     return found
+
+
+def bracket(t: Array, new: Array) -> NDArray[np.intp]:
+    """Return the indices of the two known points that the value at each new point is made of, (2, n); alike if one."""
+    before, _, exact, _ = _neighbours(t, new)
+    return np.array([before, np.minimum(before + ~exact, len(t) - 1)])
 
 
 def _neighbours(t: Array, new: Array) -> Places:

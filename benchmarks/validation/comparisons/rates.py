@@ -20,6 +20,8 @@ from validation.comparisons.pool import mapped
 
 Z95 = 1.959964
 STEP, INTERVAL, DURATION = 20.0, 600.0, 7200.0
+AVERAGED = 400_000
+"""Samples in the mean over one step at 20 kHz."""
 POINT = {"functional_point": (0.0, 0.0, 0.0)}
 DISPLACEMENTS = ("EX", "EY", "EZ")
 
@@ -41,8 +43,10 @@ def drift(machine: VirtualMachine, seed: int, first: float = STEP / 2) -> xr.Dat
     """Return what a bar before five sensors shows; the beams are those of the machine's calibration."""
     beams = drifting.calibrated_beams(machine, machine.seed)
     times = np.arange(first, DURATION, STEP)
-    raw = drifting.raw_drift(machine, times, seed=seed, beams=beams, warm_up=False, radius_error=False)
-    return identified("spindle_drift", raw, **POINT)
+    raw = drifting.raw_drift(
+        machine, times, seed=seed, beams=beams, averaged=AVERAGED, warm_up=False, radius_error=False
+    )
+    return identified("spindle_drift", raw, noise="stated", **POINT)
 
 
 def methods(seed: int) -> dict:
@@ -58,7 +62,7 @@ def methods(seed: int) -> dict:
 
 
 def records(seed: int) -> dict:
-    """Compare two records of one warm-up with the same calibrated beams, other noise and other instants."""
+    """Compare two records of one warm-up with the same calibrated beams and other noise."""
     logging.getLogger("errormotion").setLevel(logging.ERROR)
     machine = warm_machine(seed)
     sets = {"one": drift(machine, 2 * seed), "other": drift(machine, 2 * seed + 1)}
@@ -82,9 +86,7 @@ def drawn(task: tuple[int, bool]) -> dict:
         each = at(seed, 240.0, name)
         found[name] = replace(each, sources=_shared(each, sign), ids={"bar": "bar 7", "thermometer": "sensor 3"})
     E = at(seed, 240.0, "A")
-    return _judged(
-        {name: each.dataset(rng, z) for name, each in found.items()}, lambda t: E.values[np.isin(E.time, t)]
-    )
+    return _judged({name: each.dataset(rng, z) for name, each in found.items()}, lambda t: E.values[np.isin(E.time, t)])
 
 
 def _shared(each: Drawn, sign: float) -> Mapping[str, np.ndarray]:
