@@ -179,9 +179,9 @@ def section(seeds: int, workers: int) -> list[str]:
     spread = np.sqrt(LEVEL * (1 - LEVEL) / len(alarms))
     return [
         f"{seeds} virtual gantries warm up for two hours at 12000 /min. Two datasets of six freedoms are drawn from "
-        "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all values; "
-        "B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint chi-square has "
-        f"{degrees} degrees of freedom. With the effect d of the mistake and the covariance V its non-centrality is "
+        "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all "
+        "values; B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint "
+        f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its non-centrality is "
         f"d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the level {LEVEL:g}. Sizes "
         "are those of this power on the first machine; where a mistake has no size, all uncertainties are multiplied "
         "by the factor instead. `margin`: by how much the score of the planted cause (twice the logarithm of the "
@@ -189,8 +189,8 @@ def section(seeds: int, workers: int) -> list[str]:
         f"{CLOSE:g} the two cannot be told apart at this size. `right first`: among those detected, the planted cause "
         "has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
         "",
-        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike | first instead "
-        "| named as alike |",
+        "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
+        "| first instead | named as alike |",
         "|---|---|---|---|---|---|---|---|---|---|",
         *rows,
         "",
