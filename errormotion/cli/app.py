@@ -369,6 +369,24 @@ def runs(
 
 @app.command()
 @guarded
+def note(
+    folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
+    text: Annotated[str, typer.Argument(help="What happened, on one line.")],
+    machine: Annotated[str | None, typer.Option(help="The machine, for a note without a run.")] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="DATE", help="When it happened, UTC; default: the time of the run.")
+    ] = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who notes it.")] = "",
+    json_: Json = False,
+) -> None:
+    """Note an event of a machine, such as a collision or a repair."""
+    from errormotion.cli.commands import note as command
+
+    command.note(folder, text, machine, at, by, json_)
+
+
+@app.command()
+@guarded
 def history(
     machine: Annotated[str, typer.Option(help="The machine.")],
     figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
