@@ -51,6 +51,18 @@ def _version(value: bool) -> None:
         raise typer.Exit
 
 
+def _point(at: str | None) -> tuple[float, float, float] | None:
+    """Return the point of an option in mm, m."""
+    if at is None:
+        return None
+    try:
+        x, y, z = (float(part) / 1e3 for part in at.split(","))
+    except ValueError:
+        typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
+        raise typer.Exit(USAGE) from None
+    return x, y, z
+
+
 @app.callback()
 def root(
     version: Annotated[
@@ -338,16 +350,8 @@ def compare(
     """Compare results of one machine: whether they agree, and what explains it where they do not."""
     from errormotion.cli.commands import compare as command
 
-    point = None
-    if at is not None:
-        try:
-            x, y, z = (float(part) / 1e3 for part in at.split(","))
-        except ValueError:
-            typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
-            raise typer.Exit(USAGE) from None
-        point = (x, y, z)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
+    command.compare(results or [], name or [], _point(at), chosen, since, same_start, out, report, json_)
 
 
 @app.command()
@@ -389,17 +393,23 @@ def note(
 @guarded
 def history(
     machine: Annotated[str, typer.Option(help="The machine.")],
-    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    figure: Annotated[
+        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
+    ],
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
     ] = None,
+    at: Annotated[str | None, typer.Option(help="Place of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
 ) -> None:
-    """Show a figure of a machine over time, with its trend and a step."""
+    """Show a figure of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands import history as command
 
-    command.history(folders or [], machine, figure, method, json_)
+    command.history(folders or [], machine, figure, _point(at), method, test, out, report, json_)
 
 
 @app.command()
