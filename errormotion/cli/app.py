@@ -51,6 +51,16 @@ def _version(value: bool) -> None:
         raise typer.Exit
 
 
+def _millimetres(option: str, text: str) -> tuple[float, float, float]:
+    """Return the point that an option states in mm, m."""
+    try:
+        x, y, z = (float(part) / 1e3 for part in text.split(","))
+    except ValueError:
+        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
+        raise typer.Exit(USAGE) from None
+    return x, y, z
+
+
 @app.callback()
 def root(
     version: Annotated[
@@ -359,15 +369,6 @@ def compare(
     command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
 
 
-def _millimetres(option: str, text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(part) / 1e3 for part in text.split(","))
-    except ValueError:
-        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
-        raise typer.Exit(USAGE) from None
-    return x, y, z
-
-
 @app.command()
 @guarded
 def runs(
@@ -387,19 +388,44 @@ def runs(
 
 @app.command()
 @guarded
+def note(
+    folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
+    text: Annotated[str, typer.Argument(help="What happened, on one line.")],
+    machine: Annotated[str | None, typer.Option(help="The machine, for a note without a run.")] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="DATE", help="When it happened, UTC; default: the time of the run.")
+    ] = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who notes it.")] = "",
+    json_: Json = False,
+) -> None:
+    """Note an event of a machine, such as a collision or a repair."""
+    from errormotion.cli.commands import note as command
+
+    command.note(folder, text, machine, at, by, json_)
+
+
+@app.command()
+@guarded
 def history(
     machine: Annotated[str, typer.Option(help="The machine.")],
-    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    figure: Annotated[
+        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
+    ],
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
     ] = None,
+    at: Annotated[str | None, typer.Option(help="Place of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
 ) -> None:
-    """Show a figure of a machine over time, with its trend and a step."""
+    """Show a figure of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands import history as command
 
-    command.history(folders or [], machine, figure, method, json_)
+    point = None if at is None else _millimetres("--at", at)
+    command.history(folders or [], machine, figure, point, method, test, out, report, json_)
 
 
 @app.command()

@@ -216,6 +216,7 @@ def _mistakes(message: str, file: Path) -> list[str]:
 
 def _of_run(path: Path) -> list[str]:
     from errormotion.campaign.folder import RunFolder
+    from errormotion.datasets.files import events
 
     try:
         folder = RunFolder.open(path)
@@ -224,6 +225,7 @@ def _of_run(path: Path) -> list[str]:
     found = []
     for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    found += events.read(path)[1]
     if folder.finished and folder.errors is None:
         found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
     return found
