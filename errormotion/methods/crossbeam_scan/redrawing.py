@@ -14,6 +14,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification import chain
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registrations import register_all
 from errormotion.methods.crossbeam_scan.identification.scans import cold_cycles, rig_of
 from errormotion.plugins import Redraw, Redrawing
 
@@ -29,7 +30,7 @@ RADIUS_UNCERTAINTY = 1e-6
 HEIGHT = ("cycle", "artefact", "profile", "point")
 
 
-def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:  # noqa: ARG001 - one signature
     """Return the scans with their sources.
 
     Raises
@@ -45,7 +46,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
             "an assumption that is not drawn."
         )
     reduced = _scans(raw)
-    sources = {"heights": _heights(reduced, errors, cold_cycles(raw, reduced.sizes["cycle"]))}
+    sources = {"heights": _heights(reduced, settings, cold_cycles(raw, reduced.sizes["cycle"]))}
     rig = rig_of(raw)
     if rig.pose_covariance is not None:
         sources["profiler pose"] = _pose(rig)
@@ -93,26 +94,31 @@ def _scans(raw: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _heights(raw: xr.Dataset, errors: xr.Dataset, cold: list[int]) -> Redraw:
+def _heights(raw: xr.Dataset, settings: Settings, cold: list[int]) -> Redraw:
     """Return the noise of the points, and the jitter of the lines along z and along the feed.
 
-    The jitter that a registration finds is that of both scans; half of its variance is the cold scan's.
+    The noise of the points is raised to the variance of their blocks: what neighbouring points have in common is drawn
+    as if they were independent, with the same effect on a block. The jitter that a registration finds is that of both
+    scans; half of its variance is the cold scan's.
     """
-    cycles = [cold[0], *(c for c in range(raw.sizes["cycle"]) if c not in cold)]
-    noise = np.nan_to_num(errors["noise_found"].transpose("time", "position").values)
-    jitter = np.nan_to_num(errors["line_jitter"].sel(jitter=["z", "y"]).transpose("time", "position", "jitter").values)
-    jitter = jitter / np.sqrt(2.0)
-    jitter[0] = np.sqrt((jitter[1:] ** 2).mean(axis=0))  # the cold scan has the jitter of the others
+    quality = register_all(Scans(raw), cold, float(raw["height_noise"]), settings).quality
+    warm = [c for c in range(raw.sizes["cycle"]) if c not in cold]
+    factor, jitter_z, jitter_y = (quality[name].copy() for name in ("variance_factor", "jitter_z", "jitter_y"))
+    for values, both in ((factor, 1.0), (jitter_z, 2.0), (jitter_y, 2.0)):
+        values[cold] = np.where(np.isfinite(values[cold]), values[cold], np.nan_to_num(values[warm]).mean(axis=0))
+        values /= np.sqrt(both)
+    noise = np.nan_to_num(quality["noise_found"] * np.sqrt(factor))
+    jitter = np.nan_to_num(np.stack([jitter_z, jitter_y], axis=-1))
 
     def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
         height = raw["height"].transpose(*HEIGHT).values.copy()
         y = raw["y"].transpose(*HEIGHT[:3]).values
-        for (i, k), white in np.ndenumerate(noise):
-            scan = height[cycles[i], k]
-            lines = generator.normal(size=(2, len(scan), 1)) * jitter[i, k][:, None, None]
+        for (c, k), white in np.ndenumerate(noise):
+            scan = height[c, k]
+            lines = generator.normal(size=(2, len(scan), 1)) * jitter[c, k][:, None, None]
             change = white * generator.standard_normal(scan.shape, dtype=np.float32) + lines[0]
-            if jitter[i, k, 1] > 0:
-                change += lines[1] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[cycles[i], k]))
+            if jitter[c, k, 1] > 0:
+                change += lines[1] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[c, k]))
             scan += change.astype(np.float32)
         return raw.assign(height=(HEIGHT, height, raw["height"].attrs)), settings
 
