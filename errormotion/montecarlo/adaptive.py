@@ -105,6 +105,8 @@ def propagate(
     seed: int = 0,
     size: int | None = None,
     most: int = MOST_TRIALS,
+    floor: float = 0.0,
+    enough: Callable[[list[Array]], bool] | None = None,
 ) -> Summary:
     """Propagate distributions through a model.
 
@@ -124,6 +126,10 @@ def propagate(
         Size of a block; default :func:`block_size`.
     most : int
         Largest number of trials of the adaptive procedure.
+    floor : float
+        Tolerance where the standard uncertainty is 0: what is rounding.
+    enough : function, optional
+        A further condition for the adaptive procedure to stop, of all samples so far.
 
     Returns
     -------
@@ -131,11 +137,13 @@ def propagate(
     """
     size = size or block_size(probability)
     kept: list[Array] = []
-    stability = Stability(probability, digits)
+    stability = Stability(probability, digits, floor)
     for number, count in enumerate(_counts(trials, size, most)):
         kept.append(np.asarray(block(sequence_of(seed, number), count), dtype=float))
+        if trials is not None:
+            continue
         stability.add(kept[-1])
-        if trials is None and stability.reached():
+        if stability.reached() and (enough is None or enough(kept)):
             break
     return summarise(kept, probability, digits, stability.stable() if trials is None else None)
 
