@@ -137,17 +137,35 @@ def identify(
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="For several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
+        typer.Option(
+            help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler, tcp://host:port."
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
     ] = None,
+    monte_carlo: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|auto",
+            help="Evaluate the uncertainty by N trials (JCGM 101) as well, or by as many as the result needs.",
+        ),
+    ] = None,
+    digits: Annotated[
+        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: one seed gives one result.")] = 0,
     json_: Json = False,
 ) -> None:
     """Identify the errors of one raw dataset, or of many."""
     from errormotion.cli.commands import data
 
-    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
+    trials = None
+    if monte_carlo is not None:
+        from errormotion.cli.commands.monte_carlo import trials_of
+
+        trials = data.Trials(trials_of(monte_carlo), digits, seed)
+    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_, trials)
 
 
 @app.command()

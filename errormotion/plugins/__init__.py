@@ -26,6 +26,7 @@ from errormotion.plugins.contracts import (
 from errormotion.plugins.kind_registry import contract
 from errormotion.plugins.lazy import lazy, load_object
 from errormotion.plugins.readings import Environment, FrameGeometry, Measurement, Profiles, Scan
+from errormotion.plugins.redrawing import Redraw, Redrawing
 from errormotion.plugins.registry import (
     GROUPS,
     Group,
@@ -63,6 +64,8 @@ __all__ = [
     "Plugin",
     "PluginSettings",
     "Profiles",
+    "Redraw",
+    "Redrawing",
     "Samples",
     "Scan",
     "Status",

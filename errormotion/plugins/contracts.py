@@ -311,6 +311,9 @@ class Method(Protocol):
     ``check_machine(settings, machine)`` : mapping of str to str
         What contradicts the machine, by setting (an empty text for the whole), with what was expected and what was
         found; used when a campaign is read.
+    ``redrawing(raw, settings, errors)`` : `Redrawing`
+        Every source of uncertainty of raw data, to be drawn anew, for ``identify --monte-carlo``; ``errors`` is what
+        ``identify`` made of them.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
 
