@@ -70,7 +70,8 @@ CASES = {
     "keyence_ljx": Case(url=on_two_ports),
     "keyence_lk": Case(),
     "leica_emscon": Case(),
-    "linuxcnc": Case(("--set", "wait=60")),  # a computer has room for one
+    # a computer has room for one; the simulated machine takes any token
+    "linuxcnc": Case(("--set", "wait=60"), settings={"token_file": "token"}),
     "modbus_temperature": Case(url=lambda printed, port: f"modbus+tcp://127.0.0.1:{port}?unit=1"),
     "mtconnect": Case(url=lambda printed, port: f"http://127.0.0.1:{port}/"),
     "leica_geocom": Case(),
@@ -143,7 +144,12 @@ def test_every_simulated_instrument_is_here() -> None:
 
 
 @pytest.mark.parametrize("plugin_id", CASES)
-def test_a_driver_reads_a_device_in_another_process(plugin_id: str) -> None:
+def test_a_driver_reads_a_device_in_another_process(
+    plugin_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "token").write_text("x" * 64)
+    (tmp_path / "token").chmod(0o600)
     if plugin_id == "linuxcnc" and (reason := linuxcnc_process.why_not()):
         pytest.skip(reason)
     case = CASES[plugin_id]
