@@ -18,8 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
+from errormotion.campaign.timeline import Timeline, follower
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
+from errormotion.datasets.units import Time
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 from errormotion.kinematics.description import MachineDescription
@@ -58,6 +60,9 @@ class TestTable(BaseModel):
     inputs: dict[str, str] = {}
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}
+    at: Time | None = Field(
+        default=None, ge=0, description="start on the timeline; default the end of the test before it"
+    )
 
 
 class CampaignTable(BaseModel):
@@ -70,6 +75,7 @@ class CampaignTable(BaseModel):
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
     tolerances: Tolerances | None = None
+    timeline: Timeline | None = None
 
     @field_validator("runs")
     @classmethod
@@ -135,6 +141,7 @@ class TestPlan:
     settings: Any
     inputs: Mapping[str, str]
     instruments: Mapping[str, str] = field(default_factory=dict)
+    at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -150,6 +157,7 @@ class CampaignPlan:
     folder: Path
     """Folder of the files that the settings name."""
     tolerances: Tolerances | None = None
+    timeline: Timeline | None = None
 
     @property
     def sha256(self) -> str:
@@ -250,6 +258,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for number, test in enumerate(table.test if table else ()):
         mistakes += _name_mistakes(test, ("test", number), earlier)
         earlier.append(test.name)
+    mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
     if bench is None:
@@ -258,10 +267,30 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for test in table.test:
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, test.at))
     return CampaignPlan(
-        table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve(), table.tolerances
+        name=table.name,
+        bench=bench,
+        tests=tuple(tests),
+        runs=Path(table.runs),
+        source=source,
+        text=text,
+        folder=source.parent.resolve(),
+        tolerances=table.tolerances,
+        timeline=table.timeline,
     )
+
+
+def _timeline_mistakes(table: CampaignTable, bench: BenchPlan | None) -> list[str]:
+    if table.timeline is None:
+        stated = [number for number, test in enumerate(table.test) if test.at is not None]
+        return [f"{tomlfile.dotted(('test', n, 'at'))}: expected a table [timeline]; found none" for n in stated]
+    try:
+        if bench is not None:
+            follower(each.driver for each in bench.instruments)
+    except BenchError as error:
+        return [f"{error}; the bench {bench.source if bench else ''} has none"]
+    return []
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:
