@@ -97,7 +97,7 @@ def _solved(estimates: Sequence[Estimate]) -> tuple[Estimate, ChiSquare]:
     gradient = moved - np.einsum("nis,ni->s", B, plain)
     z = np.linalg.solve(root.T, np.linalg.solve(root, gradient)) if len(keys) else np.zeros(0)
     value = plain - AB @ z
-    influence = np.linalg.solve(root, AB.reshape(-1, len(keys)).T).reshape(len(keys), n, d)
+    influence = np.linalg.solve(root, AB.reshape(n * d, len(keys)).T).reshape(len(keys), n, d)
     q = square - float((weighted * plain).sum()) - float(gradient @ z)
     value = np.where(seen, value, np.nan)
     unknown = ~seen

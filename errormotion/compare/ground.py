@@ -290,7 +290,7 @@ def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
     k = [DOF.index(freedom) for freedom in freedoms]
     value = ds.em.twist().values.reshape(-1, 6)[:, k]
     F = influence_of(ds)
-    F = F.reshape(len(F), -1, 6)[..., k]
+    F = F.reshape(len(F), len(value), 6)[..., k]
     total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
     own = total - np.einsum("sni,snj->nij", F, F)
     size = len(F)
