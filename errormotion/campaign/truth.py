@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
 from errormotion import datasets, plugins
-from errormotion.campaign.files import BenchPlan, parse_bench
+from errormotion.campaign.files import parse_bench
 from errormotion.campaign.folder import RunFolder
 from errormotion.datasets.timing import between, later
 from errormotion.errors import DatasetError, RunError
@@ -32,16 +32,9 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     RunError
         No timeline, no virtual machine or several, no errors, or a method that states no truth.
     """
-    clock = folder.data.get("clock")
-    if not isinstance(clock, dict):
-        raise RunError(
-            f"{folder.path}: expected a run of a campaign with a table [timeline] on a virtual machine, which states "
-            "the time of its clock; found none"
-        )
+    machine, clock = machine_of(folder), folder.data["clock"]
     if folder.errors is None:
         raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
-    bench = folder.data["bench"]
-    machine = _machine(parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})"), clock["schedule"])
     method = plugins.get("methods", str(folder.data["method"]["id"]))
     truth = getattr(method, "truth", None)
     with datasets.load(folder.errors) as errors:
@@ -58,16 +51,29 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     return found
 
 
-def _machine(bench: BenchPlan, schedule: list[dict[str, Any]]) -> VirtualMachine:
-    """Return the one virtual machine of a bench, under a schedule."""
+def machine_of(folder: RunFolder) -> VirtualMachine:
+    """Return the virtual machine of a run, under the schedule of its timeline; its clock is in ``folder.data``.
+
+    Raises
+    ------
+    RunError
+        No timeline, no virtual machine or several.
+    """
     from errormotion.twin import Event, VirtualMachine
 
-    addresses = [parse_address(each.address) for each in bench.instruments if each.address]
+    clock, bench = folder.data.get("clock"), folder.data["bench"]
+    if not isinstance(clock, dict):
+        raise RunError(
+            f"{folder.path}: expected a run of a campaign with a table [timeline] on a virtual machine, which states "
+            "the time of its clock; found none"
+        )
+    plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
+    addresses = [parse_address(each.address) for each in plan.instruments if each.address]
     found = {(each.host, int(each.number("seed", 0))) for each in addresses if each.scheme == "sim"}
     if len(found) != 1:
         names = ", ".join(f"sim://{host} with seed {seed}" for host, seed in sorted(found)) or "none"
-        raise RunError(f"{bench.source}: expected one virtual machine; found {names}")
+        raise RunError(f"{folder.path}: expected one virtual machine on the bench; found {names}")
     ((name, seed),) = found
-    machine = VirtualMachine(bench.description if name == NAME and bench.description else name, seed=seed)
-    machine.start([Event(**event) for event in schedule])
+    machine = VirtualMachine(plan.description if name == NAME and plan.description else name, seed=seed)
+    machine.start([Event(**event) for event in clock["schedule"]])
     return machine

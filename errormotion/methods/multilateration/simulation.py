@@ -93,7 +93,7 @@ def reflector_positions(machine: VirtualMachine, position: ArrayLike, reflector:
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
-    """Return the true errors at the targets of an error dataset, in the thermal state at ``clock`` (s) of the machine."""
+    """Return the true errors at the targets of an error dataset, in the thermal state at ``clock`` (s)."""
     position = np.stack([errors[axis].values for axis in "xyz"], axis=-1)
     return true_errors(machine, position, errors.attrs["functional_point"], clock)
 

@@ -48,7 +48,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
-    """Return the true errors of the spindle at the times of a drift, whose time 0 was at ``clock`` (s) of the machine."""
+    """Return the true errors of the spindle at the times of a drift, whose time 0 was at ``clock`` (s)."""
     truth = machine.truth_spindle(errors["time"].values + clock, errors.attrs["functional_point"])
     return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
 
