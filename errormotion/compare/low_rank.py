@@ -75,7 +75,7 @@ def whitener(own: Array, influence: Array) -> Whitener:
     power = np.where(weak, LEAST, power)
     kept = strong | weak
     root = vectors * np.where(kept, 1 / np.sqrt(np.where(kept, power, 1.0)), 0.0)[:, None, :]
-    G = np.einsum("nji,snj->nis", root, F).reshape(-1, len(F))
+    G = np.einsum("nji,snj->nis", root, F).reshape(D[..., 0].size, len(F))
     inner = np.eye(len(F)) + G.T @ G
     factor = np.linalg.cholesky(inner)
     # Directions that sources alone move: no more of them are free than the sources can reach.
