@@ -11,14 +11,15 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.timeline import Timeline, follower
+from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.units import Time
@@ -28,6 +29,21 @@ from errormotion.kinematics.description import MachineDescription
 from errormotion.tolerances.table import Tolerances
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+
+
+def _certificates(found: dict[str, str]) -> dict[str, str]:
+    if mistakes := certificates.wrong(found):
+        raise ValueError(
+            f"{mistakes[0]}: expected the number or hash of a certificate for one of {', '.join(certificates.ITEMS)}"
+        )
+    return found
+
+
+Certificates = Annotated[
+    dict[str, str],
+    AfterValidator(_certificates),
+    Field(description="item = number or hash of its certificate"),
+]
 
 
 class InstrumentTable(BaseModel):
@@ -47,6 +63,7 @@ class BenchTable(BaseModel):
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
     instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
+    certificates: Certificates = {}
 
 
 class TestTable(BaseModel):
@@ -60,6 +77,7 @@ class TestTable(BaseModel):
     inputs: dict[str, str] = {}
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}
+    certificates: Certificates = {}
     at: Time | None = Field(
         default=None, ge=0, description="start on the timeline; default the end of the test before it"
     )
@@ -74,6 +92,8 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
+    operator: str = Field(default="", max_length=200, description="who measures")
+    certificates: Certificates = {}
     tolerances: Tolerances | None = None
     timeline: Timeline | None = None
 
@@ -110,6 +130,7 @@ class BenchPlan:
     text: str
     limits: Limits = field(default_factory=Limits)
     description: MachineDescription | None = None
+    certificates: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -132,6 +153,7 @@ class TestPlan:
     """One checked test of a campaign.
 
     ``inputs`` maps the method's name of an input to an earlier test, ``instruments`` a kind to a name on the bench.
+    ``certificates`` are those of bench, campaign and test, the last one first.
     """
 
     __test__ = False
@@ -141,6 +163,7 @@ class TestPlan:
     settings: Any
     inputs: Mapping[str, str]
     instruments: Mapping[str, str] = field(default_factory=dict)
+    certificates: Mapping[str, str] = field(default_factory=dict)
     at: float | None = None
 
 
@@ -157,6 +180,7 @@ class CampaignPlan:
     folder: Path
     """Folder of the files that the settings name."""
     tolerances: Tolerances | None = None
+    operator: str = ""
     timeline: Timeline | None = None
 
     @property
@@ -241,7 +265,9 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, limits, description)
+    return BenchPlan(
+        table.name, table.machine, tuple(instruments), source, text, limits, description, table.certificates
+    )
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -267,7 +293,8 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for test in table.test:
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, test.at))
+        certified = {**bench.certificates, **table.certificates, **test.certificates}
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at))
     return CampaignPlan(
         name=table.name,
         bench=bench,
@@ -277,6 +304,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         text=text,
         folder=source.parent.resolve(),
         tolerances=table.tolerances,
+        operator=table.operator,
         timeline=table.timeline,
     )
 

@@ -343,6 +343,17 @@ def compare(
     same_start: Annotated[
         bool, typer.Option("--same-start", help="Take time 0 of all datasets as one instant where none is stated.")
     ] = False,
+    change: Annotated[
+        list[str] | None,
+        typer.Option(help="A further one, the change between two measurements of the same places: NAME=AFTER,BEFORE."),
+    ] = None,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Origin of the frame of one in machine coordinates, all axes at zero, mm: NAME=x,y,z."),
+    ] = None,
+    chain: Annotated[
+        str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
@@ -350,16 +361,23 @@ def compare(
     """Compare results of one machine: whether they agree, and what explains it where they do not."""
     from errormotion.cli.commands import compare as command
 
-    point = None
-    if at is not None:
-        try:
-            x, y, z = (float(part) / 1e3 for part in at.split(","))
-        except ValueError:
-            typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
-            raise typer.Exit(USAGE) from None
-        point = (x, y, z)
+    point = None if at is None else _millimetres("--at", at)
+    origins = {}
+    for each in origin or []:
+        own, _, text = each.rpartition("=")
+        origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
+    stated = command.Stated(name or [], change or [], origins, chain)
+    command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
+
+
+def _millimetres(option: str, text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) / 1e3 for part in text.split(","))
+    except ValueError:
+        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
+        raise typer.Exit(USAGE) from None
+    return x, y, z
 
 
 @app.command()

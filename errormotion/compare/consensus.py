@@ -75,13 +75,13 @@ def _solved(estimates: Sequence[Estimate]) -> tuple[Estimate, ChiSquare]:
     B, M, moved = np.zeros((n, d, len(keys))), np.eye(len(keys)), np.zeros(len(keys))
     square, count = 0.0, 0
     for each in estimates:
-        information, known = _information(each)
+        inverse, known = information(each)
         F = np.moveaxis(np.nan_to_num(gathered(each, keys)), 0, -1)  # (n, d, s)
         y = np.where(known, np.nan_to_num(each.value), 0.0)
-        weight = np.einsum("nij,nj->ni", information, y)
-        A += information
+        weight = np.einsum("nij,nj->ni", inverse, y)
+        A += inverse
         weighted += weight
-        IF = np.einsum("nij,njs->nis", information, F)
+        IF = np.einsum("nij,njs->nis", inverse, F)
         B += IF
         M += np.einsum("nis,nit->st", F, IF)
         moved += np.einsum("nis,ni->s", F, weight)
@@ -113,7 +113,7 @@ def _solved(estimates: Sequence[Estimate]) -> tuple[Estimate, ChiSquare]:
     return Estimate("consensus", value, own, influence, names), ChiSquare(max(q, 0.0), count - int(seen.sum()))
 
 
-def _information(each: Estimate) -> tuple[Array, NDArray[np.bool_]]:
+def information(each: Estimate) -> tuple[Array, NDArray[np.bool_]]:
     """Return the inverse of the own covariance (n, d, d), 0 where unknown, and which values count."""
     total = np.diagonal(each.covariance(), axis1=1, axis2=2)
     known = each.known & (np.nan_to_num(total) > 0)

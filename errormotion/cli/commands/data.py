@@ -146,16 +146,17 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         if stored is not None and folder.errors is not None:
             found = judge(datasets.load(folder.errors), stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        path = write_run_report(run, out)
+        with reading(run):
+            path = write_run_report(run, out)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        errors = datasets.load(run)
-        found = judge(errors, limits) if limits is not None else None
-        state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-        path = write_report(errors, out or run.with_suffix(".html"), run=state)
+        with reading(run), datasets.load(run) as errors:
+            state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+            path = write_report(errors, out or run.with_suffix(".html"), run=state)
+            found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
     else:
