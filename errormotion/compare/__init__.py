@@ -14,6 +14,7 @@ from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.diagnosis import Cause, diagnose
 from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
+from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
 
 __all__ = ["compare"]
@@ -30,6 +31,7 @@ def compare(
     since: float | None = None,
     same_start: bool = False,
     causes: bool | None = None,
+    groups: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
     """Compare error datasets of one machine.
 
@@ -40,7 +42,11 @@ def compare(
     at, freedoms, since, same_start
         As of `errormotion.compare.ground.common_ground`.
     causes : bool, optional
-        Whether causes are looked for. Default: for pairs that do not agree.
+        Whether causes are looked for. Default: for pairs that do not agree; not for repeats (``groups``).
+    groups : mapping of str to str, optional
+        Group of each dataset, such as its operator (`errormotion.compare.repeats.labels`): the result then holds
+        repeatability within groups, and reproducibility. With ``same_start`` the datasets are repeats of one procedure
+        at different times: time 0 of all of them counts as one instant, whatever their start.
 
     Returns
     -------
@@ -52,19 +58,24 @@ def compare(
     DatasetError
         The datasets cannot be compared; what is missing.
     """
+    if groups and same_start:  # repeats on other days
+        datasets = {name: ds.copy() for name, ds in datasets.items()}
+        for ds in datasets.values():
+            ds.attrs.pop("start", None)
     ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
     pairs = [pair(a, b) for a, b in combinations(ground.estimates, 2)]
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
     time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     for each in pairs:
-        wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
+        wanted = groups is None and each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
         heat = _temperatures(datasets, ground) if wanted else {}
         a, b = by_name[each.a], by_name[each.b]
         found.append(
             diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
         )
-    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found)
+    spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
+    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
 
 
 def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:

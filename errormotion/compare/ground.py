@@ -209,7 +209,7 @@ def _in_time(
             "(same_start, --same-start)"
         )
     if missing:
-        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")
+        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} without start.")
     offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
     shifted = {
         name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure as Drawing
 
-from errormotion.compare.text import cause_text, probability, verdict
+from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
 from errormotion.report.canvas import COLOURS, GREEN, WIDTH, curve, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
 from errormotion.report.write import write_page
@@ -37,6 +37,7 @@ def part(ds: xr.Dataset, key: str) -> Part:
         [
             Section("curves", "Errors on common ground", [_curves(ds, key)] if _common(ds) else [_values(ds)]),
             Section("pairs", "Pairs", pairs),
+            *_repeats(ds),
             Section(
                 "ground", "Common ground", [Text(_ground(ds)), *[Text(note) for note in ds.attrs["notes"] if note]]
             ),
@@ -165,6 +166,23 @@ def _cause_blocks(ds: xr.Dataset) -> list[Block]:
                 Table(f"Single causes that could explain {name}, the most likely one first", head, rows, numeric=False)
             )
     return found
+
+
+def _repeats(ds: xr.Dataset) -> list[Section]:
+    """Return the section of repeatability and reproducibility; none without groups."""
+    rows: list[Sequence[Cell | str]] = [list(row) for row in spreads(ds)]
+    if not rows:
+        return []
+    groups: dict[str, list[str]] = {}
+    for name, group in zip(ds["dataset"].values, ds["group"].values, strict=True):
+        groups.setdefault(str(group), []).append(str(name))
+    text = "Groups: " + "; ".join(f"{group} ({', '.join(names)})" for group, names in groups.items()) + "."
+    caption = (
+        "Standard deviations over all points. Found: from the differences of the datasets. Stated: what their "
+        "uncertainties let expect. p: probability of a larger spread if these are right. Shared by all: uncertainty of "
+        "sources that all groups have in common, which no repeat shows."
+    )
+    return [Section("repeats", "Repeatability and reproducibility", [Text(text), Table(caption, SPREAD_HEAD, rows)])]
 
 
 def _ground(ds: xr.Dataset) -> str:
