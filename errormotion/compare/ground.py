@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
 from errormotion.compare import chain
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
+from errormotion.datasets.interpolation import bracket
 from errormotion.datasets.reduction import influence_of
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
@@ -100,10 +101,7 @@ def common_ground(
         raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
     for name, ds in datasets.items():
         _check(name, ds)
-    for i, name in enumerate(names):
-        for other in names[:i]:
-            if datasets[name].identical(datasets[other]):
-                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    _once(datasets)
     notes: list[str] = []
     datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
     if chain.axis_of(datasets):
@@ -117,7 +115,10 @@ def common_ground(
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
-    moved = {name: ds if component == "beam" else _at(name, ds, point) for name, ds in datasets.items()}
+    moved = {
+        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else _at(name, ds, point)
+        for name, ds in datasets.items()
+    }
     reference: float | None = None
     if dim == "time":
         moved, reference = _in_time(moved, since, same_start, notes)
@@ -171,6 +172,17 @@ def _check_dimensions(name: str, ds: xr.Dataset) -> None:
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
             "in ds.isel(position=3)"
         )
+
+
+def _once(datasets: Mapping[str, xr.Dataset]) -> None:
+    """Refuse one dataset under two names; only those with the same values are compared as a whole."""
+    seen: dict[bytes, list[str]] = {}
+    for name, ds in datasets.items():
+        alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
+        for other in alike:
+            if datasets[name].identical(datasets[other]):
+                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+        alike.append(name)
 
 
 def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str, str] | None = None) -> str:
@@ -260,9 +272,16 @@ def _in_time(
         grid = np.concatenate([[since], grid])
         if not first <= since <= last:
             raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+    others = [name for name in names if name != sparse]
+    kept = _apart(grid, [shifted[name]["time"].values for name in others])
+    if (~kept).any():
+        notes.append(
+            f"{int((~kept).sum())} of {grid.size} instants are left out, so that no two interpolated values share a "
+            "measured one."
+        )
+        grid = grid[kept]
     if grid.size < 2:
         raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
-    others = [name for name in names if name != sparse]
     notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
     start = starts[names[0]]
@@ -270,6 +289,19 @@ def _in_time(
         ds["time"] = ("time", grid, ds["time"].attrs)
         ds.attrs["start"] = start
     return placed, float(grid[0])
+
+
+def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return which instants of a grid are kept so that each value of a dataset serves for one of them at most."""
+    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, instant)
+    kept = np.ones(grid.size, dtype=bool)
+    if (used[:, 0, 1:] > used[:, 1, :-1]).all():
+        return kept
+    last = np.full(len(times), -1)
+    for i in range(grid.size):
+        kept[i] = bool((used[:, 0, i] > last).all())
+        last = used[:, 1, i] if kept[i] else last
+    return kept
 
 
 def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:
@@ -341,9 +373,9 @@ def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
     k = [DOF.index(freedom) for freedom in freedoms]
     value = ds.em.twist().values.reshape(-1, 6)[:, k]
     F = influence_of(ds)
-    F = F.reshape(len(F), -1, 6)[..., k]
+    F = F.reshape(len(F), len(value), 6)[..., k]
     total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
-    own = total - np.einsum("sni,snj->nij", F, F)
+    own = total - products(F)
     size = len(F)
     sources = ds["source"].values.tolist() if size else []
     ids = ds["source_id"].values.tolist() if size and "source_id" in ds.coords else [""] * size

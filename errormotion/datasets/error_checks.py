@@ -8,6 +8,7 @@ hold all that was measured.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Hashable, Sequence
 from datetime import datetime
 from typing import Any
@@ -169,7 +170,8 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
         if variable.dims != (name.removesuffix(INDEX),) or not (numbers % 1 == 0).all():
             found.append(_TOUCHED.format(name))
     lost = [name for name in ds.variables if str(name).endswith(INDEX) and str(name).removesuffix(INDEX) not in dims]
-    found += [_TOUCHED.format(name) for name in lost]
+    # One value that was selected, as by isel(position=3), keeps its number; a mean makes a float of it.
+    found += [_TOUCHED.format(name) for name in lost if ds[name].ndim or ds[name].dtype.kind not in "iu"]
     return found
 
 
@@ -266,7 +268,7 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
 
 def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
     F = np.asarray(ds.variables["influence"].values, dtype=float)
-    F = F.reshape(F.shape[0], -1, 6)
+    F = F.reshape(F.shape[0], math.prod(F.shape[1:-1]), 6)
     if not np.array_equal(np.isnan(F), np.broadcast_to(unseen, F.shape)):
         return [_pattern("influence", np.isnan(F) != unseen)]
     F = np.where(unseen, 0.0, F) / scale

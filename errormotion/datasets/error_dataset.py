@@ -142,7 +142,7 @@ def build_errors(
         attrs["reference_position"] = float(reference_position)
     if start:
         attrs["start"] = start
-    if notes:
+    if notes := [*notes, *provenance.get("interruptions", ())]:
         attrs["notes"] = list(notes)
     attrs |= {name: text for name in CARRIED if isinstance(text := (measured or {}).get(name), str) and text.strip()}
     if lever_axes:

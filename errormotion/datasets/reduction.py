@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
@@ -59,9 +59,9 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
             f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
         )
     m = np.maximum(count, 1)
-    own = np.nan_to_num(C - np.einsum("s...i,s...j->...ij", F, F))
-    E_ref = np.where(used[..., None], np.nan_to_num(E), 0.0).sum(axis=0) / m[..., None]
-    F_ref = np.where(used[None, ..., None], np.nan_to_num(F), 0.0).sum(axis=1) / m[None, ..., None]
+    own = filled(C - products(F))
+    E_ref = np.where(used[..., None], filled(E), 0.0).sum(axis=0) / m[..., None]
+    F_ref = np.where(used[None, ..., None], filled(F), 0.0).sum(axis=1) / m[None, ..., None]
     own_ref = np.where(used[..., None, None], own, 0.0).sum(axis=0) / (m**2)[..., None, None]
     rows = _sources_of(own_ref)  # (part, ..., 6)
     rows = np.broadcast_to(rows[:, None], (len(rows), *E.shape)).copy()
@@ -74,7 +74,7 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     nan = np.isnan(E)
     influence[:, nan] = np.nan
     own[nan[..., :, None] | nan[..., None, :]] = np.nan
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total = own + products(influence)
     zero = (first + last) / 2
     values = np.moveaxis(E - E_ref, 0, axis)
     names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
@@ -112,14 +112,14 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     known = ~np.isnan(E)
     count = known.sum(axis=axis)
     weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
-    F = np.nan_to_num(influence_of(ds))
-    own = np.nan_to_num(np.asarray(ds["covariance"].values) - np.einsum("s...i,s...j->...ij", F, F))
-    value = (weight * np.nan_to_num(E)).sum(axis=axis)
+    F = filled(influence_of(ds))
+    own = filled(np.asarray(ds["covariance"].values) - products(F))
+    value = (weight * filled(E)).sum(axis=axis)
     value[count == 0] = np.nan
     influence = (weight[None] * F).sum(axis=axis + 1)
     influence[:, count == 0] = np.nan
     own = (own * weight[..., :, None] * weight[..., None, :]).sum(axis=axis)
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total = own + products(influence)
     total[np.isnan(value)[..., :, None] | np.isnan(value)[..., None, :]] = np.nan
     rest = ds.isel({dim: 0}, drop=True).drop_vars(f"{dim}{INDEX}", errors="ignore")
     return rebuilt(rest, value, total, influence, [], {})
