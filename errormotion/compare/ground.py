@@ -157,7 +157,7 @@ def common_ground(
 def _check(name: str, ds: xr.Dataset) -> None:
     try:
         validate(ds)
-        ds.em  # noqa: B018 - refuses what is no error dataset
+        ds.em.names  # noqa: B018 - refuses what is no error dataset
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:

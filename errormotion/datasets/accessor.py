@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from errormotion import plugins
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import COMPONENTS, DOF, SCHEMA
 from errormotion.errors import DatasetError
@@ -29,7 +30,41 @@ class Combination(NamedTuple):
     covariance: xr.DataArray
 
 
-@xr.register_dataset_accessor("em")  # type: ignore[no-untyped-call]
+class Pictured:
+    """The accessor ``ds.em`` of datasets that their plugin draws, such as comparisons: ``ds.em.plot()`` alone."""
+
+    def __init__(self, ds: xr.Dataset, draw: Callable[[xr.Dataset], Figure]) -> None:
+        self._ds = ds
+        self._draw = draw
+
+    def plot(self) -> Figure:
+        """Return the figure of the dataset."""
+        return self._draw(self._ds)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise _no_errors(self._ds, f"'.em.{name}'")
+
+
+def _no_errors(ds: xr.Dataset, asked: str) -> DatasetError:
+    schema = ds.attrs.get("schema")
+    hint = ". Identify a raw dataset first" if str(schema).startswith("errormotion.raw.") or schema is None else ""
+    return DatasetError(
+        f"{asked} belongs to error datasets (attribute schema = '{SCHEMA}'); found schema = {schema!r}{hint}"
+    )
+
+
+def _accessor(ds: xr.Dataset) -> ErrorMotion | Pictured:
+    schema = ds.attrs.get("schema")
+    owner = plugins.owner_of_schema(schema) if isinstance(schema, str) and schema != SCHEMA else None
+    draw = getattr(owner, "plot", None)
+    return ErrorMotion(ds) if draw is None else Pictured(ds, draw)
+
+
+xr.register_dataset_accessor("em")(_accessor)  # type: ignore[no-untyped-call]
+
+
 class ErrorMotion:
     """The accessor ``ds.em`` of error datasets.
 
@@ -41,10 +76,7 @@ class ErrorMotion:
 
     def __init__(self, ds: xr.Dataset) -> None:
         if ds.attrs.get("schema") != SCHEMA:
-            raise DatasetError(
-                f"'.em' belongs to error datasets (attribute schema = '{SCHEMA}'); "
-                f"found schema = {ds.attrs.get('schema')!r}. Identify a raw dataset first"
-            )
+            raise _no_errors(ds, "'.em'")
         self._ds = ds
 
     @property
