@@ -47,6 +47,8 @@ class Ground:
     notes : list of str
     turns : dict of str to ndarray (n, 3)
         Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
+    records : dict of str to Dataset
+        The datasets over time as they are, at the functional point and on the common time axis.
     """
 
     estimates: list[Estimate]
@@ -61,6 +63,7 @@ class Ground:
     start: str = ""
     notes: list[str] = field(default_factory=list)
     turns: dict[str, Array] = field(default_factory=dict)
+    records: dict[str, xr.Dataset] = field(default_factory=dict)
 
 
 def common_ground(
@@ -109,8 +112,10 @@ def common_ground(
         for name, ds in datasets.items()
     }
     reference: float | None = None
+    records: dict[str, xr.Dataset] = {}
     if dim == "time":
-        moved, reference = _in_time(moved, since, same_start, notes)
+        records = _on_one_axis(moved, same_start, notes)
+        moved, reference = _in_time(records, str(first.attrs.get("start", "")), since, notes)
     elif dim:
         moved = _in_place(moved, dim, notes)
     seen = [_seen(ds) for ds in moved.values()]
@@ -138,6 +143,7 @@ def common_ground(
         start=str(grid.attrs.get("start", "")),
         notes=notes,
         turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
+        records=records,
     )
 
 
@@ -191,10 +197,8 @@ def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     return str(found[0]) if found else ""
 
 
-def _in_time(
-    datasets: Mapping[str, xr.Dataset], since: float | None, same_start: bool, notes: list[str]
-) -> tuple[dict[str, xr.Dataset], float]:
-    """Return the datasets on the instants of the sparsest one, as changes since a common instant."""
+def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: list[str]) -> dict[str, xr.Dataset]:
+    """Return the datasets with their times counted from the start of the first one."""
     names = list(datasets)
     starts = {name: str(ds.attrs.get("start", "")) for name, ds in datasets.items()}
     missing = [name for name, start in starts.items() if not start]
@@ -207,10 +211,17 @@ def _in_time(
     if missing:
         notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")
     offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
-    shifted = {
+    return {
         name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))
         for name, ds in datasets.items()
     }
+
+
+def _in_time(
+    shifted: Mapping[str, xr.Dataset], start: str, since: float | None, notes: list[str]
+) -> tuple[dict[str, xr.Dataset], float]:
+    """Return the datasets on the instants of the sparsest one, as changes since a common instant."""
+    names = list(shifted)
     known = {name: ds["time"].values[_known(ds)] for name, ds in shifted.items()}
     first = max((times[0] if times.size else np.inf) for times in known.values())
     last = min((times[-1] if times.size else -np.inf) for times in known.values())
@@ -240,7 +251,6 @@ def _in_time(
         raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
     notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
-    start = starts[names[0]]
     for ds in placed.values():
         ds["time"] = ("time", grid, ds["time"].attrs)
         ds.attrs["start"] = start

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, ncx2
 
-from errormotion.compare import compare, temperatures
-from errormotion.compare.diagnosis import CLOSE, diagnose
+from errormotion.compare import compare, explain
+from errormotion.compare.diagnosis import CLOSE
 from errormotion.compare.ground import common_ground
 from errormotion.compare.low_rank import whitener
 from errormotion.compare.stack import difference
@@ -136,9 +136,7 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
     ground = common_ground(sets)
-    time = np.asarray(ground.coords["time"].values, dtype=float)
-    heat = temperatures(sets, ground)
-    causes = diagnose(*ground.estimates, ground.freedoms, time=time, temperatures=heat)
+    causes = explain(*ground.estimates, sets, ground)
     planted = next(cause.score for cause in causes if _same(cause.name, mistake.cause))
     return planted - max(cause.score for cause in causes if not _same(cause.name, mistake.cause))
 
@@ -181,8 +179,8 @@ def section(seeds: int, workers: int) -> list[str]:
         f"{seeds} virtual gantries warm up for two hours at 12000 /min. Two datasets of six freedoms are drawn from "
         "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all "
         "values; B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint "
-        f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its non-centrality is "
-        f"d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the level {LEVEL:g}. Sizes "
+        f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its "
+        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the level {LEVEL:g}. Sizes "
         "are those of this power on the first machine; where a mistake has no size, all uncertainties are multiplied "
         "by the factor instead. `margin`: by how much the score of the planted cause (twice the logarithm of the "
         "likelihood ratio, less the penalties) exceeds that of the next one without noise; below "
