@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array, products
+from errormotion.compare import chain
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
 from errormotion.datasets.interpolation import bracket
@@ -49,6 +50,8 @@ class Ground:
         Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
     records : dict of str to Dataset
         The datasets over time as they are, at the functional point and on the common time axis.
+    labels : dict of str to str
+        Identity of a source to its name.
     """
 
     estimates: list[Estimate]
@@ -64,6 +67,7 @@ class Ground:
     notes: list[str] = field(default_factory=list)
     turns: dict[str, Array] = field(default_factory=dict)
     records: dict[str, xr.Dataset] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
 
 
 def common_ground(
@@ -101,11 +105,18 @@ def common_ground(
     for name, ds in datasets.items():
         _check(name, ds)
     _once(datasets)
+    notes: list[str] = []
+    datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
+    if chain.axis_of(datasets):
+        _same(datasets, "machine")
+        _same(datasets, "frame")
+        datasets = chain.on_axis(datasets, at=at, same_start=same_start, notes=notes)
+    for name, ds in datasets.items():
+        _check_dimensions(name, ds)
     first = datasets[names[0]]
     component = _same(datasets, "component", SAME_MOTION)
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
-    notes: list[str] = []
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
     moved = {
         name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else ds.em.at(point)
@@ -144,6 +155,7 @@ def common_ground(
         notes=notes,
         turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
         records=records,
+        labels={identity: name for ds in moved.values() for identity, name in _labels(ds)},
     )
 
 
@@ -157,6 +169,9 @@ def _check(name: str, ds: xr.Dataset) -> None:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
         )
+
+
+def _check_dimensions(name: str, ds: xr.Dataset) -> None:
     if len(ds["EX"].dims) > 1:
         raise DatasetError(
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
@@ -181,7 +196,8 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     if len(values) > 1:
         stated = "; ".join(f"'{name}': {value}" for name, value in found.items())
         hint = {
-            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name)",
+            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name), or state the origin of "
+            "its frame in machine coordinates (attribute frame_origin, --origin NAME=x,y,z)",
             "component": ". The errors of an axis and of the tool need the kinematic chain; predict one from the other",
         }.get(attribute, "")
         raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
@@ -323,6 +339,13 @@ def _seen(ds: xr.Dataset) -> list[str]:
     return [name for name in DOF if np.isfinite(ds[name].values).any()]
 
 
+def _labels(ds: xr.Dataset) -> list[tuple[str, str]]:
+    if "source_id" not in ds.coords:
+        return []
+    pairs = zip(ds["source_id"].values.tolist(), ds["source"].values.tolist(), strict=True)
+    return [(str(identity), str(name)) for identity, name in pairs if identity]
+
+
 def _turns(ds: xr.Dataset) -> Array:
     found: Array = np.nan_to_num(ds.em.twist().values.reshape(-1, 6)[:, 3:])
     return found
@@ -332,7 +355,7 @@ def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
     k = [DOF.index(freedom) for freedom in freedoms]
     value = ds.em.twist().values.reshape(-1, 6)[:, k]
     F = influence_of(ds)
-    F = F.reshape(len(F), -1, 6)[..., k]
+    F = F.reshape(len(F), len(value), 6)[..., k]
     total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
     own = total - products(F)
     size = len(F)

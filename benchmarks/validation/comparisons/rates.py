@@ -138,10 +138,10 @@ def section(seeds: int, workers: int) -> list[str]:
         f"C-frame that warms up for two hours: a bar before five sensors (every {STEP:g} s) and four balls probed "
         f"every {INTERVAL / 60:g} minutes; displacements at the origin. The last two are drawn from their own "
         "covariance about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by "
-        "5 % (k = 1), and a thermometer. `correlation`: whether sources with the same identity are one draw (as stated) or "
-        "counted as two (left out). Of datasets that agree 95.4 % of |En| are below 1 (k = 2), p is uniform and 95 % "
-        "intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of the mean over machines, since the "
-        "instants of one machine share their sources.",
+        "5 % (k = 1), and a thermometer. `correlation`: whether sources with the same identity are one draw (as "
+        "stated) or counted as two (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
+        "uniform, and 95 % intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of "
+        "the mean over machines, since the instants of one machine share their sources.",
         "",
         "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
         "|---|---|---|---|---|---|",
