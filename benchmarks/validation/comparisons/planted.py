@@ -18,7 +18,7 @@ from errormotion.compare.stack import difference
 from errormotion.datasets.timing import later
 from errormotion.kinematics import twists
 from validation.comparisons.drawn import Drawn, at
-from validation.comparisons.pool import mapped
+from validation.comparisons.pool import Pool
 
 LEVEL, POWER = 0.05, 0.9
 STEP_AT = 3600.0
@@ -163,14 +163,14 @@ def one(task: tuple[int, int, float, float]) -> dict:
     }
 
 
-def section(seeds: int, workers: int) -> list[str]:
+def section(seeds: int, pool: Pool) -> list[str]:
     """Return the lines of the section."""
     plans = [planned(mistake) for mistake in MISTAKES]
     margins = [margin(mistake, *plan) for mistake, plan in zip(MISTAKES, plans, strict=True)]
-    alarms = mapped(one, [(seed, -1, 0.0, 1.0) for seed in range(2 * seeds)], workers)
+    alarms = pool.mapped(one, [(seed, -1, 0.0, 1.0) for seed in range(2 * seeds)])
     rows = []
     for number, (mistake, (size, factor), ahead) in enumerate(zip(MISTAKES, plans, margins, strict=True)):
-        runs = mapped(one, [(seed, number, size, factor) for seed in range(seeds)], workers)
+        runs = pool.mapped(one, [(seed, number, size, factor) for seed in range(seeds)])
         rows.append(_row(mistake, size, factor, ahead, runs))
     degrees = noncentrality(*pair(0))[1]
     false = np.mean([run["p"] < LEVEL for run in alarms])

@@ -16,7 +16,7 @@ from errormotion.methods.normal_vector import simulation as probing
 from errormotion.methods.spindle_drift import simulation as drifting
 from errormotion.twin import Event, VirtualMachine
 from validation.comparisons.drawn import START, Drawn, at
-from validation.comparisons.pool import mapped
+from validation.comparisons.pool import Pool
 
 Z95 = 1.959964
 STEP, INTERVAL, DURATION = 20.0, 600.0, 7200.0
@@ -125,11 +125,11 @@ CASES = (
 )
 
 
-def section(seeds: int, workers: int) -> list[str]:
+def section(seeds: int, pool: Pool) -> list[str]:
     """Return the lines of the section."""
     rows = []
     for name, function, option in CASES:
-        runs = mapped(function, [seed if option is None else (seed, option) for seed in range(seeds)], workers)
+        runs = pool.mapped(function, [seed if option is None else (seed, option) for seed in range(seeds)])
         rows += [_row(name, "as stated", [run["shared"] for run in runs])]
         if function is not methods:
             rows += [_row("", "left out", [run["apart"] for run in runs])]
