@@ -182,10 +182,10 @@ def section(seeds: int, pool: Pool) -> list[str]:
         f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its "
         f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of "
         f"{POWER:.0%} at the level {LEVEL:g}. Sizes are those of this power on the first machine; where a mistake has "
-        "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the planted cause (twice the logarithm of the "
-        "likelihood ratio, less the penalties) exceeds that of the next one without noise; below "
-        f"{CLOSE:g} the two cannot be told apart at this size. `right first`: among those detected, the planted cause "
-        "has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
+        "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
+        "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
+        f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
+        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
         "",
         "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
         "| first instead | named as alike |",

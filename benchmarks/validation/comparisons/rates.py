@@ -58,7 +58,7 @@ def methods(seed: int) -> dict:
         "drift": drift(machine, seed),
         "probing": identified("normal_vector", balls, tool_axes="Z", **POINT),
     }
-    return _judged(sets, _truth(machine), freedoms=DISPLACEMENTS)
+    return {"shared": _counted(sets, _truth(machine), {"freedoms": DISPLACEMENTS})}
 
 
 def records(seed: int) -> dict:
