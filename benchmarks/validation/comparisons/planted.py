@@ -185,7 +185,8 @@ def section(seeds: int, pool: Pool) -> list[str]:
         "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
         "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
         f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
-        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
+        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be "
+        "indistinguishable from it.",
         "",
         "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
         "| first instead | named as alike |",
