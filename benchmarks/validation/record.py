@@ -1,4 +1,4 @@
-"""Histories of figures: false alarms of steps, their power, coverage of the intervals, and rate outside of the limits."""
+"""Histories of figures: false alarms and power of steps, coverage of intervals, and rate outside of the limits."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ COUNTS, TAUS, SIZE = (12, 24, 60), (0.0, 1e-6, 3e-6), 4.0
 def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     yield (
-        f"{seeds} virtual histories in each row: runs at random times in three years, a trend of {SLOPE * 1e6:g} um a year, "
-        f"standard uncertainties of {U[0] * 1e6:g} um to {U[1] * 1e6:g} um from run to run, {BAR * 1e6:g} um of a bar that all "
-        "runs share, and a reproducibility of the machine that no run states. `false steps`, `false departures`: share of "
-        "histories in which one is found though there is none. `trend`: share of its 95 % intervals that hold the true "
-        f"trend. `outside`: share of the values outside of their limits, without a trend; 0.27 % where the reproducibility "
-        f"is known. In as many histories more there is a step of {SIZE:g} standard deviations of a value, in the middle. `found`: "
-        "share in which a step is found; `time`, `size`: share of these whose 95 % intervals hold the true time and size."
+        f"{seeds} virtual histories in each row: runs at random times in three years, a trend of {SLOPE * 1e6:g} um a "
+        f"year, standard uncertainties of {U[0] * 1e6:g} um to {U[1] * 1e6:g} um from run to run, {BAR * 1e6:g} um of "
+        "a bar that all runs share, and a reproducibility of the machine that no run states. `false steps`, `false "
+        "departures`: share of histories in which one is found though there is none. `trend`: share of its 95 % "
+        "intervals that hold the true trend. `outside`: share of the values outside of their limits, without a trend; "
+        "0.27 % where the reproducibility is known. In as many histories more there is a step of "
+        f"{SIZE:g} standard deviations of a value, in the middle. `found`: share in which a step is found; `time`, "
+        "`size`: share of these whose 95 % intervals hold the true time and size."
     )
     yield from (
         "",
