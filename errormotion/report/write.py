@@ -16,6 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion import plugins
+from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
 from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
@@ -27,6 +28,9 @@ from errormotion.tolerances.table import Tolerances, from_run
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.
 COMPONENTS = {"beam": beams.part}
+
+#: What a chapter raises where a dataset has not what the chapter shows.
+_DO_NOT_FIT = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
 def write_report(
@@ -68,6 +72,7 @@ def write_report(
     sources = []
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
+        validate(dataset)
         sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
     tolerances = from_run(run or {})
     parts = [part for source in sources for part in _judged(chapters(source), source, tolerances)]
@@ -99,10 +104,18 @@ def _noted(part: Part, run: Mapping[str, Any]) -> Part:
 def chapters(source: Source) -> list[Part]:
     """Return the chapters of one dataset: those of the plugin that made it, else the generic one."""
     owner = _owner(source.errors)
-    own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
-    if own:
-        return own
-    return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
+    try:
+        own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
+        if own:
+            return own
+        return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
+    except _DO_NOT_FIT as error:
+        by = f"method '{source.errors.attrs['method']}'" if "method" in source.errors.attrs else "the plugin"
+        raise DatasetError(
+            f"The chapter of {by} cannot be written from this dataset ({type(error).__name__}: {error}). Its schema is "
+            "followed; what the plugin adds to it is missing or has another form. If nobody changed the dataset, this "
+            "is a defect of the plugin: the traceback is in the log."
+        ) from error
 
 
 def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, title: str | None = None) -> Path:
