@@ -180,16 +180,17 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         if stored is not None and folder.errors is not None:
             found = judge(datasets.load(folder.errors), stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        path = write_run_report(run, out)
+        with reading(run):
+            path = write_run_report(run, out)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        errors = datasets.load(run)
-        found = judge(errors, limits) if limits is not None else None
-        state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-        path = write_report(errors, out or run.with_suffix(".html"), run=state)
+        with reading(run), datasets.load(run) as errors:
+            state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+            path = write_report(errors, out or run.with_suffix(".html"), run=state)
+            found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
     else:
@@ -249,6 +250,7 @@ def _mistakes(message: str, file: Path) -> list[str]:
 
 def _of_run(path: Path) -> list[str]:
     from errormotion.campaign.folder import RunFolder
+    from errormotion.datasets.files import events
 
     try:
         folder = RunFolder.open(path)
@@ -257,6 +259,7 @@ def _of_run(path: Path) -> list[str]:
     found = []
     for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    found += events.read(path)[1]
     if folder.finished and folder.errors is None:
         found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
     return found

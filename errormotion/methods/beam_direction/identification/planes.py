@@ -14,11 +14,13 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, tilt_text
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
 from errormotion.methods.beam_direction.identification.check_bar.result import bar_extras
 from errormotion.methods.beam_direction.identification.compensation import (
+    SCALE,
     Converged,
     Planes,
     Sensor,
@@ -88,8 +90,10 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         reference="nominal beam; its errors are stated at its nominal zero point (nominal_origin)",
         method=method,
         method_version=version,
+        measured=raw.attrs,
         start=start_of(raw),
-        source_ids=identities(converged, sensor),
+        source_ids=identities(converged, sensor)
+        | certified(raw.attrs, {SCALE: ("sensor", "gain")} if SCALE in converged.sources else {}),
         provenance=provenance.make(settings, raw, None, steps=steps)
         | ({"calibration": sensor.calibration.reference()} if sensor is not None else {}),
         influence=by_source[:, None, :] if converged.sources else None,

@@ -79,6 +79,8 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
         reference=f"mean state of the {'cold' if settings.reference == 'cold' else 'first'} probing cycle",
         method=method,
         method_version=version,
+        measured=raw.attrs,
+        lever_axes="" if data.tool_axes == "XYZ" else data.tool_axes,
         provenance=provenance.make(settings, raw, None, steps=_steps(cleaned, settings)),
         influence=influence,
         sources=cold,

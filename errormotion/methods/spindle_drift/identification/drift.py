@@ -11,6 +11,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.files.hashing import DatasetHasher
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
@@ -42,6 +43,9 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
     twist,
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS
+
+CERTIFIED = {"bar radius": ("bar", "radius"), "frame expansion": ("frame", "coefficient of expansion")}
+"""Sources that are one draw in all measurements with one certificate."""
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -145,6 +149,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         ),
         method=method,
         method_version=version,
+        measured=raw.attrs,
         provenance=provenance.make(
             settings,
             measured,
@@ -157,7 +162,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         source_groups=[group for _, group in names],
         extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time),
         start=start_of(raw, zero),
-        source_ids={s.name: s.identity for s in sources if s.identity},
+        source_ids={s.name: s.identity for s in sources if s.identity}
+        | certified(raw.attrs, {name: CERTIFIED[name] for name, _ in names if name in CERTIFIED}),
         reference_sources=[s.name for s in sources if s.group == REFERENCE],
         reference_interval=(float(time[reference[0]]), float(time[reference[-1]])),
     )
