@@ -49,10 +49,9 @@ def sources_as_stated(subject: MethodSubject) -> str:
     """Each source drawn alone has the spread of its influence, and all of them together the stated covariance."""
     _, errors, drawn = _drawn(subject)
     places, verdicts = tested_places(subject), []
-    together = {"all sources": None}
-    alone = {name: [name] for name, source in drawn.sources.items() if source.groups and not source.own}
-    for what, only in (together | alone).items():
-        stated = covariance(errors) if only is None else _of_groups(errors, drawn.sources[what].groups)
+    for what, only in {"all sources": list(drawn.sources), **_parts(drawn)}.items():
+        groups = {group for name in only for group in drawn.sources[name].groups}
+        stated = covariance(errors) if len(only) == len(drawn.sources) else _of_groups(errors, groups)
         shape = values(errors).shape
         with _quiet():
             found, reasons = sample(subject.plugin(), drawn, SeedSequence(7), range(TRIALS), shape, only)
@@ -86,9 +85,21 @@ def _groups(errors: xr.Dataset) -> set[str]:
     return {str(group) for group in errors["source_group"].values[moving]}
 
 
-def _of_groups(errors: xr.Dataset, groups: tuple[str, ...]) -> np.ndarray:
+def _parts(drawn: Redrawing) -> dict[str, list[str]]:
+    """Return the sources that have no independent part, those with a group in common together, by their names."""
+    parts: list[tuple[list[str], set[str]]] = []
+    for name, source in drawn.sources.items():
+        together = [part for part in parts if part[1] & set(source.groups)]
+        names_ = [other for part in together for other in part[0]] + [name]
+        merged = (names_, set(source.groups).union(*(part[1] for part in together)))
+        parts = [part for part in parts if part not in together] + [merged]
+    own = {name for name, source in drawn.sources.items() if source.own or not source.groups}
+    return {", ".join(part): part for part, _ in parts if not own & set(part) and len(part) < len(drawn.sources)}
+
+
+def _of_groups(errors: xr.Dataset, groups: set[str]) -> np.ndarray:
     """Return the covariance (place, n, n) that some groups of sources make."""
-    chosen = np.isin(errors["source_group"].values, groups)
+    chosen = np.isin(errors["source_group"].values, sorted(groups))
     F = influence(errors)[:, chosen]
     return np.asarray(np.einsum("psi,psj->pij", F, F))
 
