@@ -11,13 +11,14 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
+from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
@@ -26,6 +27,21 @@ from errormotion.kinematics.description import MachineDescription
 from errormotion.tolerances.table import Tolerances
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+
+
+def _certificates(found: dict[str, str]) -> dict[str, str]:
+    if mistakes := certificates.wrong(found):
+        raise ValueError(
+            f"{mistakes[0]}: expected the number or hash of a certificate for one of {', '.join(certificates.ITEMS)}"
+        )
+    return found
+
+
+Certificates = Annotated[
+    dict[str, str],
+    AfterValidator(_certificates),
+    Field(description="item = number or hash of its certificate"),
+]
 
 
 class InstrumentTable(BaseModel):
@@ -45,6 +61,7 @@ class BenchTable(BaseModel):
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
     instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
+    certificates: Certificates = {}
 
 
 class TestTable(BaseModel):
@@ -58,6 +75,7 @@ class TestTable(BaseModel):
     inputs: dict[str, str] = {}
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}
+    certificates: Certificates = {}
 
 
 class CampaignTable(BaseModel):
@@ -69,6 +87,8 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
+    operator: str = Field(default="", max_length=200, description="who measures")
+    certificates: Certificates = {}
     tolerances: Tolerances | None = None
 
     @field_validator("runs")
@@ -104,6 +124,7 @@ class BenchPlan:
     text: str
     limits: Limits = field(default_factory=Limits)
     description: MachineDescription | None = None
+    certificates: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -126,6 +147,7 @@ class TestPlan:
     """One checked test of a campaign.
 
     ``inputs`` maps the method's name of an input to an earlier test, ``instruments`` a kind to a name on the bench.
+    ``certificates`` are those of bench, campaign and test, the last one first.
     """
 
     __test__ = False
@@ -135,6 +157,7 @@ class TestPlan:
     settings: Any
     inputs: Mapping[str, str]
     instruments: Mapping[str, str] = field(default_factory=dict)
+    certificates: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -150,6 +173,7 @@ class CampaignPlan:
     folder: Path
     """Folder of the files that the settings name."""
     tolerances: Tolerances | None = None
+    operator: str = ""
 
     @property
     def sha256(self) -> str:
@@ -233,7 +257,9 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, limits, description)
+    return BenchPlan(
+        table.name, table.machine, tuple(instruments), source, text, limits, description, table.certificates
+    )
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -258,9 +284,18 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for test in table.test:
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
+        certified = {**bench.certificates, **table.certificates, **test.certificates}
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified))
     return CampaignPlan(
-        table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve(), table.tolerances
+        table.name,
+        bench,
+        tuple(tests),
+        Path(table.runs),
+        source,
+        text,
+        source.parent.resolve(),
+        table.tolerances,
+        table.operator,
     )
 
 

@@ -29,6 +29,7 @@ from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
+from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.merit import figures_of, stored
 from errormotion.errors import RunError
@@ -236,6 +237,7 @@ class _Session:
                 "settings_hash": settings_hash(settings, info.id, info.version),
                 "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
                 "inputs": {},
+                "operator": plan.operator,
                 "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
                 "samples": {},
@@ -281,6 +283,10 @@ class _Session:
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         if bench.description is not None:
             attrs["chain"] = bench.description.moving_chain
+        if folder.data.get("operator"):
+            attrs["operator"] = folder.data["operator"]
+        if test.certificates:
+            attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None

@@ -67,7 +67,7 @@ def test_a_device_answers_one_client_after_another_and_outlives_them() -> None:
 
 
 def test_a_fault_is_one_of_the_device() -> None:
-    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=3") as (process, printed):
+    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=4") as (process, printed):
         with DconTemperature(printed["url"], DconSettings(timeout=0.3)) as thermometer:
             thermometer.read()
             with pytest.raises(InstrumentTimeoutError):

@@ -63,7 +63,8 @@ CASES = {
     "keyence_ljx": Case(lines=1),
     "keyence_lk": Case(),
     "leica_emscon": Case(),
-    "linuxcnc": Case(("--set", "wait=60")),  # a computer has room for one
+    # a computer has room for one; the simulated machine takes any token
+    "linuxcnc": Case(("--set", "wait=60"), settings="token_file = 'token'"),
     "modbus_temperature": Case(),
     "mtconnect": Case(),
     "leica_geocom": Case(),
@@ -136,7 +137,12 @@ def test_every_simulated_instrument_is_here() -> None:
 
 
 @pytest.mark.parametrize("plugin_id", CASES)
-def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(plugin_id: str, tmp_path: Path) -> None:
+def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(
+    plugin_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "token").write_text("x" * 64)
+    (tmp_path / "token").chmod(0o600)
     if plugin_id == "linuxcnc" and (reason := linuxcnc_process.why_not()):
         pytest.skip(reason)
     case = CASES[plugin_id]

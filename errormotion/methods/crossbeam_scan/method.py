@@ -40,6 +40,7 @@ class CrossbeamScan:
     figures = lazy("errormotion.methods.crossbeam_scan.report.figures:figures")
     simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
     conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
+    redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
         self,

@@ -40,6 +40,7 @@ class Multilateration:
     figures = lazy("errormotion.methods.multilateration.figures:figures")
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
     conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
+    redrawing = lazy("errormotion.methods.multilateration.redrawing:redrawing")
 
     def acquire(
         self,

@@ -42,6 +42,7 @@ class NormalVector:
     figures = lazy("errormotion.datasets.merit:last_values")
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
     conformance = lazy("errormotion.methods.normal_vector.conformance:subjects")
+    redrawing = lazy("errormotion.methods.normal_vector.redrawing:redrawing")
 
     def acquire(
         self,

@@ -39,6 +39,7 @@ class SpindleDrift:
     figures = lazy("errormotion.methods.spindle_drift.figures:figures")
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
+    redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
         self,

@@ -100,7 +100,7 @@ class VirtualWorld(Motion):
             resting = Path.resting(self.path.place(self.time))
             self._set_clock(0.0)
             self.motion, self.path, self.program, self._warm_up = None, resting, "", None
-            self.printed, self._program_events = [], []
+            self.port_output, self._program_events = [], []
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
