@@ -1,4 +1,4 @@
-"""Values, ids and first messages of OPC UA against published bytes, through the package and the transport's own form."""
+"""Values, ids and first messages of OPC UA against published bytes, through the package and the transport."""
 
 import math
 from typing import Any
