@@ -18,9 +18,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
+from errormotion.campaign.timeline import Timeline, follower
 from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
+from errormotion.datasets.units import Time
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 from errormotion.kinematics.description import MachineDescription
@@ -76,6 +78,9 @@ class TestTable(BaseModel):
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}
     certificates: Certificates = {}
+    at: Time | None = Field(
+        default=None, ge=0, description="start on the timeline; default the end of the test before it"
+    )
 
 
 class CampaignTable(BaseModel):
@@ -90,6 +95,7 @@ class CampaignTable(BaseModel):
     operator: str = Field(default="", max_length=200, description="who measures")
     certificates: Certificates = {}
     tolerances: Tolerances | None = None
+    timeline: Timeline | None = None
 
     @field_validator("runs")
     @classmethod
@@ -158,6 +164,7 @@ class TestPlan:
     inputs: Mapping[str, str]
     instruments: Mapping[str, str] = field(default_factory=dict)
     certificates: Mapping[str, str] = field(default_factory=dict)
+    at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -174,6 +181,7 @@ class CampaignPlan:
     """Folder of the files that the settings name."""
     tolerances: Tolerances | None = None
     operator: str = ""
+    timeline: Timeline | None = None
 
     @property
     def sha256(self) -> str:
@@ -276,6 +284,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for number, test in enumerate(table.test if table else ()):
         mistakes += _name_mistakes(test, ("test", number), earlier)
         earlier.append(test.name)
+    mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
     if bench is None:
@@ -285,18 +294,31 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
         certified = {**bench.certificates, **table.certificates, **test.certificates}
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified))
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at))
     return CampaignPlan(
-        table.name,
-        bench,
-        tuple(tests),
-        Path(table.runs),
-        source,
-        text,
-        source.parent.resolve(),
-        table.tolerances,
-        table.operator,
+        name=table.name,
+        bench=bench,
+        tests=tuple(tests),
+        runs=Path(table.runs),
+        source=source,
+        text=text,
+        folder=source.parent.resolve(),
+        tolerances=table.tolerances,
+        operator=table.operator,
+        timeline=table.timeline,
     )
+
+
+def _timeline_mistakes(table: CampaignTable, bench: BenchPlan | None) -> list[str]:
+    if table.timeline is None:
+        stated = [number for number, test in enumerate(table.test) if test.at is not None]
+        return [f"{tomlfile.dotted(('test', n, 'at'))}: expected a table [timeline]; found none" for n in stated]
+    try:
+        if bench is not None:
+            follower(each.driver for each in bench.instruments)
+    except BenchError as error:
+        return [f"{error}; the bench {bench.source if bench else ''} has none"]
+    return []
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:

@@ -28,10 +28,12 @@ from errormotion.campaign.folder import RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
+from errormotion.campaign.timeline import follower
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.timing import later
 from errormotion.errors import RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -287,6 +289,7 @@ class _Session:
             attrs["operator"] = folder.data["operator"]
         if test.certificates:
             attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
+        own = self._set_clock(folder, test)
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
@@ -298,7 +301,7 @@ class _Session:
                 closing(_Chunks(method.acquire(bench, test.settings, inputs=inputs, done=done))) as chunks,
             ):
                 for chunk in chunks:
-                    recorder.put(chunk)
+                    recorder.put(chunk.assign_attrs(own) if own else chunk)
                     taken += chunk.sizes.get(dim, 0)
                     rate = chunk.attrs.get("sample_rate")
                     self.progress.advance(taken / rate if rate else taken)
@@ -318,6 +321,19 @@ class _Session:
             raise RunError(f"The method '{method.info.id}' yielded no data.")
         folder.step("acquire", "done", samples=recorder.committed)
         folder.save(acquired=True)
+
+    def _set_clock(self, folder: RunFolder, test: TestPlan) -> dict[str, str]:
+        """Set the machine to the start of a test on the timeline; return the attributes that state it."""
+        timeline = self.campaign.timeline
+        if timeline is None:
+            return {}
+        control = follower(answer.driver for answer in self.bench.answers)
+        if "clock" not in folder.data:
+            time = float(control.state()["time"]) if test.at is None else test.at
+            folder.save(clock={"start": timeline.start, "time": time, "schedule": timeline.events()})
+        clock = folder.data["clock"]
+        control.follow(clock["schedule"], clock["time"])
+        return {"start": later(clock["start"], clock["time"])}
 
     def _identify(self, folder: RunFolder, test: TestPlan) -> None:
         self.progress.stage("identifying")

@@ -343,6 +343,18 @@ def validate(
 
 @app.command()
 @guarded
+def truth(
+    run: Annotated[Path, typer.Argument(help="Run folder of a campaign with a [timeline] on a virtual machine.")],
+    out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],
+) -> None:
+    """Write the true errors behind a run on a virtual machine, as an error dataset."""
+    from errormotion.cli.commands import truth as command
+
+    command.truth(run, out)
+
+
+@app.command()
+@guarded
 def compare(
     results: Annotated[
         list[Path] | None,

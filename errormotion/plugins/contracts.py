@@ -320,6 +320,9 @@ class Method(Protocol):
         The numbers that the command line and summaries show.
     ``simulate(settings, seed)`` : (raw, truth)
         Raw data with a known truth: a raw dataset, and an error dataset relative to the same reference.
+    ``truth(machine, errors, clock)`` : Dataset
+        The true errors of a `VirtualMachine` where an error dataset states errors; its time 0 was at ``clock`` (s) of
+        the machine.
     ``conformance()`` : tuple of `MethodSubject`
         What the conformance kit examines.
     ``follow(settings)`` : function

@@ -39,6 +39,7 @@ class Multilateration:
     chapters = lazy("errormotion.methods.multilateration.report:chapters")
     figures = lazy("errormotion.methods.multilateration.figures:figures")
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
+    truth = lazy("errormotion.methods.multilateration.simulation:truth_of")
     conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
     redrawing = lazy("errormotion.methods.multilateration.redrawing:redrawing")
 
