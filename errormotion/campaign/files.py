@@ -11,21 +11,39 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
 from errormotion.campaign.limits import Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
+from errormotion.campaign.timeline import Timeline, follower
+from errormotion.datasets import certificates
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.files.folders import looking_beside
+from errormotion.datasets.units import Time
 from errormotion.errors import BenchError, InstrumentError, MethodError, PluginError
 from errormotion.instruments.transports.address import parse_address
 from errormotion.kinematics.description import MachineDescription
 from errormotion.tolerances.table import Tolerances
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+
+
+def _certificates(found: dict[str, str]) -> dict[str, str]:
+    if mistakes := certificates.wrong(found):
+        raise ValueError(
+            f"{mistakes[0]}: expected the number or hash of a certificate for one of {', '.join(certificates.ITEMS)}"
+        )
+    return found
+
+
+Certificates = Annotated[
+    dict[str, str],
+    AfterValidator(_certificates),
+    Field(description="item = number or hash of its certificate"),
+]
 
 
 class InstrumentTable(BaseModel):
@@ -45,6 +63,7 @@ class BenchTable(BaseModel):
     machine: str = Field(description="the name of the machine tool, or the table [machine]")
     instruments: dict[str, InstrumentTable] = Field(default_factory=dict)
     limits: Limits = Limits()
+    certificates: Certificates = {}
 
 
 class TestTable(BaseModel):
@@ -58,6 +77,10 @@ class TestTable(BaseModel):
     inputs: dict[str, str] = {}
     instruments: dict[str, str] = Field(default={}, description="kind of instrument = its name on the bench")
     settings: dict[str, Any] = {}
+    certificates: Certificates = {}
+    at: Time | None = Field(
+        default=None, ge=0, description="start on the timeline; default the end of the test before it"
+    )
 
 
 class CampaignTable(BaseModel):
@@ -69,7 +92,10 @@ class CampaignTable(BaseModel):
     bench: str = Field(description="the path of a bench file, relative to this file")
     runs: str = "runs"
     test: list[TestTable] = Field(min_length=1)
+    operator: str = Field(default="", max_length=200, description="who measures")
+    certificates: Certificates = {}
     tolerances: Tolerances | None = None
+    timeline: Timeline | None = None
 
     @field_validator("runs")
     @classmethod
@@ -104,6 +130,7 @@ class BenchPlan:
     text: str
     limits: Limits = field(default_factory=Limits)
     description: MachineDescription | None = None
+    certificates: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -126,6 +153,7 @@ class TestPlan:
     """One checked test of a campaign.
 
     ``inputs`` maps the method's name of an input to an earlier test, ``instruments`` a kind to a name on the bench.
+    ``certificates`` are those of bench, campaign and test, the last one first.
     """
 
     __test__ = False
@@ -135,6 +163,8 @@ class TestPlan:
     settings: Any
     inputs: Mapping[str, str]
     instruments: Mapping[str, str] = field(default_factory=dict)
+    certificates: Mapping[str, str] = field(default_factory=dict)
+    at: float | None = None
 
 
 @dataclass(frozen=True)
@@ -150,6 +180,8 @@ class CampaignPlan:
     folder: Path
     """Folder of the files that the settings name."""
     tolerances: Tolerances | None = None
+    operator: str = ""
+    timeline: Timeline | None = None
 
     @property
     def sha256(self) -> str:
@@ -233,7 +265,9 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
-    return BenchPlan(table.name, table.machine, tuple(instruments), source, text, limits, description)
+    return BenchPlan(
+        table.name, table.machine, tuple(instruments), source, text, limits, description, table.certificates
+    )
 
 
 def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> CampaignPlan:
@@ -250,6 +284,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for number, test in enumerate(table.test if table else ()):
         mistakes += _name_mistakes(test, ("test", number), earlier)
         earlier.append(test.name)
+    mistakes += _timeline_mistakes(table, bench) if table else []
     if table is None or mistakes:
         raise BenchError(tomlfile.report(source, mistakes))
     if bench is None:
@@ -258,10 +293,32 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     for test in table.test:
         method = plugins.get("methods", test.method)
         settings = completed(method, _settings("methods", test.method, test.settings, ())[0], bench.description)
-        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments))
+        certified = {**bench.certificates, **table.certificates, **test.certificates}
+        tests.append(TestPlan(test.name, method, settings, test.inputs, test.instruments, certified, test.at))
     return CampaignPlan(
-        table.name, bench, tuple(tests), Path(table.runs), source, text, source.parent.resolve(), table.tolerances
+        name=table.name,
+        bench=bench,
+        tests=tuple(tests),
+        runs=Path(table.runs),
+        source=source,
+        text=text,
+        folder=source.parent.resolve(),
+        tolerances=table.tolerances,
+        operator=table.operator,
+        timeline=table.timeline,
     )
+
+
+def _timeline_mistakes(table: CampaignTable, bench: BenchPlan | None) -> list[str]:
+    if table.timeline is None:
+        stated = [number for number, test in enumerate(table.test) if test.at is not None]
+        return [f"{tomlfile.dotted(('test', n, 'at'))}: expected a table [timeline]; found none" for n in stated]
+    try:
+        if bench is not None:
+            follower(each.driver for each in bench.instruments)
+    except BenchError as error:
+        return [f"{error}; the bench {bench.source if bench else ''} has none"]
+    return []
 
 
 def _address_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...]) -> list[str]:

@@ -14,6 +14,7 @@ from typing import Any, Self
 import xarray as xr
 
 from errormotion.campaign.store import RawStore
+from errormotion.datasets.clock import RecordClock
 from errormotion.errors import RunError
 
 COMMIT_INTERVAL = 0.5
@@ -44,6 +45,7 @@ class Recorder:
     def __init__(self, path: Path, dim: str, expected: float, attrs: dict[str, Any]) -> None:
         self._path, self._dim, self._expected, self._attrs = path, dim, expected, attrs
         self._store = RawStore(path, dim) if path.exists() else None
+        self._clock = RecordClock(self.attrs, self.committed, self._end())
         self._queue: queue.Queue[xr.Dataset | None] = queue.Queue(maxsize=8)
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="errormotion-recorder", daemon=True)
@@ -115,10 +117,21 @@ class Recorder:
             except queue.Empty:
                 pass
             if self._store and waiting_since is not None and time.monotonic() - waiting_since >= COMMIT_INTERVAL:
-                self._store.commit()
+                self._commit(self._store)
                 waiting_since = None
         if self._store:
-            self._store.commit()
+            self._commit(self._store)
+
+    def _commit(self, store: RawStore) -> None:
+        store.attrs.update(self._clock.attributes())
+        store.commit()
+
+    def _end(self) -> float | None:
+        """Return the time of the last sample on disk, s; None without samples at a constant rate."""
+        rate = self.attrs.get("sample_rate")
+        if not (rate and self._dim == "time" and self.committed):
+            return None
+        return float(self.attrs.get("time_start", 0.0)) + (self.committed - 1) / float(rate)
 
     def _append(self, chunk: xr.Dataset) -> None:
         if self._store is None:

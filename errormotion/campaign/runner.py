@@ -28,9 +28,12 @@ from errormotion.campaign.folder import RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
+from errormotion.campaign.timeline import follower
 from errormotion.datasets import provenance
+from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.timing import later
 from errormotion.errors import RunError
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -236,6 +239,7 @@ class _Session:
                 "settings_hash": settings_hash(settings, info.id, info.version),
                 "tolerances": plan.tolerances.model_dump(mode="json") if plan.tolerances else None,
                 "inputs": {},
+                "operator": plan.operator,
                 "instruments": [answer.record() for answer in self.bench.chosen(test.instruments).answers],
                 "software": provenance.make({}, None, None)["software"],
                 "samples": {},
@@ -281,6 +285,11 @@ class _Session:
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         if bench.description is not None:
             attrs["chain"] = bench.description.moving_chain
+        if folder.data.get("operator"):
+            attrs["operator"] = folder.data["operator"]
+        if test.certificates:
+            attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
+        own = self._set_clock(folder, test)
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
@@ -292,7 +301,7 @@ class _Session:
                 closing(_Chunks(method.acquire(bench, test.settings, inputs=inputs, done=done))) as chunks,
             ):
                 for chunk in chunks:
-                    recorder.put(chunk)
+                    recorder.put(chunk.assign_attrs(own) if own else chunk)
                     taken += chunk.sizes.get(dim, 0)
                     rate = chunk.attrs.get("sample_rate")
                     self.progress.advance(taken / rate if rate else taken)
@@ -312,6 +321,19 @@ class _Session:
             raise RunError(f"The method '{method.info.id}' yielded no data.")
         folder.step("acquire", "done", samples=recorder.committed)
         folder.save(acquired=True)
+
+    def _set_clock(self, folder: RunFolder, test: TestPlan) -> dict[str, str]:
+        """Set the machine to the start of a test on the timeline; return the attributes that state it."""
+        timeline = self.campaign.timeline
+        if timeline is None:
+            return {}
+        control = follower(answer.driver for answer in self.bench.answers)
+        if "clock" not in folder.data:
+            time = float(control.state()["time"]) if test.at is None else test.at
+            folder.save(clock={"start": timeline.start, "time": time, "schedule": timeline.events()})
+        clock = folder.data["clock"]
+        control.follow(clock["schedule"], clock["time"])
+        return {"start": later(clock["start"], clock["time"])}
 
     def _identify(self, folder: RunFolder, test: TestPlan) -> None:
         self.progress.stage("identifying")

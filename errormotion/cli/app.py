@@ -51,6 +51,16 @@ def _version(value: bool) -> None:
         raise typer.Exit
 
 
+def _millimetres(option: str, text: str) -> tuple[float, float, float]:
+    """Return the point that an option states in mm, m."""
+    try:
+        x, y, z = (float(part) / 1e3 for part in text.split(","))
+    except ValueError:
+        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
+        raise typer.Exit(USAGE) from None
+    return x, y, z
+
+
 @app.callback()
 def root(
     version: Annotated[
@@ -127,17 +137,35 @@ def identify(
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="For several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
+        typer.Option(
+            help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler, tcp://host:port."
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
     ] = None,
+    monte_carlo: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|auto",
+            help="Evaluate the uncertainty by N trials (JCGM 101) as well, or by as many as the result needs.",
+        ),
+    ] = None,
+    digits: Annotated[
+        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: one seed gives one result.")] = 0,
     json_: Json = False,
 ) -> None:
     """Identify the errors of one raw dataset, or of many."""
     from errormotion.cli.commands import data
 
-    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
+    trials = None
+    if monte_carlo is not None:
+        from errormotion.cli.commands.monte_carlo import trials_of
+
+        trials = data.Trials(trials_of(monte_carlo), digits, seed)
+    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_, trials)
 
 
 @app.command()
@@ -315,6 +343,18 @@ def validate(
 
 @app.command()
 @guarded
+def truth(
+    run: Annotated[Path, typer.Argument(help="Run folder of a campaign with a [timeline] on a virtual machine.")],
+    out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],
+) -> None:
+    """Write the true errors behind a run on a virtual machine, as an error dataset."""
+    from errormotion.cli.commands import truth as command
+
+    command.truth(run, out)
+
+
+@app.command()
+@guarded
 def compare(
     results: Annotated[
         list[Path] | None,
@@ -331,6 +371,17 @@ def compare(
     same_start: Annotated[
         bool, typer.Option("--same-start", help="Take time 0 of all datasets as one instant where none is stated.")
     ] = False,
+    change: Annotated[
+        list[str] | None,
+        typer.Option(help="A further one, the change between two measurements of the same places: NAME=AFTER,BEFORE."),
+    ] = None,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Origin of the frame of one in machine coordinates, all axes at zero, mm: NAME=x,y,z."),
+    ] = None,
+    chain: Annotated[
+        str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
@@ -338,16 +389,14 @@ def compare(
     """Compare results of one machine: whether they agree, and what explains it where they do not."""
     from errormotion.cli.commands import compare as command
 
-    point = None
-    if at is not None:
-        try:
-            x, y, z = (float(part) / 1e3 for part in at.split(","))
-        except ValueError:
-            typer.echo(f"--at {at}: expected three numbers in mm, as in 0,0,-150", err=True)
-            raise typer.Exit(USAGE) from None
-        point = (x, y, z)
+    point = None if at is None else _millimetres("--at", at)
+    origins = {}
+    for each in origin or []:
+        own, _, text = each.rpartition("=")
+        origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    command.compare(results or [], name or [], point, chosen, since, same_start, out, report, json_)
+    stated = command.Stated(name or [], change or [], origins, chain)
+    command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
 
 
 @app.command()
@@ -369,19 +418,44 @@ def runs(
 
 @app.command()
 @guarded
+def note(
+    folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
+    text: Annotated[str, typer.Argument(help="What happened, on one line.")],
+    machine: Annotated[str | None, typer.Option(help="The machine, for a note without a run.")] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="DATE", help="When it happened, UTC; default: the time of the run.")
+    ] = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who notes it.")] = "",
+    json_: Json = False,
+) -> None:
+    """Note an event of a machine, such as a collision or a repair."""
+    from errormotion.cli.commands import note as command
+
+    command.note(folder, text, machine, at, by, json_)
+
+
+@app.command()
+@guarded
 def history(
     machine: Annotated[str, typer.Option(help="The machine.")],
-    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    figure: Annotated[
+        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
+    ],
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
     ] = None,
+    at: Annotated[str | None, typer.Option(help="Place of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
 ) -> None:
-    """Show a figure of a machine over time, with its trend and a step."""
+    """Show a figure of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands import history as command
 
-    command.history(folders or [], machine, figure, method, json_)
+    point = None if at is None else _millimetres("--at", at)
+    command.history(folders or [], machine, figure, point, method, test, out, report, json_)
 
 
 @app.command()

@@ -15,11 +15,15 @@ from errormotion.compare.diagnosis import Cause, diagnose
 from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
 from errormotion.compare.result import build
+from errormotion.compare.stack import Estimate
+from errormotion.errors import DatasetError
 
-__all__ = ["compare"]
+__all__ = ["compare", "temperatures"]
 
 SUSPICIOUS = 0.05
 """Probability of a pair below which causes are looked for, divided by the number of pairs."""
+MOST_FOR_ALL_PAIRS = 40
+"""Number of datasets up to which every one is compared with every other: the pairs grow with its square."""
 
 
 def compare(
@@ -30,6 +34,7 @@ def compare(
     since: float | None = None,
     same_start: bool = False,
     causes: bool | None = None,
+    against: str = "",
 ) -> xr.Dataset:
     """Compare error datasets of one machine.
 
@@ -41,6 +46,9 @@ def compare(
         As of `errormotion.compare.ground.common_ground`.
     causes : bool, optional
         Whether causes are looked for. Default: for pairs that do not agree.
+    against : str, optional
+        Dataset that each of the others is compared with. Default: all pairs of up to 40 datasets; of more, the first
+        dataset with each of the others. The consensus is that of all datasets.
 
     Returns
     -------
@@ -53,13 +61,13 @@ def compare(
         The datasets cannot be compared; what is missing.
     """
     ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
-    pairs = [pair(a, b) for a, b in combinations(ground.estimates, 2)]
+    pairs = [pair(a, b) for a, b in _pairs(ground, against)]
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
     time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     for each in pairs:
         wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
-        heat = _temperatures(datasets, ground) if wanted else {}
+        heat = temperatures(datasets, ground) if wanted else {}
         a, b = by_name[each.a], by_name[each.b]
         found.append(
             diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
@@ -67,7 +75,20 @@ def compare(
     return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found)
 
 
-def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
+def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
+    estimates = ground.estimates
+    if against and against not in (names := [each.name for each in estimates]):
+        raise DatasetError(f"against: expected one of the datasets {', '.join(names)}; found '{against}'")
+    if not against and len(estimates) > MOST_FOR_ALL_PAIRS:
+        against = estimates[0].name
+        ground.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
+    if not against:
+        return list(combinations(estimates, 2))
+    first = next(each for each in estimates if each.name == against)
+    return [(first, each) for each in estimates if each is not first]
+
+
+def temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
     """Return the recorded temperatures of all datasets at the instants of the grid, by name."""
     if ground.dim != "time":
         return {}

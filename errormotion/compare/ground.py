@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
+from errormotion.compare import chain
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
+from errormotion.datasets.interpolation import bracket
 from errormotion.datasets.reduction import influence_of
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
@@ -46,6 +48,8 @@ class Ground:
     notes : list of str
     turns : dict of str to ndarray (n, 3)
         Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
+    labels : dict of str to str
+        Identity of a source to its name.
     """
 
     estimates: list[Estimate]
@@ -60,6 +64,7 @@ class Ground:
     start: str = ""
     notes: list[str] = field(default_factory=list)
     turns: dict[str, Array] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
 
 
 def common_ground(
@@ -96,17 +101,24 @@ def common_ground(
         raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
     for name, ds in datasets.items():
         _check(name, ds)
-    for i, name in enumerate(names):
-        for other in names[:i]:
-            if datasets[name].identical(datasets[other]):
-                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    _once(datasets)
+    notes: list[str] = []
+    datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
+    if chain.axis_of(datasets):
+        _same(datasets, "machine")
+        _same(datasets, "frame")
+        datasets = chain.on_axis(datasets, at=at, same_start=same_start, notes=notes)
+    for name, ds in datasets.items():
+        _check_dimensions(name, ds)
     first = datasets[names[0]]
     component = _same(datasets, "component", SAME_MOTION)
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
-    notes: list[str] = []
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
-    moved = {name: ds if component == "beam" else ds.em.at(point) for name, ds in datasets.items()}
+    moved = {
+        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else ds.em.at(point)
+        for name, ds in datasets.items()
+    }
     reference: float | None = None
     if dim == "time":
         moved, reference = _in_time(moved, since, same_start, notes)
@@ -137,6 +149,7 @@ def common_ground(
         start=str(grid.attrs.get("start", "")),
         notes=notes,
         turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
+        labels={identity: name for ds in moved.values() for identity, name in _labels(ds)},
     )
 
 
@@ -150,11 +163,25 @@ def _check(name: str, ds: xr.Dataset) -> None:
         raise DatasetError(
             f"'{name}': its errors are known along one direction only (deviation), which cannot be compared"
         )
+
+
+def _check_dimensions(name: str, ds: xr.Dataset) -> None:
     if len(ds["EX"].dims) > 1:
         raise DatasetError(
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
             "in ds.isel(position=3)"
         )
+
+
+def _once(datasets: Mapping[str, xr.Dataset]) -> None:
+    """Refuse one dataset under two names; only those with the same values are compared as a whole."""
+    seen: dict[bytes, list[str]] = {}
+    for name, ds in datasets.items():
+        alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
+        for other in alike:
+            if datasets[name].identical(datasets[other]):
+                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+        alike.append(name)
 
 
 def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str, str] | None = None) -> str:
@@ -163,7 +190,8 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     if len(values) > 1:
         stated = "; ".join(f"'{name}': {value}" for name, value in found.items())
         hint = {
-            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name)",
+            "frame": ". Bring one to the frame of the other with ds.em.in_frame(pose, name), or state the origin of "
+            "its frame in machine coordinates (attribute frame_origin, --origin NAME=x,y,z)",
             "component": ". The errors of an axis and of the tool need the kinematic chain; predict one from the other",
         }.get(attribute, "")
         raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
@@ -216,9 +244,16 @@ def _in_time(
         grid = np.concatenate([[since], grid])
         if not first <= since <= last:
             raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+    others = [name for name in names if name != sparse]
+    kept = _apart(grid, [shifted[name]["time"].values for name in others])
+    if (~kept).any():
+        notes.append(
+            f"{int((~kept).sum())} of {grid.size} instants are left out, so that no two interpolated values share a "
+            "measured one."
+        )
+        grid = grid[kept]
     if grid.size < 2:
         raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
-    others = [name for name in names if name != sparse]
     notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
     start = starts[names[0]]
@@ -226,6 +261,19 @@ def _in_time(
         ds["time"] = ("time", grid, ds["time"].attrs)
         ds.attrs["start"] = start
     return placed, float(grid[0])
+
+
+def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return which instants of a grid are kept so that each value of a dataset serves for one of them at most."""
+    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, instant)
+    kept = np.ones(grid.size, dtype=bool)
+    if (used[:, 0, 1:] > used[:, 1, :-1]).all():
+        return kept
+    last = np.full(len(times), -1)
+    for i in range(grid.size):
+        kept[i] = bool((used[:, 0, i] > last).all())
+        last = used[:, 1, i] if kept[i] else last
+    return kept
 
 
 def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:
@@ -281,6 +329,13 @@ def _seen(ds: xr.Dataset) -> list[str]:
     return [name for name in DOF if np.isfinite(ds[name].values).any()]
 
 
+def _labels(ds: xr.Dataset) -> list[tuple[str, str]]:
+    if "source_id" not in ds.coords:
+        return []
+    pairs = zip(ds["source_id"].values.tolist(), ds["source"].values.tolist(), strict=True)
+    return [(str(identity), str(name)) for identity, name in pairs if identity]
+
+
 def _turns(ds: xr.Dataset) -> Array:
     found: Array = np.nan_to_num(ds.em.twist().values.reshape(-1, 6)[:, 3:])
     return found
@@ -290,9 +345,9 @@ def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
     k = [DOF.index(freedom) for freedom in freedoms]
     value = ds.em.twist().values.reshape(-1, 6)[:, k]
     F = influence_of(ds)
-    F = F.reshape(len(F), -1, 6)[..., k]
+    F = F.reshape(len(F), len(value), 6)[..., k]
     total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
-    own = total - np.einsum("sni,snj->nij", F, F)
+    own = total - products(F)
     size = len(F)
     sources = ds["source"].values.tolist() if size else []
     ids = ds["source_id"].values.tolist() if size and "source_id" in ds.coords else [""] * size

@@ -114,6 +114,7 @@ def build(
         "fit_p": agreed.fit.p,
         "birge_ratio": agreed.birge,
         "shared_sources": json.dumps(shared(estimates)),
+        "shared_names": json.dumps([ground.labels.get(key, key) for key in shared(estimates)]),
         "notes": ground.notes or [""],
     }
     if ground.since is not None:

@@ -16,6 +16,10 @@ SHORT = 1e-3
 FIELD |= {"m/K": (1e6, "um/K"), "rad/K": (648000 / np.pi, "arcsec/K")}
 
 
+MOST_SHARED = 6
+"""Shared sources that are named."""
+
+
 class CauseText(NamedTuple):
     """One cause, ready to be printed."""
 
@@ -67,10 +71,18 @@ def verdict(ds: xr.Dataset) -> list[str]:
         else:
             more = f" These data cannot tell it from: {first.alike}." if first.alike else ""
             lines.append(f"{pair}: most likely {first.name}{' ' + first.size if first.size else ''}.{more}")
-    shared = json.loads(ds.attrs.get("shared_sources", "[]"))
-    if shared:
-        lines.append(f"Taken as one draw in several datasets: {', '.join(shared)}.")
+    if shared := _shared(ds):
+        more = f" and {len(shared) - MOST_SHARED} more" if len(shared) > MOST_SHARED else ""
+        lines.append(f"Taken as one draw in several datasets: {'; '.join(shared[:MOST_SHARED])}{more}.")
     return lines
+
+
+def _shared(ds: xr.Dataset) -> list[str]:
+    """Return the sources that count as one draw: the certificate, or the name of what one calibration gave."""
+    keys = json.loads(ds.attrs.get("shared_sources", "[]"))
+    names = json.loads(ds.attrs.get("shared_names", "[]")) or keys
+    hashed = zip(keys, names, strict=True)
+    return [f"{name} (one calibration)" if key.startswith("sha256:") else key for key, name in hashed]
 
 
 def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:

@@ -239,6 +239,12 @@ class ErrorMotion:
 
         return since(self._ds, time)
 
+    def change_from(self, before: xr.Dataset) -> xr.Dataset:
+        """Return the changes since another measurement of the same places; see `reduction.change`."""
+        from errormotion.datasets.reduction import change
+
+        return change(self._ds, before)
+
     def to_times(self, times: ArrayLike) -> xr.Dataset:
         """Return the errors at other instants, s, with what interpolation adds; see `interpolation.to_points`."""
         from errormotion.datasets.interpolation import to_points

@@ -61,14 +61,18 @@ def _guess(value: float, row: Row) -> str:
 def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]:
     """Return a sentence if the attribute ``units`` is there and is not the inside unit."""
     found = attrs.get("units")
-    if found is None or not unit or found == unit:
+    if found is None or not unit:
+        return []
+    if not isinstance(found, str):
+        return [f"{name}: expected units '{unit}'; found {found!r:.100}"]
+    if found == unit:
         return []
     if unit == "1":
-        if str(found).strip().lower() in ("", "dimensionless", "none"):
+        if found.strip().lower() in ("", "dimensionless", "none"):
             return []
         return [f"{name}: expected units '1' (a pure number); found '{found}'"]
     try:
-        same = convert(1.0, str(found), unit) == 1.0 and convert(0.0, str(found), unit) == 0.0
+        same = convert(1.0, found, unit) == 1.0 and convert(0.0, found, unit) == 0.0
     except DatasetError as error:
         return [f"{name}: expected units '{unit}'; found '{found}': {error}"]
     if same:

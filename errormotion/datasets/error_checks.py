@@ -8,6 +8,7 @@ hold all that was measured.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Hashable, Sequence
 from datetime import datetime
 from typing import Any
@@ -41,6 +42,7 @@ from errormotion.datasets.schemas import (
     SIGN,
     Row,
 )
+from errormotion.kinematics.chains import parse_chain
 
 ROUNDING = 1e-8
 """Rounding of a 6x6 covariance relative to its diagonal, after moves over some metres and back."""
@@ -104,16 +106,16 @@ def _attribute_violations(ds: xr.Dataset) -> list[str]:
     return found
 
 
-def _point_violations(value: Any) -> list[str]:
+def _point_violations(value: Any, name: str = "functional_point") -> list[str]:
     try:
         point = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         point = np.empty(0)
     if point.shape != (3,) or not np.isfinite(point).all():
-        return [f"attribute 'functional_point': expected three finite coordinates in m; found {value!r}"]
+        return [f"attribute '{name}': expected three finite coordinates in m; found {value!r}"]
     if np.abs(point).max() > FARTHEST:
         far = number(float(point[np.argmax(np.abs(point))]))
-        return [f"attribute 'functional_point': {far} m: expected within {FARTHEST:g} m; is it in mm?"]
+        return [f"attribute '{name}': {far} m: expected within {FARTHEST:g} m; is it in mm?"]
     return []
 
 
@@ -152,6 +154,7 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
     for name, size in (("reference_interval", 2), ("reference_position", 1)):
         if name in ds.attrs and not _is_rising(ds.attrs[name], size):
             found.append(f"attribute '{name}': expected {OPTIONAL_ATTRIBUTES[name]}; found {ds.attrs[name]!r}")
+    found += _machine_violations(ds)
     for name in ("source_id", "source_reference"):
         if name in ds.variables and ds.variables[name].dims != ("source",):
             found.append(f"{name}: expected dims (source); found {dims_text(ds.variables[name])}")
@@ -167,9 +170,28 @@ def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str
         if variable.dims != (name.removesuffix(INDEX),) or not (numbers % 1 == 0).all():
             found.append(_TOUCHED.format(name))
     lost = [name for name in ds.variables if str(name).endswith(INDEX) and str(name).removesuffix(INDEX) not in dims]
-    found += [_TOUCHED.format(name) for name in lost]
+    # One value that was selected, as by isel(position=3), keeps its number; a mean makes a float of it.
+    found += [_TOUCHED.format(name) for name in lost if ds[name].ndim or ds[name].dtype.kind not in "iu"]
     return found
 
+
+def _machine_violations(ds: xr.Dataset) -> list[str]:
+    """Return what is wrong with what the dataset states of the machine and of its frame."""
+    found = []
+    if "chain" in ds.attrs:
+        try:
+            parse_chain(ds.attrs["chain"])
+        except (ValueError, AttributeError, TypeError) as error:
+            found.append(f"attribute 'chain': {error}")
+    if "frame_origin" in ds.attrs:
+        found += _point_violations(ds.attrs["frame_origin"], "frame_origin")
+    axes = ds.attrs.get("lever_axes", "Z")
+    if axes not in _LEVERS:
+        found.append(f"attribute 'lever_axes': expected one of {', '.join(_LEVERS)}; found {axes!r}")
+    return found
+
+
+_LEVERS = ("X", "Y", "Z", "XY", "XZ", "YZ", "XYZ")
 
 _TOUCHED = (
     "{}: expected whole numbers along its own dimension; a mean or an interpolation of plain xarray changed them and "
@@ -246,7 +268,7 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
 
 def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
     F = np.asarray(ds.variables["influence"].values, dtype=float)
-    F = F.reshape(F.shape[0], -1, 6)
+    F = F.reshape(F.shape[0], math.prod(F.shape[1:-1]), 6)
     if not np.array_equal(np.isnan(F), np.broadcast_to(unseen, F.shape)):
         return [_pattern("influence", np.isnan(F) != unseen)]
     F = np.where(unseen, 0.0, F) / scale

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.error_checks import error_violations
-from errormotion.datasets.schemas import DOF, ERROR_ROWS, ERROR_UNITS, INDEX, SCHEMA, SIGN
+from errormotion.datasets.schemas import CARRIED, DOF, ERROR_ROWS, ERROR_UNITS, INDEX, SCHEMA, SIGN
 from errormotion.errors import DatasetError
 
 _ROWS = {row.name: row for row in ERROR_ROWS}
@@ -47,6 +47,8 @@ def build_errors(
     reference_position: float | None = None,
     start: str = "",
     notes: Sequence[str] = (),
+    measured: Mapping[Any, Any] | None = None,
+    lever_axes: str = "",
 ) -> xr.Dataset:
     """Return an error dataset that follows its schema.
 
@@ -88,6 +90,11 @@ def build_errors(
         Instant of time 0: ISO 8601 with an offset from UTC.
     notes : sequence of str, optional
         What a reader has to know, one sentence each.
+    measured : mapping, optional
+        Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts become attributes of the errors.
+    lever_axes : str, optional
+        Axes whose travel is a lever of the rotations, such as ``Z``, where the errors are not those of one rigid
+        motion.
 
     Returns
     -------
@@ -135,8 +142,11 @@ def build_errors(
         attrs["reference_position"] = float(reference_position)
     if start:
         attrs["start"] = start
-    if notes:
+    if notes := [*notes, *provenance.get("interruptions", ())]:
         attrs["notes"] = list(notes)
+    attrs |= {name: text for name in CARRIED if isinstance(text := (measured or {}).get(name), str) and text.strip()}
+    if lever_axes:
+        attrs["lever_axes"] = lever_axes
     try:
         ds = xr.Dataset(variables, coords=own_coords, attrs=attrs)
         clash = sorted(set(extras or {}) & set(ds.variables))

@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
+from errormotion.datasets import clock
 from errormotion.datasets.files.hashing import hash_dataset, plain
 
 __all__ = ["hash_dataset", "identity", "make", "of", "plain"]
@@ -54,6 +55,7 @@ def make(
     """
     if instruments is None and raw is not None and isinstance(raw.attrs.get("instruments"), str):
         instruments = json.loads(raw.attrs["instruments"])
+    interrupted = clock.notes(raw.attrs) if raw is not None else []
     return {
         "settings": plain(settings),
         "raw": None
@@ -63,7 +65,7 @@ def make(
         "software": _software(),
         "seed": seed,
         "steps": plain(steps),
-    }
+    } | ({"interruptions": interrupted} if interrupted else {})
 
 
 def identity(*calibrated: ArrayLike | str, part: str, along: ArrayLike = ()) -> str:

@@ -105,6 +105,9 @@ def _covariance_violations(variable: xr.Variable, row: Row) -> Iterator[str]:
     if row.name == "beam_covariance" and np.isnan(C).any():
         yield f"{row.name}: expected numbers; found NaN. Leave the variable out where it is not known"
         return
+    if C.shape[-1] != C.shape[-2]:
+        yield f"{row.name}: expected square matrices; found {C.shape[-2]} x {C.shape[-1]}"
+        return
     C = C[~np.isnan(C).any(axis=(-2, -1))]
     scale = np.sqrt(np.abs(np.diagonal(C, axis1=-2, axis2=-1)))
     scale[scale == 0] = 1.0

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
+from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 
 REFERENCE = "reference state"
@@ -58,9 +59,9 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
             f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
         )
     m = np.maximum(count, 1)
-    own = np.nan_to_num(C - np.einsum("s...i,s...j->...ij", F, F))
-    E_ref = np.where(used[..., None], np.nan_to_num(E), 0.0).sum(axis=0) / m[..., None]
-    F_ref = np.where(used[None, ..., None], np.nan_to_num(F), 0.0).sum(axis=1) / m[None, ..., None]
+    own = filled(C - products(F))
+    E_ref = np.where(used[..., None], filled(E), 0.0).sum(axis=0) / m[..., None]
+    F_ref = np.where(used[None, ..., None], filled(F), 0.0).sum(axis=1) / m[None, ..., None]
     own_ref = np.where(used[..., None, None], own, 0.0).sum(axis=0) / (m**2)[..., None, None]
     rows = _sources_of(own_ref)  # (part, ..., 6)
     rows = np.broadcast_to(rows[:, None], (len(rows), *E.shape)).copy()
@@ -73,7 +74,7 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     nan = np.isnan(E)
     influence[:, nan] = np.nan
     own[nan[..., :, None] | nan[..., None, :]] = np.nan
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total = own + products(influence)
     zero = (first + last) / 2
     values = np.moveaxis(E - E_ref, 0, axis)
     names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
@@ -111,19 +112,94 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     known = ~np.isnan(E)
     count = known.sum(axis=axis)
     weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
-    F = np.nan_to_num(influence_of(ds))
-    own = np.nan_to_num(np.asarray(ds["covariance"].values) - np.einsum("s...i,s...j->...ij", F, F))
-    value = (weight * np.nan_to_num(E)).sum(axis=axis)
+    F = filled(influence_of(ds))
+    own = filled(np.asarray(ds["covariance"].values) - products(F))
+    value = (weight * filled(E)).sum(axis=axis)
     value[count == 0] = np.nan
     influence = (weight[None] * F).sum(axis=axis + 1)
     influence[:, count == 0] = np.nan
     own = (own * weight[..., :, None] * weight[..., None, :]).sum(axis=axis)
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total = own + products(influence)
     total[np.isnan(value)[..., :, None] | np.isnan(value)[..., None, :]] = np.nan
     rest = ds.isel({dim: 0}, drop=True).drop_vars(f"{dim}{INDEX}", errors="ignore")
     return rebuilt(rest, value, total, influence, [], {})
 
 
+def change(after: xr.Dataset, before: xr.Dataset) -> xr.Dataset:
+    """Return the changes of errors since another measurement of the same places, such as a volume warm less cold.
+
+    Parameters
+    ----------
+    after, before : Dataset
+        Error datasets of one component over ``position`` or ``target``; both state ``start``. Places of ``after`` that
+        ``before`` does not have are left out.
+
+    Returns
+    -------
+    Dataset
+        Sources with one ``source_id`` are one draw in both. Without the further results of the method.
+
+    Raises
+    ------
+    DatasetError
+        Another machine, component, frame or functional point; no start; no common places.
+    """
+    for name in ("machine", "component", "frame"):
+        if after.attrs[name] != before.attrs[name]:
+            raise DatasetError(
+                f"A change needs one {name}; found '{after.attrs[name]}' and '{before.attrs[name]}' (before)"
+            )
+    dims = after["EX"].dims
+    if dims != before["EX"].dims or dims not in (("position",), ("target",)):
+        raise DatasetError(
+            "A change of places needs errors over position or target in both datasets; found "
+            f"{', '.join(map(str, dims)) or 'none'} and {', '.join(map(str, before['EX'].dims)) or 'none'} (before)"
+        )
+    silent = [name for name, ds in (("after", after), ("before", before)) if not ds.attrs.get("start")]
+    if silent:
+        raise DatasetError(f"A change needs the attribute 'start' of both datasets; {' and '.join(silent)}: none")
+    _freedoms_over(after, str(dims[0]))
+    _freedoms_over(before, str(dims[0]))
+    before = before.em.at(after.attrs["functional_point"])
+    axes = [name for name in "xyz" if name in after.variables and name in before.variables]
+    places = [np.stack([ds[name].values for name in axes], axis=-1) if axes else None for ds in (after, before)]
+    if places[0] is None or places[1] is None:
+        raise DatasetError("A change of places needs the commanded x, y or z in both datasets; found none in common")
+    nearest = np.array([np.abs(places[1] - each).max(axis=1).argmin() for each in places[0]])
+    rows = np.flatnonzero(np.abs(places[0] - places[1][nearest]).max(axis=1) <= SAME_PLACE)
+    if not rows.size:
+        raise DatasetError(f"The datasets have no place in common (within {SAME_PLACE * 1e6:g} um)")
+    a, b = after.isel({dims[0]: rows}), before.isel({dims[0]: nearest[rows]})
+    F, G = influence_of(a), influence_of(b)
+    own = [ds["covariance"].values - np.einsum("snj,snk->njk", f, f) for ds, f in ((a, F), (b, G))]
+    ids = [list(ds["source_id"].values) if "source_id" in ds.coords else [""] * len(f) for ds, f in ((a, F), (b, G))]
+    shared = [ids[0].index(each) if each and each in ids[0] else -1 for each in ids[1]]
+    value = np.stack([a[name].values - b[name].values for name in DOF], axis=-1)
+    F = F.copy()
+    for k, mine in enumerate(shared):
+        if mine >= 0:
+            F[mine] -= G[k]
+    own_only = [k for k, mine in enumerate(shared) if mine < 0]
+    gone = np.isnan(value)
+    F = np.concatenate([F, -G[own_only]])
+    F[:, gone] = np.nan
+    total = own[0] + own[1] + np.einsum("snj,snk->njk", F, F)
+    total[gone[:, :, None] | gone[:, None, :]] = np.nan
+    names = [f"{b['source'].values[k]} (before)" for k in own_only]
+    away = -between(str(before.attrs["start"]), str(after.attrs["start"]))
+    changed = rebuilt(
+        a, value, total, F, names, {}, reference=f"the state measured from {before.attrs['start']}",
+        reference_interval=np.array([away, away]),
+    )  # fmt: skip
+    if len(names):
+        known = changed["source_id"].values.astype(object)
+        known[-len(names) :] = [ids[1][k] for k in own_only]
+        changed = changed.assign_coords(source_id=("source", known.astype(str)))
+    return changed
+
+
+SAME_PLACE = 1e-6
+"""Distance below which two commanded positions are the same, m."""
 TOLERANCE = 1e-9
 """Rounding of a time, s."""
 

@@ -214,8 +214,19 @@ OPTIONAL_ATTRIBUTES = {
     "reference_position": "position whose errors are zero by definition",
     "notes": "list of sentences for the reader",
     "component_description": "what a component is that the schema does not list",
+    "chain": "kinematic chain of the machine, such as `workpiece-X-Y-bed-Z-spindle-tool`",
+    "operator": "who measured",
+    "certificates": "JSON object: certificates of artefacts and instruments, by item",
+    "frame_origin": "origin of `frame` in machine coordinates with all axes at zero, m, where its directions are those "
+    "of the machine",
+    "lever_axes": "linear axes whose travel is a lever of the rotations, such as `Z`, where the errors are not those "
+    "of one rigid motion: the displacement at another point is `E + R x r` along these directions only, and EA, EB "
+    "and EC are rotations of the frame of the axes",
 }
 """Attributes that an error dataset may have."""
+
+CARRIED = ("chain", "operator", "certificates")
+"""Attributes of a raw dataset that its error dataset carries on."""
 
 
 def variants(schema: str) -> tuple[RawSchema, ...]:
@@ -237,6 +248,7 @@ def known_schemas() -> set[str]:
 
 
 __all__ = [
+    "CARRIED",
     "COMPONENTS",
     "DIRECTION",
     "DOF",

@@ -23,7 +23,7 @@ from xarray.indexes import RangeIndex
 
 from errormotion.datasets.checks import storable_violations
 from errormotion.datasets.schemas import SCHEMA
-from errormotion.errors import DatasetError
+from errormotion.errors import DatasetError, ErrormotionError
 
 _NETCDF = (".nc", ".nc4", ".h5")
 _READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
@@ -227,10 +227,12 @@ def _reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Turn what a damaged file raises while its values are read, long after it was opened, into a DatasetError."""
+    """Name the file in errors of the project, and turn what a damaged one raises when its values are read into one."""
     try:
         yield
-    except DatasetError:
+    except ErrormotionError as error:
+        if str(path) not in str(error):
+            error.args = (f"{path}: {error}",)
         raise
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)

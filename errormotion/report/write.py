@@ -16,10 +16,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import errormotion
 from errormotion import plugins
+from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
 from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.document import Cell, Part, Section, Source, Table
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH
 from errormotion.tolerances.conformity import judge
@@ -27,6 +28,9 @@ from errormotion.tolerances.table import Tolerances, from_run
 
 #: Chapters of components that several methods measure; used where the method brings no chapter of its own.
 COMPONENTS = {"beam": beams.part}
+
+#: What a chapter raises where a dataset has not what the chapter shows.
+_DO_NOT_FIT = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
 def write_report(
@@ -68,9 +72,11 @@ def write_report(
     sources = []
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
+        validate(dataset)
         sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
     tolerances = from_run(run or {})
     parts = [part for source in sources for part in _judged(chapters(source), source, tolerances)]
+    parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
     return write_page(sources, parts, Path(out), title)
 
 
@@ -82,13 +88,34 @@ def _judged(parts: list[Part], source: Source, tolerances: Tolerances | None) ->
     return [replace(parts[0], summary=[*lines, *parts[0].summary]), *parts[1:]]
 
 
+def _noted(part: Part, run: Mapping[str, Any]) -> Part:
+    """Return a chapter that ends with the notes on its run."""
+    notes, damaged = run.get("events") or ((), ())
+    if not notes and not damaged:
+        return part
+    rows = [
+        [_moment(each.at or str(run.get("created", DASH))), each.text, each.by, _moment(each.noted)] for each in notes
+    ]
+    head = ["time of the event", "note", "by", "noted"]
+    table = Table("Notes on this run", head, rows, numeric=False, notes=damaged)
+    return replace(part, sections=[*part.sections, Section("notes", "Notes", [table])])
+
+
 def chapters(source: Source) -> list[Part]:
     """Return the chapters of one dataset: those of the plugin that made it, else the generic one."""
     owner = _owner(source.errors)
-    own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
-    if own:
-        return own
-    return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
+    try:
+        own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
+        if own:
+            return own
+        return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
+    except _DO_NOT_FIT as error:
+        by = f"method '{source.errors.attrs['method']}'" if "method" in source.errors.attrs else "the plugin"
+        raise DatasetError(
+            f"The chapter of {by} cannot be written from this dataset ({type(error).__name__}: {error}). Its schema is "
+            "followed; what the plugin adds to it is missing or has another form. If nobody changed the dataset, this "
+            "is a defect of the plugin: the traceback is in the log."
+        ) from error
 
 
 def write_page(sources: Sequence[Source], parts: Sequence[Part], out: Path, title: str | None = None) -> Path:
@@ -163,6 +190,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
         A result cannot be read.
     """
     from errormotion.datasets import load
+    from errormotion.datasets.files import events
 
     folder = Path(run_folder)
     if not folder.is_dir():
@@ -182,6 +210,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
             raise RunError(
                 f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
             ) from error
+    run["events"] = events.read(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
         return write_report(log, target, run=run)

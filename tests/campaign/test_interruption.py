@@ -15,6 +15,7 @@ from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.store import committed_length
+from errormotion.datasets.clock import joins
 from errormotion.datasets.provenance import of
 
 RATE = 1000
@@ -84,6 +85,11 @@ def test_kill_9_loses_at_most_the_last_second_and_resume_goes_on(
     assert of(datasets.load(Path(found["tests"][1]["errors"])))["settings"]["count"] == COUNT
     starts = [step["samples"] for step in RunFolder.open(folder.path).data["steps"] if step["outcome"] == "started"]
     assert starts == [0, kept]
+    with datasets.load(folder.raw) as raw:
+        (join,) = joins(raw.attrs)
+    assert join.index == kept
+    assert join.seconds is not None
+    assert join.seconds > 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

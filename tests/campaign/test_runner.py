@@ -219,3 +219,28 @@ def test_each_test_measures_with_the_instrument_that_it_chooses_and_records_it_a
         with datasets.load(folder.raw) as raw:
             assert raw.attrs["sample_rate"] == rate
             assert [entry["name"] for entry in json.loads(raw.attrs["instruments"])] == [name]
+
+
+def test_operator_and_certificates_reach_the_raw_data(plan: Plan) -> None:
+    bench = '[certificates]\nbar = "K-1"\nthermometer = "T-1"\n'
+    first, second = runner.run(plan('name = "a"', 'name = "b"\ncertificates = {bar = "K-2"}', bench=bench))
+    with datasets.load(first.raw) as a, datasets.load(second.raw) as b:
+        assert json.loads(a.attrs["certificates"]) == {"bar": "K-1", "thermometer": "T-1"}
+        assert json.loads(b.attrs["certificates"]) == {"bar": "K-2", "thermometer": "T-1"}
+
+
+def test_the_operator_of_a_campaign_is_in_the_raw_data(lab: None, write: Callable[..., Path]) -> None:
+    file = write('name = "a"')
+    text = file.read_text().replace('name = "Ramps"', 'name = "Ramps"\noperator = "M. Muster"')
+    file.write_text(text)
+    (folder,) = runner.run(load_campaign(file))
+    assert folder.data["operator"] == "M. Muster"
+    with datasets.load(folder.raw) as raw:
+        assert raw.attrs["operator"] == "M. Muster"
+        assert "certificates" not in raw.attrs
+
+
+def test_a_certificate_of_nothing_known_is_refused(lab: None, write: Callable[..., Path]) -> None:
+    file = write('name = "a"', bench='[certificates]\nbear = "K-1"\n')
+    with pytest.raises(BenchError, match=r"certificates.*bear: expected the number or hash of a certificate"):
+        load_campaign(file)

@@ -8,6 +8,7 @@ import pytest
 
 from errormotion.compare.result import TABLE
 from errormotion.datasets.calibrations import inclination as calibration
+from errormotion.datasets.certificates import ITEMS
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RawSchema, Row, raw_schemas
 from errormotion.methods.spindle_drift.log_import.import_map import (
     Channel,
@@ -70,3 +71,9 @@ def test_the_how_to_names_every_key_of_a_map() -> None:
 def test_the_table_of_attributes_is_the_schema() -> None:
     for name, meaning in ERROR_ATTRIBUTES.items():
         assert f"| `{name}` | {meaning} |" in PAGE
+
+
+def test_the_table_of_certificates_is_the_list_of_items() -> None:
+    section = (DOCS / "reference" / "files.md").read_text().partition("### Certificates")[2].partition("\n### ")[0]
+    rows = [row for row in section.splitlines() if row.startswith("| `")]
+    assert rows == [f"| `{item}` | {meaning} |" for item, meaning in ITEMS.items()]

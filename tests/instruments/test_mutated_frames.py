@@ -22,7 +22,6 @@ QUICK = 200
 HUGE = 10**400
 """A whole number beyond the range of float."""
 WITHOUT_CODEC = {
-    "confocaldt",  # not yet in the list; the kit replays its session with damaged frames
     "compensated_lds",  # reads another instrument
     "controller_probe",  # moves a controller
     "five_sensor_frame",  # several sensors

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchInstrument
 from errormotion.campaign.journal import cause_of
+from errormotion.datasets.clock import steady
 
 FIRST_RETRY_INTERVAL, LONGEST_RETRY_INTERVAL = 1.0, 30.0
 """Time until an instrument is opened again after a failure, s; doubled after each failure up to the longest."""
@@ -30,7 +30,7 @@ class Reading:
     Attributes
     ----------
     at : float
-        ``time.monotonic()`` when it was received, s.
+        `errormotion.datasets.clock.steady` when it was received, s.
     values : mapping
         Result of the driver's ``read``.
     flags : mapping of str to str
@@ -103,7 +103,7 @@ class Source:
         self._thread.join()
 
     def fresh(self, oldest: float) -> Reading | None:
-        """Return the last reading if it is not older than a time of ``time.monotonic()``."""
+        """Return the last reading if it is not older than a time of `steady`."""
         reading = self._reading
         return reading if reading is not None and reading.at >= oldest else None
 
@@ -111,11 +111,11 @@ class Source:
         wait, failed = FIRST_RETRY_INTERVAL, 0
         try:
             while not self._stop.is_set():
-                start = time.monotonic()
+                start = steady()
                 try:
                     self._open()
                     values = dict(self._driver.read())
-                    self._reading = Reading(time.monotonic(), values, _flags(self._driver, values))
+                    self._reading = Reading(steady(), values, _flags(self._driver, values))
                 except Exception as error:  # noqa: BLE001 - reported to the operator, and retried
                     failed += 1
                     self._note(cause_of(error))
@@ -129,7 +129,7 @@ class Source:
                     wait, failed = FIRST_RETRY_INTERVAL, 0
                     self._note("")
                 self._ready.set()
-                self._stop.wait(max(0.0, start + self.interval - time.monotonic()))
+                self._stop.wait(max(0.0, start + self.interval - steady()))
         finally:
             self._close()
 

@@ -32,6 +32,7 @@ from errormotion.campaign.monitor.sources import Source
 from errormotion.campaign.recorder import Recorder
 from errormotion.campaign.store import RawStore
 from errormotion.datasets import provenance
+from errormotion.datasets.clock import steady
 from errormotion.errors import BenchError
 
 TEST = "monitor"
@@ -181,18 +182,18 @@ class Monitor:
         """
         for source in self.sources:
             source.wait(START_TIMEOUT)
-        start, tick, rows = time.monotonic(), 0, 0
+        start, tick, rows = steady(), 0, 0
         while tick * self.interval <= duration:
             due = start + tick * self.interval
-            if (ahead := due - time.monotonic()) > 0:
+            if (ahead := due - steady()) > 0:
                 time.sleep(ahead)
             rows += 1
-            snapshot = self._snapshot(time.monotonic() - start, rows)
+            snapshot = self._snapshot(steady() - start, rows)
             self._recorder.put(self._row(snapshot))
             self._note_instruments()
             yield snapshot
             # Intervals missed by a suspended computer give no rows; the times of the log show them.
-            tick = max(tick + 1, math.ceil((time.monotonic() - start) / self.interval))
+            tick = max(tick + 1, math.ceil((steady() - start) / self.interval))
 
     def _note_instruments(self) -> None:
         """Store the identities of the instruments in the log whenever one has been opened."""
@@ -203,7 +204,7 @@ class Monitor:
             self._noted = answers
 
     def _snapshot(self, at: float, logged: int) -> Snapshot:
-        oldest = time.monotonic() - OLDEST_READING * self.interval
+        oldest = steady() - OLDEST_READING * self.interval
         temperatures = dict.fromkeys(self.sensors, math.nan)
         flags = dict.fromkeys(self.sensors, "no answer")
         state: dict[str, Any] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,19 @@ from errormotion.compare.text import cause_text, probability, verdict
 from errormotion.errors import DatasetError
 
 
+@dataclass(frozen=True)
+class Stated:
+    """What the command line states of the results: names, changes, origins of frames (m), the chain."""
+
+    names: list[str]
+    changes: list[str]
+    origins: dict[str, tuple[float, float, float]]
+    chain: str | None
+
+
 def compare(
     paths: list[Path],
-    names: list[str],
+    stated: Stated,
     at: tuple[float, float, float] | None,
     freedoms: list[str],
     since: float | None,
@@ -37,7 +48,8 @@ def compare(
     for path in (out, report):
         if path is not None and path.exists():
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
-    results, left_out = load(paths, _named(names))
+    results, left_out = load(paths, _named(stated.names))
+    results = _completed(results, stated)
     found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start)
     if left_out:
         found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
@@ -64,6 +76,25 @@ def _named(names: list[str]) -> dict[str, Path]:
         if not (name and equals and path):
             raise DatasetError(f"--name {each}: expected NAME=PATH, as in --name 'five sensors=runs/drift-1'")
         found[name] = Path(path)
+    return found
+
+
+def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.Dataset]:
+    """Return the results with changes between them, and with what the command line states of them."""
+    found = dict(results)
+    for each in stated.changes:
+        name, _, paths = each.partition("=")
+        parts = [part for part in paths.split(",") if part]
+        if not name or len(parts) != 2:
+            raise DatasetError(f"--change {each}: expected NAME=AFTER,BEFORE, as in --change volume=warm.nc,cold.nc")
+        both, _ = load([], {"after": Path(parts[0]), "before": Path(parts[1])})
+        found[name] = both["after"].em.change_from(both["before"])
+    if stray := [name for name in stated.origins if name not in found]:
+        raise DatasetError(f"--origin {stray[0]}: expected the name of a result: {', '.join(found)}")
+    for name, origin in stated.origins.items():
+        found[name] = found[name].assign_attrs(frame_origin=np.array(origin))
+    if stated.chain is not None:
+        found = {name: ds.assign_attrs({"chain": stated.chain} | ds.attrs) for name, ds in found.items()}
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
@@ -24,6 +24,14 @@ if TYPE_CHECKING:
     from errormotion.campaign.batch import Outcome
 
 
+class Trials(NamedTuple):
+    """What ``--monte-carlo`` asks for; ``number`` is None for the adaptive procedure."""
+
+    number: int | None
+    digits: int
+    seed: int
+
+
 def identify(
     raws: list[Path],
     method_id: str | None,
@@ -33,15 +41,18 @@ def identify(
     scheduler: str | None,
     workers: int | None,
     as_json: bool,
+    trials: Trials | None = None,
 ) -> None:
     """Identify one raw dataset into a file, or several into a folder."""
-    several = len(raws) > 1 or scheduler or workers or is_runs_folder(raws[0])
+    several = len(raws) > 1 or is_runs_folder(raws[0]) or (trials is None and (scheduler or workers))
+    if several and trials is not None:
+        raise DatasetError("--monte-carlo: expected one raw dataset; evaluate several results one after another")
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
-        _identify_one(raw_of(raws[0]), method_id, settings, out, as_json)
+        _identify_one(raw_of(raws[0]), method_id, settings, out, as_json, trials, scheduler, workers)
         return
     from errormotion.campaign import batch
 
@@ -91,16 +102,37 @@ def _show_outcomes(outcomes: list[Outcome], out: Path, scheduler: str, as_json: 
         raise typer.Exit(INTERNAL if broken else ERROR)
 
 
-def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: bool) -> None:
-    method = plugins.get("methods", method_id)
-    with Bars(as_json) as bars, reading(raw), datasets.load(raw) as dataset:
-        bars.stage("identifying")
-        errors = method().identify(dataset, settings)
-    datasets.validate(errors)
+def _identify_one(
+    raw: Path,
+    method_id: str,
+    settings: Any,
+    out: Path,
+    as_json: bool,
+    trials: Trials | None,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    method, evaluation, file = plugins.get("methods", method_id), None, out
+    if trials is not None:
+        from errormotion.cli.commands import monte_carlo
+
+        file = monte_carlo.beside(out)
+    with Bars(as_json) as bars:
+        with reading(raw), datasets.load(raw) as dataset:
+            bars.stage("identifying")
+            errors = method().identify(dataset, settings)
+        datasets.validate(errors)
+        if trials is not None:
+            evaluation = monte_carlo.evaluate(
+                raw, method_id, settings, errors, out, bars, trials=trials.number, digits=trials.digits,
+                seed=trials.seed, scheduler=scheduler, workers=workers,
+            )  # fmt: skip
     datasets.save(errors, out)
     results, notes = [as_printed(figure) for figure in figures_of(errors)], notes_of(errors)
     if as_json:
         answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
+        if evaluation is not None:
+            answer |= {"monte_carlo": str(file), "verdicts": monte_carlo.summary(evaluation)}
         show_json({"ok": True, **answer})
         return
     show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
@@ -108,6 +140,8 @@ def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: 
         show(figure_table(results))
     for note in notes:
         show(f"  note: {note}")
+    if evaluation is not None:
+        monte_carlo.show_evaluation(evaluation, file)
 
 
 def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
@@ -146,16 +180,17 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         if stored is not None and folder.errors is not None:
             found = judge(datasets.load(folder.errors), stored)
             folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        path = write_run_report(run, out)
+        with reading(run):
+            path = write_run_report(run, out)
         if out is None:
             folder.data["report"] = path.relative_to(folder.path).as_posix()
             folder.step("report", "done")
             folder.save()
     else:
-        errors = datasets.load(run)
-        found = judge(errors, limits) if limits is not None else None
-        state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-        path = write_report(errors, out or run.with_suffix(".html"), run=state)
+        with reading(run), datasets.load(run) as errors:
+            state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+            path = write_report(errors, out or run.with_suffix(".html"), run=state)
+            found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
     else:
@@ -215,6 +250,7 @@ def _mistakes(message: str, file: Path) -> list[str]:
 
 def _of_run(path: Path) -> list[str]:
     from errormotion.campaign.folder import RunFolder
+    from errormotion.datasets.files import events
 
     try:
         folder = RunFolder.open(path)
@@ -223,6 +259,7 @@ def _of_run(path: Path) -> list[str]:
     found = []
     for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    found += events.read(path)[1]
     if folder.finished and folder.errors is None:
         found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
     return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.cli.summary import as_printed, digits_of
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.record.entry import Entry
-from errormotion.record.listing import Listing, list_runs
+from errormotion.record.listing import Listing, Note, list_runs
 
 
 def runs(paths: list[Path], machine: str | None, method: str | None, since: str | None, as_json: bool) -> None:
@@ -30,6 +32,7 @@ def runs(paths: list[Path], machine: str | None, method: str | None, since: str 
             {
                 "ok": True,
                 "runs": [_plain(path, entry) for path, entry in found.runs],
+                "notes": [plain_note(note) for note in found.notes],
                 "skipped": list(found.skipped),
                 "figures_not_read": found.waiting,
                 "without_time": found.undated,
@@ -39,7 +42,7 @@ def runs(paths: list[Path], machine: str | None, method: str | None, since: str 
     if found.runs:
         head = ["started (UTC)", "machine", "test", "method", "figure", "value", "U (k=2)", "unit", "verdict", "state"]
         show(table([*head, "run"], [_row(path, entry) for path, entry in found.runs]))
-    for line in _remarks(found, machine, method):
+    for line in [*note_lines(found.notes), *_remarks(found, machine, method)]:
         show(line)
 
 
@@ -51,6 +54,22 @@ def _time(text: str | None) -> datetime | None:
     except ValueError:
         typer.echo(f"--since {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", err=True)
         raise typer.Exit(USAGE) from None
+
+
+def plain_note(note: Note) -> dict[str, Any]:
+    """Return a note for a JSON document."""
+    return {**asdict(note), "time": note.time.isoformat() if note.time is not None else None}
+
+
+def note_lines(notes: Sequence[Note]) -> list[str]:
+    """Return a table of notes, the oldest first; nothing where there are none."""
+    if not notes:
+        return []
+    rows = [
+        [f"{each.time:%Y-%m-%d %H:%M}" if each.time else "unknown", each.machine, each.by, each.run, each.text]
+        for each in notes
+    ]
+    return ["", table(["noted for (UTC)", "machine", "by", "run", "note"], rows), ""]
 
 
 def _row(path: Path, entry: Entry) -> list[str]:

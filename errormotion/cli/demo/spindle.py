@@ -14,17 +14,22 @@ from errormotion import datasets
 from errormotion.arrays import Array
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
+from errormotion.campaign.truth import machine_of, truth_of
+from errormotion.cli.commands.compare import as_plain, text
 from errormotion.cli.commands.run import describe, work
 from errormotion.cli.output import show, show_json, table
-from errormotion.instruments.transports import parse_address
+from errormotion.compare import compare as compared
+from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import move
-from errormotion.twin import Event, VirtualMachine
+from errormotion.twin import VirtualMachine
 
 CAMPAIGN = Path(__file__).parent / "campaign.toml"
 
 UM, ARCSEC = (1e6, "um"), (648000 / np.pi, "arcsec")
 AROUND_A_STEP = 10.0
 """Seconds averaged before and after a compensation is switched off."""
+SWITCHED = 0.9
+"""Time after which a compensation is off, s."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +47,14 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     """Run the campaign, and print its results beside the truth, and the path of the report."""
     began = time.monotonic()
     plan = load_campaign(campaign)
-    beams, drift = work(plan, runs=runs, quiet=as_json)
+    beams, drift, balls = folders = work(plan, runs=runs, quiet=as_json)
     numbers = compare(plan, beams, drift)
+    agreement = agree(drift, balls)
     seconds = time.monotonic() - began
     if as_json:
-        tests = [describe(folder) for folder in (beams, drift)]
-        show_json({"ok": True, "seconds": seconds, "tests": tests, "numbers": [number.__dict__ for number in numbers]})
+        tests = [describe(folder) for folder in folders]
+        plain = {"numbers": [number.__dict__ for number in numbers], "comparison": as_plain(agreement)}
+        show_json({"ok": True, "seconds": seconds, "tests": tests, **plain})
         return
     settings = plan.tests[1].settings
     speed = settings.schedule[0].spindle_speed
@@ -63,33 +70,36 @@ def run(runs: Path, as_json: bool, campaign: Path = CAMPAIGN) -> None:
     for number in numbers:
         if number.truth is None:
             show(f"{number.name}: {number.measured:.1f} {number.unit}")
-    for folder in (beams, drift):
+    show("\nDo the five sensors and the probing of four balls agree?")
+    show(text(agreement))
+    for folder in folders:
         show(f"\nreport on {folder.data['test']}: {describe(folder)['report']}")
 
 
 def compare(plan: CampaignPlan, beams: RunFolder, drift: RunFolder) -> list[Number]:
     """Return the results with the truth of the same virtual machine."""
-    machine = virtual_machine(plan)
+    machine, clock = machine_of(drift), float(drift.data["clock"]["time"])
     with datasets.load(drift.errors or drift.path) as errors:
-        numbers = [*_drift_numbers(machine, errors, plan.tests[1].settings.schedule), *_ranges(machine, errors)]
+        settings = plan.tests[1].settings
+        numbers = [*_drift_numbers(machine, errors, clock, settings), *_ranges(machine, errors, clock)]
     with datasets.load(beams.errors or beams.path) as found:
         numbers += _beam_numbers(machine, found)
     return numbers
 
 
-def virtual_machine(plan: CampaignPlan) -> VirtualMachine:
-    """Return the machine that the simulators of the bench measure, under the schedule of the drift test."""
-    place = parse_address(plan.bench.instruments[0].address)
-    machine = VirtualMachine(place.host, seed=int(place.number("seed", 0)))
-    machine.start([Event(e.at, e.spindle_speed, e.compensation) for e in plan.tests[1].settings.schedule])
-    return machine
+def agree(drift: RunFolder, balls: RunFolder) -> xr.Dataset:
+    """Return the comparison of two methods and the truth, in the displacements that all three state."""
+    with datasets.load(drift.errors or drift.path) as bar, datasets.load(balls.errors or balls.path) as probed:
+        found = {str(drift.data["test"]): bar, str(balls.data["test"]): probed, "truth": truth_of(balls)}
+        return compared(found, at=probed.attrs["functional_point"], freedoms=DOF[:3])
 
 
-def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, schedule: Any) -> list[Number]:
+def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, clock: float, settings: Any) -> list[Number]:
     t = np.asarray(errors["time"].values) + float(errors.attrs["reference_time"])
-    truth = _truth(machine, errors, errors.attrs["functional_point"])
-    off = [e for e in schedule if e.compensation]
-    end = int(np.searchsorted(t, off[0].at)) - 1
+    truth = _truth(machine, errors, clock, errors.attrs["functional_point"])
+    off = [e for e in settings.schedule if e.compensation]
+    half = settings.average / 2  # a mean is stated at its middle
+    end = int(np.searchsorted(t, off[0].at - half, side="right")) - 1
     numbers = []
     for k, (name, scale) in enumerate([("EX", UM), ("EY", UM), ("EZ", UM), ("EA", ARCSEC), ("EB", ARCSEC)]):
         weights = np.zeros(t.size)
@@ -98,8 +108,8 @@ def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, schedule: Any) -
         numbers.append(_number(what, errors, truth, weights, k, scale))
     for event in off:
         axis = next(iter(event.compensation))
-        before = (t >= event.at - AROUND_A_STEP) & (t < event.at - 1.0)
-        after = (t >= event.at + 1.0) & (t < event.at + AROUND_A_STEP)
+        before = (t >= event.at - AROUND_A_STEP) & (t <= event.at - half)
+        after = (t >= event.at + SWITCHED + half) & (t < event.at + AROUND_A_STEP)
         weights = after / after.sum() - before / before.sum()
         what = f"E{axis} step, compensation of {axis} switched off"
         numbers.append(_number(what, errors, truth, weights, "XYZ".index(axis), UM))
@@ -121,7 +131,7 @@ def _number(
     )
 
 
-def _ranges(machine: VirtualMachine, errors: xr.Dataset) -> list[Number]:
+def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[Number]:
     """Return the ISO 230-3 ranges of the first hour: displacements at the two levels, Z and the tilts."""
     t = np.asarray(errors["time"].values)
     hour = (t >= 0.0) & (t <= 3600.0)
@@ -137,7 +147,7 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset) -> list[Number]:
         "B": (0.0, 4),
     }
     for name, (height, freedom) in places.items():
-        truth = _truth(machine, errors, (0.0, 0.0, height))[hour, freedom]
+        truth = _truth(machine, errors, clock, (0.0, 0.0, height))[hour, freedom]
         factor, unit = ARCSEC if freedom > 2 else UM
         measured = errors["iso_value"].sel(quantity=name, measure="range_60min").item()
         u = errors["iso_uncertainty"].sel(quantity=name, measure="range_60min").item()
@@ -146,9 +156,9 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset) -> list[Number]:
     return numbers
 
 
-def _truth(machine: VirtualMachine, errors: xr.Dataset, point: Any) -> Array:
+def _truth(machine: VirtualMachine, errors: xr.Dataset, clock: float, point: Any) -> Array:
     """Return the true twists (time, 6) at the times of a result, relative to its reference state."""
-    reference = float(errors.attrs["reference_time"])
+    reference = clock + float(errors.attrs["reference_time"])
     t = np.asarray(errors["time"].values) + reference
     shift = np.asarray(point, dtype=float) - machine.spindle_functional_point
     twists = machine.spindle_twist(t) - machine.spindle_twist(np.array([reference]))

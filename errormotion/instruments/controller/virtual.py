@@ -159,6 +159,19 @@ class VirtualController(Driver):
         """
         self._call("start", schedule=[event_fields(event) for event in schedule])
 
+    def follow(self, schedule: Iterable[Any], time: float) -> None:
+        """Warm up by a schedule from time 0 on, and set the clock to a time, s, also back.
+
+        From then on `spindle` turns the spindle and does not change the heat, and `start` expects a part of this
+        schedule: several measurements meet one machine in the same state at the same time.
+
+        Raises
+        ------
+        InstrumentError
+            A stream is running, alarm, or the machine cannot follow the schedule.
+        """
+        self._call("follow", schedule=[event_fields(event) for event in schedule], time=float(time))
+
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
         self._call("elapse", seconds=float(seconds))

@@ -39,7 +39,9 @@ class CrossbeamScan:
     chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
     figures = lazy("errormotion.methods.crossbeam_scan.report.figures:figures")
     simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
+    truth = lazy("errormotion.methods.crossbeam_scan.simulation:truth_of")
     conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
+    redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
         self,

@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import BenchError
+from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import given
 from errormotion.methods.crossbeam_scan.method import SCHEMA
@@ -60,6 +61,13 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     raw["lever"].attrs["units"] = "m"
     raw["lever_uncertainty"] = ("direction", np.array(settings.lever_uncertainty), {"units": "m"})
     return raw, truth_axis(machine, times, positions)
+
+
+def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:  # noqa: ARG001 - the interface
+    """Return the true errors at the times of the scans of an error dataset; the axis warms up from its time 0 on."""
+    found = truth_axis(machine, errors["time"].values, errors["y"].values)
+    twist = machine.crossbeam.twist(errors["scan_time"].values, errors["y"].values)  # one artefact after the other
+    return found.assign({name: (("time", "position"), twist[..., k], found[name].attrs) for k, name in enumerate(DOF)})
 
 
 def truth_axis(machine: VirtualMachine, times: ArrayLike, positions: ArrayLike) -> xr.Dataset:

@@ -39,7 +39,9 @@ class Multilateration:
     chapters = lazy("errormotion.methods.multilateration.report:chapters")
     figures = lazy("errormotion.methods.multilateration.figures:figures")
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
+    truth = lazy("errormotion.methods.multilateration.simulation:truth_of")
     conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
+    redrawing = lazy("errormotion.methods.multilateration.redrawing:redrawing")
 
     def acquire(
         self,

@@ -92,13 +92,25 @@ def reflector_positions(machine: VirtualMachine, position: ArrayLike, reflector:
     return np.asarray(q + at + twist[:, :3] + np.cross(twist[:, 3:], np.broadcast_to(at, q.shape)))
 
 
-def true_errors(machine: VirtualMachine, position: ArrayLike, reflector: ArrayLike = REFLECTOR) -> xr.Dataset:
+def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
+    """Return the true errors at the targets of an error dataset, in the thermal state at ``clock`` (s)."""
+    position = np.stack([errors[axis].values for axis in "xyz"], axis=-1)
+    return true_errors(machine, position, errors.attrs["functional_point"], clock)
+
+
+def true_errors(
+    machine: VirtualMachine, position: ArrayLike, reflector: ArrayLike = REFLECTOR, time: float | None = None
+) -> xr.Dataset:
     """Return the errors of the reflector at axis positions (n, 3), m, less the rigid motion that fits them best.
 
-    Distances do not determine that motion: it depends on the choice of the workpiece's frame.
+    Distances do not determine that motion: it depends on the choice of the workpiece's frame. With a time, s, the
+    thermal errors at it are included.
     """
     q, at = np.atleast_2d(np.asarray(position, dtype=float)), np.asarray(reflector, dtype=float)
-    twist = move(machine.geometry.twist(q), at)
+    twist = machine.geometry.twist(q)
+    if time is not None:
+        twist = twist + machine.thermal_twist(q, time)
+    twist = move(twist, at)
     place = q + at
     lever = place - place.mean(axis=0)
     G = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -cross_matrix(lever)], axis=2)

@@ -41,7 +41,9 @@ class NormalVector:
     chapters = lazy("errormotion.methods.normal_vector.report:chapters")
     figures = lazy("errormotion.datasets.merit:last_values")
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
+    truth = lazy("errormotion.methods.normal_vector.simulation:truth_of")
     conformance = lazy("errormotion.methods.normal_vector.conformance:subjects")
+    redrawing = lazy("errormotion.methods.normal_vector.redrawing:redrawing")
 
     def acquire(
         self,

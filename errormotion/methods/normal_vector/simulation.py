@@ -80,6 +80,12 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     return data, truth
 
 
+def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
+    """Return the true errors at the times of an error dataset, whose time 0 was at ``clock`` (s) of the machine."""
+    truth = machine.truth_probing(errors["time"].values + clock, errors.attrs["functional_point"])
+    return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
+
+
 def raw(
     machine: VirtualMachine,
     times: ArrayLike,

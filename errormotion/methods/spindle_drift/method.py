@@ -38,7 +38,9 @@ class SpindleDrift:
     log_readers = lazy("errormotion.methods.spindle_drift.log_import.importer:LOG_READERS")
     figures = lazy("errormotion.methods.spindle_drift.figures:figures")
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
+    truth = lazy("errormotion.methods.spindle_drift.simulation:truth_of")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
+    redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
         self,

@@ -47,6 +47,12 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     return _simulated_beams(seed) if settings.procedure == "beam_detection" else _simulated_drift(settings, seed)
 
 
+def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:
+    """Return the true errors of the spindle at the times of a drift, whose time 0 was at ``clock`` (s)."""
+    truth = machine.truth_spindle(errors["time"].values + clock, errors.attrs["functional_point"])
+    return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
+
+
 def _simulated_drift(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     machine = _machine(seed, tuple((e.at, e.spindle_speed) for e in settings.schedule) or ((0.0, SPEED),))
     t = settings.duration / INSTANTS * np.arange(INSTANTS)

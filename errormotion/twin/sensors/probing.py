@@ -143,6 +143,23 @@ class ProbeMeasurements:
         where = "time", coords, "tool", point, "cold state at time 0", self._origin()
         return truth.dataset(np.hstack([displacement, turn]), *where)
 
+    def thermal_twist(self, p: ArrayLike, t: ArrayLike) -> Array:
+        """Return the thermal error of the tool at commanded positions p and times t, m and rad, shape (n, 6).
+
+        The displacement is that of the end of the bar, the rotation that of the spindle: relative to the cold state.
+
+        Parameters
+        ----------
+        p : (n, 3) or (3,)
+            m.
+        t : (n,) or scalar
+            s.
+        """
+        twist, turn = self.state.twist_and_turn(np.atleast_1d(np.asarray(t, dtype=float)))
+        lever = self._carried(np.atleast_2d(np.asarray(p, dtype=float)))
+        displacement = twist[:, :3] + np.cross(turn, lever)
+        return np.hstack([displacement, np.broadcast_to(twist[:, 3:], displacement.shape)])
+
     def _carried(self, place: Array) -> Array:
         """Return M (p - f): the lever that rotates with the frame of the axes, m."""
         carried = np.array([axis in self.tool_axes for axis in "XYZ"], dtype=float)

@@ -1,5 +1,6 @@
 """Measuring, with instruments that do what real ones do: go on late, fall silent, start when the operator is ready."""
 
+import json
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift import Event, Settings, SpindleDrift
 from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_SAMPLES, MAX_FAILED_POLLS
@@ -124,6 +126,25 @@ def test_the_gap_of_an_interruption_is_nan_in_chunks_and_time_goes_on():
     gap = np.isnan(raw["distance"].values[0])
     assert gap.argmin() == pytest.approx(599_000, abs=5000)  # a few seconds for the test itself
     np.testing.assert_array_equal(np.isnan(raw["temperature"].sel(sensor="frame").values), gap)
+
+
+@pytest.mark.parametrize(("change", "restarted"), [(-3600.0, False), (86400.0, False), (-3600.0, True)])
+def test_a_clock_that_was_set_neither_hides_a_gap_nor_makes_one(change, restarted):
+    done = interrupted(600.0 + change)  # as the wall clock has it now: it was set by `change` since the last data
+    started = datetime.fromisoformat(done.attrs["start"]).timestamp()
+    now = clock.read()
+    stored = {
+        "wall": started + 1.0,
+        "steady": now.steady - 599.0,
+        "boot": "another" if restarted else now.boot,
+        "began": started,
+        "elapsed": 1.0,
+    }
+    done.attrs[clock.CLOCK] = json.dumps(stored)
+    bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
+    _, raw = record(bench, Settings(duration=900.0), done)
+    gap = int(np.isnan(raw["distance"].values[0]).sum())
+    assert gap == (1 if restarted else pytest.approx(599_000, abs=5000))  # one row where the duration is unknown
 
 
 def test_a_record_without_its_start_is_not_continued():

@@ -68,6 +68,8 @@ class SimulatedController(SimulatedDevice):
                 world.mount(**arguments)
             case "start":
                 world.start([Event(**event) for event in arguments["schedule"]])
+            case "follow":
+                world.follow([Event(**event) for event in arguments["schedule"]], float(arguments["time"]))
             case "elapse":
                 world.elapse(**arguments)
             case "run_steps":

@@ -250,6 +250,10 @@ class Motion(SampleClock):
         """Return the spindle speed that is commanded at a time, 1/min."""
         raise NotImplementedError
 
+    def turn(self, speed: float, time: float) -> Event | None:
+        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, None without one."""
+        raise NotImplementedError
+
     # ------------------------------------------------------------------ position
 
     def _go(self, start: Array, goal: Array, begin: float, feed: float) -> float:
@@ -336,9 +340,8 @@ class ProgramActions:
 
     def spindle(self, speed: float, time: float) -> None:
         """Turn the spindle."""
-        event = Event(self._begin + time, spindle_speed=speed)
-        self._world.machine.command(event)
-        self.events.append(event)
+        event = self._world.turn(speed, self._begin + time)
+        self.events += [event] if event is not None else []
         if speed and self._world.tool == "probe":
             self._world.tool = "bar"
 

@@ -59,7 +59,7 @@ class TrackerScene:
     world : VirtualWorld
     address : Address
         ``station`` (m, m, m), ``heading`` (rad), ``lever`` (m, m, m: from the tool to the reflector), ``thermal`` (1:
-        the spindle's thermal drift moves it as well), ``repeatability`` (m, one sigma per direction, again at each
+        the machine's thermal errors move it as well), ``repeatability`` (m, one sigma per direction, again at each
         commanded position), ``air_temperature`` (degC, else the machine's surroundings), ``air_pressure`` (Pa),
         ``air_humidity`` (%).
     rng : Generator
@@ -99,7 +99,7 @@ class TrackerScene:
         commanded = np.atleast_2d(self.world.path.place(times) if self.world.motion is None else self.world.position())
         twist = machine.geometry.twist(commanded)
         if self._thermal:
-            twist = twist + machine.spindle_twist(times)
+            twist = twist + machine.thermal_twist(commanded, times)
         moved = commanded + self.lever + twist[:, :3] + np.cross(twist[:, 3:], self.lever)
         return np.broadcast_to(moved + self._arrived(commanded[-1]), (len(times), 3))
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.virtual_world.described import described
@@ -17,6 +19,12 @@ from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 
 __all__ = ["LEAD_IN", "VirtualWorld", "reset", "world"]
+
+
+SAME_INSTANT = 1e-3
+"""Difference of the times of one event in two schedules, s."""
+ORIGIN = (0.0, 0.0, 0.0)
+"""Position of the axes when the clock is set, m."""
 
 
 class VirtualWorld(Motion):
@@ -48,6 +56,8 @@ class VirtualWorld(Motion):
         super().__init__()
         self.stand = TargetStand(self.machine)
         self._readings = 0  # by command
+        self._ordered: float | None = None  # spindle speed ordered while the heat follows a schedule
+        self._follows: tuple[Event, ...] | None = None
         self._devices: set[Device] = set()
 
     def _compile(self) -> None:
@@ -91,15 +101,53 @@ class VirtualWorld(Motion):
     # ------------------------------------------------------------------ heat and time
 
     def start(self, schedule: Sequence[Event]) -> None:
-        """Start again at time 0, cold, with a schedule."""
+        """Start again at time 0, cold, with a schedule.
+
+        A world that follows a schedule (`follow`) goes on at its time; this one has to be a part of the other.
+        """
         with self._change:
             self._refuse_while_streaming("start a schedule")
             self._refuse_in_alarm()
+            if self._follows is not None:
+                self._refuse_others(schedule)
+                return
             self.machine.start(schedule)
-            resting = Path.resting(self.path.place(self.time))
-            self._set_clock(0.0)
-            self.motion, self.path, self.program, self._warm_up = None, resting, "", None
-            self.port_output, self._program_events = [], []
+            self._restart(0.0, self.path.place(self.time))
+
+    def follow(self, schedule: Sequence[Event], time: float) -> None:
+        """Warm up by a schedule from time 0 on, whatever the devices order, and set the clock, also back.
+
+        The axes are then at zero.
+
+        Several measurements thus meet one machine in the same state at the same time. An order to the spindle turns it,
+        and does not change the heat.
+        """
+        if not 0 <= time < np.inf:
+            raise InstrumentError(f"Expected a time of at least 0 s; found {time} s")
+        with self._change:
+            self._refuse_while_streaming("set the clock")
+            self._refuse_in_alarm()
+            self.machine.start(schedule)
+            self._follows, self._ordered = self.machine.state.schedule.events, None
+            self._restart(float(time), ORIGIN)
+
+    def _refuse_others(self, schedule: Sequence[Event]) -> None:
+        now = self.time
+        for event in schedule:
+            at = now + event.time
+            known = [each for each in self._follows or () if abs(each.time - at) < SAME_INSTANT]
+            if not any(replace(each, time=0.0) == replace(event, time=0.0) for each in known):
+                found = "; ".join(map(str, known)) or "nothing"
+                raise InstrumentError(
+                    f"The schedule of the machine states what happens: expected {event} at {at:g} s in it; found "
+                    f"{found}. State the same events in both"
+                )
+
+    def _restart(self, time: float, place: ArrayLike) -> None:
+        """Set the clock, with the axes at rest and nothing in progress."""
+        self._set_clock(time)
+        self.motion, self.path, self.program, self._warm_up = None, Path.resting(place), "", None
+        self.port_output, self._program_events = [], []
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
@@ -114,9 +162,20 @@ class VirtualWorld(Motion):
         with self._change:
             if speed:
                 self._refuse_in_alarm()
-            self.machine.command(Event(self._next_instant(), spindle_speed=float(speed)))
+            self.turn(float(speed), self._next_instant())
             if speed and self.tool == "probe":
                 self.tool = "bar"
+
+    def turn(self, speed: float, time: float) -> Event | None:
+        """Turn the spindle at a speed from a time on; return the event in the machine's schedule, None without one."""
+        if self._follows is not None:
+            if not 0 <= speed <= self.machine.top_speed:
+                raise InstrumentError(f"The spindle turns at up to {self.machine.top_speed:g} /min; found {speed:g}")
+            self._ordered = speed
+            return None
+        event = Event(time, spindle_speed=speed)
+        self.machine.command(event)
+        return event
 
     def press_estop(self) -> None:
         """Press the emergency stop: axes and spindle stop, and what was scheduled for the spindle is off."""
@@ -134,6 +193,8 @@ class VirtualWorld(Motion):
 
     def commanded_speed(self, time: float) -> float:
         """Return the spindle speed that is commanded at a time, 1/min."""
+        if self._ordered is not None:
+            return self._ordered
         speeds = [event.spindle_speed for event in self._events(time) if event.spindle_speed is not None]
         return float(speeds[-1]) if speeds else 0.0
 
@@ -147,7 +208,7 @@ class VirtualWorld(Motion):
             compensation = {"X": True, "Y": True, "Z": True}
             for event in self._events(now):
                 compensation.update(event.compensation or {})
-            speed = float(self.machine.spindle_speed(now)[0])
+            speed = float(self.machine.spindle_speed(now)[0]) if self._ordered is None else self._ordered
             position = self.position()
             return {
                 "time": now,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,11 +14,13 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import InclinationCalibration, tilt_text
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors, error_jacobian, inclination_rotation
 from errormotion.methods.beam_direction.identification.check_bar.result import bar_extras
 from errormotion.methods.beam_direction.identification.compensation import (
+    SCALE,
     Converged,
     Planes,
     Sensor,
@@ -50,6 +53,92 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         Data that do not determine the beam; the message names the plane.
     """
     notes: list[str] = []
+    beam = determine(raw, settings, notes)
+    data, fits, factor, sensor = beam.data, beam.fits, beam.factor, beam.sensor
+    converged, plain, origin, found = beam.converged, beam.plain, beam.origin, beam.found
+    found_covariance = found.covariance * beam.closure_factor**2
+    influence = found.influence
+    total = found_covariance + influence.T @ influence
+    p0, u0 = data.nominal_origin, data.nominal_direction
+    p = origin.origin if origin is not None else np.full(3, np.nan)
+    u = converged.direction.direction
+    errors, covariance = beam_errors(p0[None], u0[None], p[None], u[None], total[None])
+    chart = error_jacobian(u0[None], u[None])[0]
+    by_source = np.nan_to_num(influence) @ chart.T
+    steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
+    steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
+    extras = _extras(data, fits, converged, plain, found, total, beam.corrected, factor, p, settings.beam)
+    if "bar_distance" in raw:
+        if not np.isfinite(p).all():
+            notes.append(
+                "Check bar: its centre is relative to the nominal zero point, because the actual one is unknown."
+            )
+        position = p if np.isfinite(p).all() else np.nan_to_num(p0)
+        calibration = sensor.calibration if sensor is not None else None
+        extras |= bar_extras(raw, position, u, np.nan_to_num(total), calibration, data.moves, settings, notes)
+    for note in notes:
+        log.warning(note)
+    ds = build_errors(
+        errors,
+        covariance,
+        dims=("beam",),
+        coords={"beam": [settings.beam], "direction": ("direction", list("xyz"))},
+        component="beam",
+        machine=str(raw.attrs.get("machine", "unknown")),
+        frame=str(raw.attrs.get("frame", "machine")),
+        functional_point=np.where(np.isfinite(p0), p0, 0.0),
+        reference="nominal beam; its errors are stated at its nominal zero point (nominal_origin)",
+        method=method,
+        method_version=version,
+        measured=raw.attrs,
+        start=start_of(raw),
+        source_ids=identities(converged, sensor)
+        | certified(raw.attrs, {SCALE: ("sensor", "gain")} if SCALE in converged.sources else {}),
+        provenance=provenance.make(settings, raw, None, steps=steps)
+        | ({"calibration": sensor.calibration.reference()} if sensor is not None else {}),
+        influence=by_source[:, None, :] if converged.sources else None,
+        sources=converged.sources or None,
+        source_groups=converged.groups or None,
+        extras=extras,
+    )
+    return ds.assign_attrs(notes=notes or [""])
+
+
+@dataclass(frozen=True)
+class Determined:
+    """A beam from readings on planes, and what it was determined from.
+
+    Attributes
+    ----------
+    data, fits : Readings, list of PlaneFit
+    factor : float
+        Of the stated noise.
+    sensor : Sensor or None
+        None without compensation.
+    converged, plain : Converged
+        With and without compensation.
+    corrected : ndarray (plane, reading)
+        Compensated readings, m.
+    origin : Origin or None
+    found : Propagated
+    closure_factor : float
+        Of the uncertainties, where planes contradict one another.
+    """
+
+    data: Readings
+    fits: list[PlaneFit]
+    factor: float
+    sensor: Sensor | None
+    converged: Converged
+    plain: Converged
+    corrected: Array
+    origin: Origin | None
+    found: Propagated
+    closure_factor: float
+
+
+def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determined:
+    """Return the beam; ``notes`` are extended. See `identify_beam` for the errors raised."""
     data = read(raw, settings, notes)
     fits = [
         fit_plane_readings(d, s, data.noise, data.speckle, data.speckle_length, settings.robust, name)
@@ -75,53 +164,10 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     origin = locate(converged.direction, converged.planes.offsets, converged.planes.covariances, data.points,
                     data.point_uncertainty)  # fmt: skip
     found = propagate(converged, origin, data.point_uncertainty)
-    found_covariance = found.covariance * _closure_factor(data, converged, found, notes) ** 2
+    closure_factor = _closure_factor(data, converged, found, notes)
     _note_roots(converged, data, notes)
     _note_origin(data, origin, notes)
-
-    influence = found.influence
-    total = found_covariance + influence.T @ influence
-    p0, u0 = data.nominal_origin, data.nominal_direction
-    p = origin.origin if origin is not None else np.full(3, np.nan)
-    u = converged.direction.direction
-    errors, covariance = beam_errors(p0[None], u0[None], p[None], u[None], total[None])
-    chart = error_jacobian(u0[None], u[None])[0]
-    by_source = np.nan_to_num(influence) @ chart.T
-    steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
-    steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
-    extras = _extras(data, fits, converged, plain, found, total, corrected, factor, p, settings.beam)
-    if "bar_distance" in raw:
-        if not np.isfinite(p).all():
-            notes.append(
-                "Check bar: its centre is relative to the nominal zero point, because the actual one is unknown."
-            )
-        position = p if np.isfinite(p).all() else np.nan_to_num(p0)
-        calibration = sensor.calibration if sensor is not None else None
-        extras |= bar_extras(raw, position, u, np.nan_to_num(total), calibration, data.moves, settings, notes)
-    for note in notes:
-        log.warning(note)
-    ds = build_errors(
-        errors,
-        covariance,
-        dims=("beam",),
-        coords={"beam": [settings.beam], "direction": ("direction", list("xyz"))},
-        component="beam",
-        machine=str(raw.attrs.get("machine", "unknown")),
-        frame=str(raw.attrs.get("frame", "machine")),
-        functional_point=np.where(np.isfinite(p0), p0, 0.0),
-        reference="nominal beam; its errors are stated at its nominal zero point (nominal_origin)",
-        method=method,
-        method_version=version,
-        start=start_of(raw),
-        source_ids=identities(converged, sensor),
-        provenance=provenance.make(settings, raw, None, steps=steps)
-        | ({"calibration": sensor.calibration.reference()} if sensor is not None else {}),
-        influence=by_source[:, None, :] if converged.sources else None,
-        sources=converged.sources or None,
-        source_groups=converged.groups or None,
-        extras=extras,
-    )
-    return ds.assign_attrs(notes=notes or [""])
+    return Determined(data, fits, factor, sensor, converged, plain, corrected, origin, found, closure_factor)
 
 
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
@@ -136,7 +182,8 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     """
     if settings.compensation is None:
         return None
-    calibration = InclinationCalibration.find(settings.compensation)
+    given = getattr(settings, "calibration", None)  # drawn anew
+    calibration = InclinationCalibration.find(settings.compensation) if given is None else given
     if "triangulation_normal" not in raw:
         raise MethodError(
             "The inclination compensation needs triangulation_normal(direction) in the raw dataset: the normal of the "

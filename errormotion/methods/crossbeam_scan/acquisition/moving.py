@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Protocol
 
+from errormotion.datasets.clock import steady
 from errormotion.errors import InstrumentError
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class Controlled:
 
     def now(self) -> float:
         """Return the time of the machine."""
-        return float(self._control.state()["time"]) if self.virtual else time.time()
+        return float(self._control.state()["time"]) if self.virtual else steady()
 
     def start(self, program: Program, *, listening: bool = False) -> float:
         """Transfer a program and wait for its first motion; with ``listening`` return immediately."""
@@ -144,8 +145,8 @@ class Operated:
         self._deadline = 0.0
 
     def now(self) -> float:
-        """Return the time of the day."""
-        return time.time()
+        """Return a time that nobody sets, s."""
+        return steady()
 
     def start(self, program: Program, *, listening: bool = False) -> float:
         """Prompt the operator to start a program."""
@@ -162,17 +163,17 @@ class Operated:
                 "program may be longer than this duration: stop it when the time is over."
             )
         self._running = program.name
-        self._deadline = time.time() + OPERATOR_TIMEOUT + program.seconds()
-        return time.time()
+        self._deadline = steady() + OPERATOR_TIMEOUT + program.seconds()
+        return steady()
 
     def wait_until(self, when: float) -> None:
         """Wait until `NOTICE_TIME` before a time, s."""
-        while (left := when - NOTICE_TIME - time.time()) > 0:
+        while (left := when - NOTICE_TIME - steady()) > 0:
             time.sleep(min(left, POLL_INTERVAL))
 
     def may_still_move(self) -> bool:
         """Return whether the time of the operator to start has not expired."""
-        return time.time() < self._deadline
+        return steady() < self._deadline
 
     def finish(self) -> None:
         """Do nothing: the next prompt waits for the end."""

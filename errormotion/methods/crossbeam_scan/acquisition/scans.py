@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -19,6 +20,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.crossbeam_scan.acquisition.listening import BrokenPassError, Lines, listen
 from errormotion.methods.crossbeam_scan.acquisition.moving import Mover, mover
@@ -162,7 +164,7 @@ class _Campaign:
 
     def _resume(self, done: xr.Dataset) -> None:
         """Determine the passes that were made and the start of the warm-up."""
-        cycle, since, clock = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
+        cycle, since, of_line = (np.asarray(done[name].values) for name in ("cycle_of_line", "line_time", "line_clock"))
         self.pending.x = np.asarray(done["x"].values, dtype=float)
         tried = cycle[since != 0]  # time 0 is that of the mark
         self.next = int(tried.max()) + 1 if tried.size else 0
@@ -170,17 +172,18 @@ class _Campaign:
             self.next -= 1  # nothing has warmed up yet: a cold pass can be made again
         if self.move.virtual:
             return
-        start = str(done.attrs.get("start", ""))
         try:
-            self.origin = datetime.fromisoformat(start).timestamp()
+            age = clock.age(done).seconds
         except ValueError as error:
             raise MethodError(
-                f"The interrupted record does not state when it started (attribute start = '{start}'; expected UTC "
-                "such as 2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
+                f"The interrupted record does not state when it started ({error}; expected UTC such as "
+                "2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
             ) from error
+        # After an interruption of unknown duration, the clock goes on from the last line.
+        self.origin = self.move.now() - (float(np.nanmax(of_line)) if math.isnan(age) else age)
         warm = np.flatnonzero(cycle >= self.plan.cold)
         if warm.size:
-            self.zero = self.origin + float(clock[warm[-1]] - since[warm[-1]])
+            self.zero = self.origin + float(of_line[warm[-1]] - since[warm[-1]])
             self._skip_overdue(self.move.now() - self.zero)
 
     def _skip_overdue(self, now: float) -> None:

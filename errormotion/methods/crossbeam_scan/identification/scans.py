@@ -158,6 +158,7 @@ def _dataset(
         reference="cold scans of the artefacts, before the warm-up",
         method=method,
         method_version=version,
+        measured=raw.attrs,
         provenance=origin,
         influence=influence,
         sources=axis.sources,

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets.clock import steady
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.acquisition.scales import Scales
 from errormotion.methods.multilateration.names import station_names, target_names
@@ -199,7 +200,7 @@ class Stand:
 
     def now(self) -> float:
         """Return the time of the control, or of this computer, s."""
-        return float(self.control.state().get("time", time.time()))
+        return float(self.control.state().get("time", steady()))
 
     def measure(self, number: int) -> xr.Dataset:
         """Set the tracker up at a station and return the raw dataset of it."""

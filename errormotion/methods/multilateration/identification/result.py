@@ -13,6 +13,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import uncertainty
@@ -35,6 +36,16 @@ DATUM = (
     "best rigid fit of all targets to their commanded places; six motions of the whole, three shifts and three "
     "rotations, are not seen"
 )
+CERTIFIED = {
+    "air temperature": ("thermometer", "offset"),
+    "air pressure": ("barometer", "offset"),
+    "air humidity": ("hygrometer", "offset"),
+    "wavelength": ("tracker", "wavelength"),
+    "tracker scale": ("tracker", "scale"),
+    "coefficient of expansion": ("scales", "coefficient of expansion"),
+    **{f"scale temperature {axis}": ("scale_thermometer", f"offset at {axis}") for axis in "XYZ"},
+}
+"""Sources that are one draw in all measurements with one certificate."""
 BLOCK = 50_000
 """Targets that are checked at a time."""
 
@@ -71,10 +82,12 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
         reference=DATUM,
         method=method,
         method_version=version,
+        measured={**state.raw.attrs, **({"chain": state.settings.chain} if state.settings.chain else {})},
         start=start_of(state.raw),
         provenance=provenance.make(state.settings, state.raw, None, steps=_steps(state)),
         sources=made.names,
         source_groups=made.groups,
+        source_ids=certified(state.raw.attrs, {name: CERTIFIED[name] for name in made.names if name in CERTIFIED}),
     )
     return ds.assign_attrs(notes=notes or [""])
 

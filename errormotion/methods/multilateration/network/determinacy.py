@@ -268,9 +268,11 @@ def swapped_stations(found: Array, rough: Array | None) -> list[tuple[int, int]]
     """
     if rough is None or not np.isfinite(rough).all():
         return []
+    off = np.linalg.norm(found[:, None] - rough[None], axis=-1)
+    if (off.argmin(axis=1) == np.arange(len(off))).all():
+        return []  # each is nearest to its own: no other order has a smaller sum
     from scipy.optimize import linear_sum_assignment
 
-    off = np.linalg.norm(found[:, None] - rough[None], axis=-1)
     rows, columns = linear_sum_assignment(off)
     if (rows == columns).all() or not off[rows, columns].sum() < 0.5 * np.diag(off).sum():
         return []

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.clock import age as record_age
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.normal_vector.acquisition import cycle
 
@@ -207,16 +207,18 @@ def fault(state: dict[str, Any]) -> str:
 def age(done: xr.Dataset) -> float:
     """Return the time since the start of the cold cycle of an interrupted run, s.
 
+    That of its last touch where the duration of the interruption is unknown.
+
     Raises
     ------
     MethodError
         The run does not state its start.
     """
     try:
-        start = datetime.fromisoformat(str(done.attrs["start"]))
-    except (KeyError, ValueError):
+        seconds = record_age(done).seconds
+    except ValueError:
         raise MethodError("The interrupted run does not state its start (attribute start); start a new run.") from None
-    return (datetime.now(UTC) - start).total_seconds()
+    return float(_ends(done)[-1]) if math.isnan(seconds) else seconds
 
 
 def _ends(done: xr.Dataset) -> Array:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -16,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench, Samples
@@ -108,16 +110,18 @@ def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
 
 
 def _missed(done: xr.Dataset, rate: float) -> int:
-    """Return the number of the present sample, from the start of the record in UTC."""
-    start = str(done.attrs.get("start", ""))
+    """Return the number of the present sample; the second sample to come where the interruption has no known duration.
+
+    Its single row of NaN separates what was recorded before and after.
+    """
     try:
-        started = datetime.fromisoformat(start)
+        seconds = clock.age(done).seconds
     except ValueError as error:
         raise MethodError(
-            f"The interrupted record cannot be continued: attribute start = '{start}'; expected UTC such as "
-            "2025-03-01T08:00:00+00:00. Start a new run."
+            f"The interrupted record cannot be continued: {error}; expected UTC such as 2025-03-01T08:00:00+00:00. "
+            "Start a new run."
         ) from error
-    return round((datetime.now(UTC) - started).total_seconds() * rate)
+    return int(done.sizes["time"]) + 1 if math.isnan(seconds) else round(seconds * rate)
 
 
 def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | None) -> xr.Dataset:

@@ -10,6 +10,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import beam_errors
 from errormotion.methods.spindle_drift.identification.beams import Beam, circles_and_line, likelihood_fit
@@ -111,6 +112,8 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         reference="nominal beams; each beam's errors are stated at its own nominal zero point (nominal_origin)",
         method=method,
         method_version=version,
+        measured=measured.attrs,
+        start=start_of(measured),
         provenance=provenance.make(settings, measured, None, steps=["ray-sphere likelihood fit", "circles and line"]),
         extras=extras,
     )

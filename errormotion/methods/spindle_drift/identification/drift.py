@@ -11,6 +11,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.files.hashing import DatasetHasher
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
@@ -43,6 +44,9 @@ from errormotion.methods.spindle_drift.identification.uncertainty import (
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
+CERTIFIED = {"bar radius": ("bar", "radius"), "frame expansion": ("frame", "coefficient of expansion")}
+"""Sources that are one draw in all measurements with one certificate."""
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -53,6 +57,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+UNSEEN = "rotation about the spindle axis"
+"""Group of the influence of what the method does not see."""
 _UNSEEN_KNOTS = 8
 
 
@@ -125,8 +131,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     if np.linalg.norm(unseen) > 0:
         rows = _unseen(unseen, averages.time, reference)
         influence = np.concatenate([influence, rows])
-        group = "rotation about the spindle axis"
-        names += [(f"{group}, part {k + 1}", group) for k in range(len(rows))]
+        names += [(f"{UNSEEN}, part {k + 1}", UNSEEN) for k in range(len(rows))]
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -144,6 +149,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         ),
         method=method,
         method_version=version,
+        measured=raw.attrs,
         provenance=provenance.make(
             settings,
             measured,
@@ -156,7 +162,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         source_groups=[group for _, group in names],
         extras=_extras(raw, averages, mean, state, bar, time) | results.as_extras(time),
         start=start_of(raw, zero),
-        source_ids={s.name: s.identity for s in sources if s.identity},
+        source_ids={s.name: s.identity for s in sources if s.identity}
+        | certified(raw.attrs, {name: CERTIFIED[name] for name, _ in names if name in CERTIFIED}),
         reference_sources=[s.name for s in sources if s.group == REFERENCE],
         reference_interval=(float(time[reference[0]]), float(time[reference[-1]])),
     )
@@ -240,7 +247,7 @@ def _bar(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Bar:
             f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights at "
             "least 1 mm apart."
         )
-    return Bar(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
+    return Bar(*beams_of(raw, settings, notes), float(raw["bar_radius"]), levels)
 
 
 def _fit(mean: Array, bar: Bar) -> State:
@@ -248,7 +255,7 @@ def _fit(mean: Array, bar: Bar) -> State:
     return State(mean, q, *end_point(q, mean[4], bar.origin[4], bar.direction[4], bar.levels))
 
 
-def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
+def beams_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
     """Return origins, directions (5, 3), covariance (5, 6, 6) and the budget's name for it."""
     nominal = settings.beams == "nominal"
     if nominal and "nominal_origin" not in raw:

@@ -76,6 +76,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         reference="nominal beam; a check bar does not tell its errors",
         method=method,
         method_version=version,
+        measured=raw.attrs,
         start=start_of(raw),
         provenance=provenance.make(settings, raw, None, steps=["check bar"])
         | ({"calibration": calibration.reference()} if calibration is not None else {}),

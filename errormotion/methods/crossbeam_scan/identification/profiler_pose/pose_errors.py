@@ -63,6 +63,7 @@ def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str
         reference="nominal pose of the profiler",
         method=method,
         method_version=version,
+        measured=raw.attrs,
         start=start_of(raw),
         provenance=provenance.make(settings, raw, None, steps=["edges of the pocket", "fit pose"]),
         extras={

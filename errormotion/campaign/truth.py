@@ -1,0 +1,79 @@
+"""The truth behind a run on a virtual machine, as an error dataset that is compared like any other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets, plugins
+from errormotion.campaign.files import parse_bench
+from errormotion.campaign.folder import RunFolder
+from errormotion.datasets.timing import between, later
+from errormotion.errors import DatasetError, RunError
+from errormotion.instruments.simulators.virtual_world.described import NAME
+from errormotion.instruments.transports.address import parse_address
+
+if TYPE_CHECKING:
+    from errormotion.twin import VirtualMachine
+
+EXACTNESS = 1e-10
+"""Standard uncertainty of a truth, m and rad: readings of the virtual machine follow from it to 0.1 nm."""
+
+
+def truth_of(folder: RunFolder) -> xr.Dataset:
+    """Return the true errors where a run states errors, with standard uncertainties of 0.1 nm and 0.1 nrad.
+
+    The run is one of a campaign with a timeline, which states where the clock of the machine was.
+
+    Raises
+    ------
+    RunError
+        No timeline, no virtual machine or several, no errors, or a method that states no truth.
+    """
+    machine, clock = machine_of(folder), folder.data["clock"]
+    if folder.errors is None:
+        raise RunError(f"{folder.path}: has no errors yet; identify its raw data first")
+    method = plugins.get("methods", str(folder.data["method"]["id"]))
+    truth = getattr(method, "truth", None)
+    with datasets.load(folder.errors) as errors:
+        if truth is None or errors.attrs["component"] == "beam":
+            raise RunError(f"{folder.path}: no truth is stated for these errors, of {errors.attrs['component']}")
+        start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
+        found: xr.Dataset = truth(machine, errors, between(clock["start"], start))
+        found = found.assign_attrs({key: errors.attrs[key] for key in ("machine", "frame")}, start=start)
+        found["covariance"] = found["covariance"] + EXACTNESS**2 * np.eye(6)
+    try:
+        datasets.validate(found)
+    except DatasetError as error:
+        raise RunError(f"{folder.path}: the truth is no error dataset: {error}") from error
+    return found
+
+
+def machine_of(folder: RunFolder) -> VirtualMachine:
+    """Return the virtual machine of a run, under the schedule of its timeline; its clock is in ``folder.data``.
+
+    Raises
+    ------
+    RunError
+        No timeline, no virtual machine or several.
+    """
+    from errormotion.twin import Event, VirtualMachine
+
+    clock, bench = folder.data.get("clock"), folder.data["bench"]
+    if not isinstance(clock, dict):
+        raise RunError(
+            f"{folder.path}: expected a run of a campaign with a table [timeline] on a virtual machine, which states "
+            "the time of its clock; found none"
+        )
+    plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
+    addresses = [parse_address(each.address) for each in plan.instruments if each.address]
+    found = {(each.host, int(each.number("seed", 0))) for each in addresses if each.scheme == "sim"}
+    if len(found) != 1:
+        names = ", ".join(f"sim://{host} with seed {seed}" for host, seed in sorted(found)) or "none"
+        raise RunError(f"{folder.path}: expected one virtual machine on the bench; found {names}")
+    ((name, seed),) = found
+    machine = VirtualMachine(plan.description if name == NAME and plan.description else name, seed=seed)
+    machine.start([Event(**event) for event in clock["schedule"]])
+    return machine

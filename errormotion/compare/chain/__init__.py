@@ -1,0 +1,196 @@
+"""The errors of one axis and of the volume on common ground, through the kinematic chain of the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from errormotion.arrays import Array
+from errormotion.compare.chain.curve import Curve, measured, reference_weights
+from errormotion.compare.chain.volume import SAME, predict
+from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import between, later
+from errormotion.errors import DatasetError
+from errormotion.kinematics.chains import parse_chain
+from errormotion.kinematics.iso import LINEAR_AXES, ROTARY_AXES
+
+__all__ = ["axis_of", "in_machine", "on_axis", "predict"]
+
+
+def axis_of(datasets: Mapping[str, xr.Dataset]) -> str:
+    """Return the axis that some of the datasets are of while others are of the volume; empty where there is none."""
+    axes = {str(ds.attrs["component"]) for ds in datasets.values()} - {"tool"}
+    mixed = len(axes) == 1 and any(ds.attrs["component"] == "tool" for ds in datasets.values())
+    axis = axes.pop() if mixed else ""
+    return axis if axis in (*LINEAR_AXES, *ROTARY_AXES) else ""
+
+
+def on_axis(
+    datasets: Mapping[str, xr.Dataset], *, at: ArrayLike | None = None, same_start: bool = False, notes: list[str]
+) -> dict[str, xr.Dataset]:
+    """Return all datasets as errors of one axis, at common positions, relative to the same positions.
+
+    Parameters
+    ----------
+    datasets : mapping of str to Dataset
+        Of one axis (over ``position``, perhaps ``time``) and of the tool (over ``target``).
+    at : array_like, (3,), optional
+        Functional point in machine coordinates with all axes at zero, m. Default: that of the first volume.
+    same_start : bool
+        Compare an axis over time at its last instant where a start is not stated.
+    notes : list of str
+        What was done is added.
+
+    Raises
+    ------
+    DatasetError
+        What is missing: chain, frame, coordinates, the same kind of reference, start in UTC, common positions.
+    """
+    axis = axis_of(datasets)
+    volumes = {name: ds for name, ds in datasets.items() if ds.attrs["component"] == "tool"}
+    first_name, first = next(iter(volumes.items()))
+    for name, ds in volumes.items():
+        _check_volume(name, ds, axis)
+    point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
+    axes = {}
+    for name, ds in datasets.items():
+        if name in volumes:
+            continue
+        _check_reference(name, ds, first_name, first)
+        axes[name] = _at_instant(name, ds, first_name, first, same_start, notes).em.at(point)
+    letter = axis.lower()
+    positions = _common_positions(axes, volumes, letter)
+    found: dict[str, Curve] = {}
+    for name in datasets:
+        if name in axes:
+            found[name] = measured(axes[name], letter, positions)
+        else:
+            found[name] = predict(volumes[name], axis, positions, point, notes=notes, name=name)
+    weights = reference_weights([each.value for each in found.values()], positions, axis)
+    notes.append(
+        f"Errors of {axis} from the volume ({', '.join(volumes)}) by the chain {first.attrs['chain']}, at "
+        f"{positions.size} positions. Positioning and rotations count from the first one, straightness from the line "
+        "through the first and the last one: squareness, datum and constant parts are not compared."
+    )
+    return {
+        name: _dataset(datasets[name], curve.relative(weights), axis, positions, point, first)
+        for name, curve in found.items()
+    }
+
+
+def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:
+    dims = ", ".join(map(str, ds["EX"].dims)) or "nothing"
+    if ds["EX"].dims != ("target",):
+        raise DatasetError(
+            f"'{name}': the errors of {axis} follow from errors of the tool at targets in the volume; "
+            f"these depend on {dims}"
+        )
+    if "chain" not in ds.attrs:
+        raise DatasetError(
+            f"'{name}': no attribute 'chain' (such as workpiece-X-Y-bed-Z-spindle-tool), so that the errors of {axis} "
+            "cannot be derived from those of the volume. State it (--chain)"
+        )
+    axes = parse_chain(str(ds.attrs["chain"]))
+    if axis not in axes:
+        raise DatasetError(f"'{name}': its chain {ds.attrs['chain']} has no axis {axis}")
+    missing = [each for each in axes if each not in "XYZ" or each.lower() not in ds.variables]
+    if missing:
+        raise DatasetError(f"'{name}': its targets state no commanded position of {', '.join(missing)}")
+
+
+def in_machine(ds: xr.Dataset) -> xr.Dataset:
+    """Return the dataset in machine coordinates where it states the origin of its own frame in them."""
+    if "frame_origin" not in ds.attrs:
+        return ds
+    origin = np.asarray(ds.attrs["frame_origin"], dtype=float)
+    moved = ds.assign_attrs(frame="machine", functional_point=np.asarray(ds.attrs["functional_point"]) + origin)
+    del moved.attrs["frame_origin"]
+    return moved
+
+
+def _check_reference(name: str, ds: xr.Dataset, volume_name: str, volume: xr.Dataset) -> None:
+    changes = ["reference_interval" in each.attrs for each in (ds, volume)]
+    if changes[0] == changes[1]:
+        return
+    one, other = ((name, ds), (volume_name, volume)) if changes[0] else ((volume_name, volume), (name, ds))
+    raise DatasetError(
+        f"'{one[0]}' states changes since a reference state ({one[1].attrs['reference']}), '{other[0]}' errors against "
+        f"the commanded positions ({other[1].attrs['reference']}): measure '{other[0]}' in the reference state too and "
+        "subtract it (ds.em.change_from(before), --change NAME=AFTER,BEFORE)"
+    )
+
+
+def _at_instant(
+    name: str, ds: xr.Dataset, volume_name: str, volume: xr.Dataset, same_start: bool, notes: list[str]
+) -> xr.Dataset:
+    """Return an axis over time at the instant of the volume."""
+    if ds["EX"].dims not in (("time", "position"), ("position", "time"), ("position",)):
+        found = ", ".join(map(str, ds["EX"].dims)) or "nothing"
+        raise DatasetError(f"'{name}': expected errors over position, and perhaps time; they depend on {found}")
+    if "time" not in ds["EX"].dims:
+        return ds
+    t = np.asarray(ds["time"].values, dtype=float)
+    silent = [n for n, each in ((name, ds), (volume_name, volume)) if not each.attrs.get("start")]
+    if silent and not same_start:
+        raise DatasetError(
+            f"{', '.join(map(repr, silent))}: no attribute 'start' (UTC of time 0), so that the instant of '{name}' "
+            f"that belongs to '{volume_name}' is unknown. State it, or take the last instant (same_start, --same-start)"
+        )
+    wanted = t[-1] if silent else between(str(ds.attrs["start"]), str(volume.attrs["start"]))
+    k = int(np.abs(t - wanted).argmin())
+    step = np.abs(np.diff(t)).max(initial=0.0)
+    if not t[0] - step <= wanted <= t[-1] + step:
+        raise DatasetError(
+            f"'{volume_name}' starts {wanted:.0f} s after the start of '{name}', which holds {t[0]:.0f} s to "
+            f"{t[-1]:.0f} s: they do not overlap in time"
+        )
+    notes.append(f"'{name}' at {t[k]:.0f} s, {abs(t[k] - wanted):.0f} s from the start of '{volume_name}'.")
+    one = ds.isel(time=k).drop_vars(["time", "time_index"], errors="ignore")
+    return one.assign_attrs(start=later(str(ds.attrs["start"]), t[k])) if ds.attrs.get("start") else one
+
+
+def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.Dataset], letter: str) -> Array:
+    """Return the positions of the axis that all datasets of it have, and that lie within all volumes."""
+    for name, ds in axes.items():
+        if letter not in ds.variables or ds[letter].dims != ("position",):
+            raise DatasetError(f"'{name}': no coordinate {letter} along position, where its errors are")
+    found = np.sort(np.asarray(next(iter(axes.values()))[letter].values, dtype=float))
+    for ds in axes.values():
+        found = np.array([q for q in found if (np.abs(ds[letter].values - q) <= SAME).any()])
+    for ds in volumes.values():
+        inside = np.asarray(ds[letter].values, dtype=float)[np.isfinite(ds["EX"].values)]
+        if inside.size:
+            found = found[(found >= inside.min() - SAME) & (found <= inside.max() + SAME)]
+    if found.size < 2:
+        raise DatasetError(
+            f"{', '.join(map(repr, axes))}: {found.size} positions of {letter} in common within the volume; expected "
+            "at least two, since nothing is extrapolated"
+        )
+    return found
+
+
+def _dataset(ds: xr.Dataset, curve: Curve, axis: str, positions: Array, point: Array, volume: xr.Dataset) -> xr.Dataset:
+    F = np.nan_to_num(curve.influence)
+    return build_errors(
+        curve.value,
+        curve.own + np.einsum("sni,snj->nij", F, F),
+        dims=("position",),
+        coords={axis.lower(): ("position", positions)},
+        component=axis,
+        machine=str(ds.attrs["machine"]),
+        frame=str(volume.attrs["frame"]),
+        functional_point=point,
+        reference="the first position; for straightness the line through the first and the last one",
+        method=str(ds.attrs["method"]),
+        method_version=str(ds.attrs["method_version"]),
+        provenance=provenance.of(ds),
+        influence=curve.influence if len(F) else None,
+        sources=curve.source,
+        source_groups=curve.group,
+        source_ids={name: key for name, key in zip(curve.source, curve.identity, strict=True) if key},
+        start=str(ds.attrs.get("start", "")),
+        measured=volume.attrs,
+    )

@@ -1,0 +1,225 @@
+"""Time across interruptions: how long a record has run, on clocks that nobody sets.
+
+The wall clock of a computer may be set, by a person or by a time server, while a record runs and while it is
+interrupted. The time since the computer started (suspension included) is not set by anybody, but ends with a restart.
+Every commit of a raw store keeps both, with the identity of the start of the computer (attribute ``clock``). A
+continuation compares them: the duration of the interruption is known where they agree or where the computer was not
+restarted, and unknown where they contradict each other. Every interruption is an entry of the attribute ``joins``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+CLOCK, JOINS = "clock", "joins"
+"""Attributes of raw data (JSON): the clocks at the last commit, and the interruptions of the record."""
+
+TOLERANCE = 2.0
+"""Difference of two clocks that is no contradiction, s."""
+DRIFT = 1e-3
+"""The same for each second between two readings."""
+LONGEST = 30 * 86400.0
+"""Longest interruption that is believed from the wall clock alone, s."""
+
+
+def steady() -> float:
+    """Return a time that is never set, s: it runs through a suspension of the computer, and is never negative."""
+    if hasattr(time, "CLOCK_BOOTTIME"):  # Linux
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
+
+
+@cache
+def _boot() -> str:
+    """Return the identity of the start of the computer; empty where the system does not state it."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Clocks at one instant of a record.
+
+    Attributes
+    ----------
+    wall : float
+        Wall clock, s since 1970-01-01 UTC.
+    steady : float
+        Time since the start of the computer, s.
+    boot : str
+        Identity of that start; empty if unknown.
+    began : float
+        Wall clock at the start of the record, s.
+    elapsed : float
+        Duration of the record, interruptions of known duration included, s.
+    """
+
+    wall: float
+    steady: float
+    boot: str
+    began: float
+    elapsed: float
+
+
+def read(began: float = math.nan, elapsed: float = 0.0) -> Reading:
+    """Return the present reading; by default that of a record that begins now."""
+    wall = time.time()
+    return Reading(wall, steady(), _boot(), wall if math.isnan(began) else began, elapsed)
+
+
+def interval(first: Reading, last: Reading) -> tuple[float, str]:
+    """Return the time between two readings, s, and what is wrong with the clocks, if anything.
+
+    NaN where the clocks contradict each other and the computer was restarted between the readings.
+    """
+    wall, run = last.wall - first.wall, last.steady - first.steady
+    if first.boot and first.boot == last.boot and run >= 0:
+        if abs(wall - run) <= TOLERANCE + DRIFT * run:
+            return run, ""
+        return (
+            run,
+            f"the wall clock was changed by {wall - run:+.3g} s; the duration is that of the computer's own clock",
+        )
+    since_start = last.steady if last.boot and first.boot else 0.0
+    if wall < since_start - TOLERANCE:
+        return math.nan, (
+            f"the wall clock states {wall:.3g} s since the last data, and the computer has run for {since_start:.3g} s "
+            "since then: it was set back, and the duration is unknown"
+        )
+    if wall > LONGEST:
+        return math.nan, (
+            f"the wall clock states {wall / 86400:.3g} days since the last data; beyond {LONGEST / 86400:.0f} days it "
+            "is taken as wrong, and the duration is unknown"
+        )
+    return max(wall, 0.0), ""
+
+
+@dataclass(frozen=True)
+class Join:
+    """An interruption of a record.
+
+    Attributes
+    ----------
+    index : int
+        Number of the first sample after it.
+    seconds : float or None
+        Duration; None if unknown.
+    reason : str
+        What is wrong with the clocks; empty if nothing is.
+    time : float or None
+        Time of the last sample before it on the time axis of the record, s, where it has one.
+    """
+
+    index: int
+    seconds: float | None
+    reason: str
+    time: float | None = None
+
+
+class RecordClock:
+    """The clock of a record that is being written.
+
+    Parameters
+    ----------
+    attrs : mapping
+        Attributes of the store so far; empty for a new record.
+    index : int
+        Number of the next sample.
+    at : float, optional
+        Time of the last sample on the time axis of the record, s.
+    """
+
+    def __init__(self, attrs: Mapping[Any, Any], index: int = 0, at: float | None = None) -> None:
+        self._joins = joins(attrs)
+        self._first, before = read(), _stored(attrs)
+        if before is not None:
+            seconds, reason = interval(before, self._first)
+            known = None if math.isnan(seconds) else round(seconds, 3)
+            self._first = read(before.began, before.elapsed + (known or 0.0))
+            self._joins.append(Join(index, known, reason, at))
+
+    def attributes(self) -> dict[str, str]:
+        """Return the attributes of the store at this instant."""
+        now, first = steady(), self._first
+        state = asdict(read(first.began, first.elapsed + max(now - first.steady, 0.0)))
+        found = {CLOCK: json.dumps(state)}
+        return found | ({JOINS: json.dumps([asdict(join) for join in self._joins])} if self._joins else {})
+
+
+@dataclass(frozen=True)
+class Age:
+    """Time since the start of an interrupted record.
+
+    Attributes
+    ----------
+    seconds : float
+        Now, s; NaN where the duration of the interruption is unknown.
+    stored : float
+        At the last commit, s; NaN in data of versions that did not store their clocks.
+    """
+
+    seconds: float
+    stored: float
+
+
+def age(done: xr.Dataset) -> Age:
+    """Return the time since the attribute ``start`` of an interrupted record.
+
+    Raises
+    ------
+    ValueError
+        The record does not state its start.
+    """
+    try:
+        start = datetime.fromisoformat(str(done.attrs.get("start", ""))).astimezone(UTC).timestamp()
+    except (ValueError, OverflowError):
+        raise ValueError(f"attribute start = '{done.attrs.get('start', '')}'") from None
+    before, now = _stored(done.attrs), read()
+    if before is None:  # written by a version that did not store its clocks
+        seconds = now.wall - start
+        return Age(seconds if 0 <= seconds <= LONGEST else math.nan, math.nan)
+    stored = before.began + before.elapsed - start
+    return Age(stored + interval(before, now)[0], stored)
+
+
+def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
+    """Return the reading at the last commit; None where there is none, or a damaged one."""
+    try:
+        found = json.loads(attrs[CLOCK])
+        wall, since, began, elapsed = (float(found[name]) for name in ("wall", "steady", "began", "elapsed"))
+        boot = str(found["boot"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    if not all(map(math.isfinite, (wall, since, began, elapsed))):
+        return None
+    return Reading(wall, since, boot, began, elapsed)
+
+
+def joins(attrs: Mapping[Any, Any]) -> list[Join]:
+    """Return the interruptions that raw data state; none where the attribute is damaged."""
+    try:
+        return [Join(**each) for each in json.loads(attrs.get(JOINS, "[]"))]
+    except (TypeError, ValueError):
+        return []
+
+
+def notes(attrs: Mapping[Any, Any]) -> list[str]:
+    """Return a sentence for each interruption of unknown duration."""
+    return [
+        f"The record was interrupted{f' at {join.time:.6g} s' if join.time is not None else ''}, before sample "
+        f"{join.index}, for an unknown time: {join.reason}. Times after it do not count from the start of the record."
+        for join in joins(attrs)
+        if join.seconds is None
+    ]
