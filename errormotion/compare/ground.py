@@ -303,7 +303,9 @@ def _in_time(
     placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
     for name, each in placed.items():
         if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
-            raise DatasetError(f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state")
+            raise DatasetError(
+                f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state"
+            )
     return {name: each.since_first() for name, each in placed.items()}, grid
 
 
