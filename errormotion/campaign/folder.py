@@ -119,12 +119,9 @@ class RunFolder:
         name = self.data.get("errors")
         if name is None or name == "":
             return None
-        inside = (
-            isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts
-        )
-        if not inside:
-            raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
-        return self.path / name
+        if isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts:
+            return self.path / name
+        raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
 
     @property
     def finished(self) -> bool:
