@@ -166,7 +166,9 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         square += float(np.einsum("ti,tij,tj->", data, W, data))
     N[columns:, columns:] += np.eye(s)
     M, right = N[columns:, columns:], N[:columns, columns:]
-    gain: Array = np.linalg.solve(M, right.T).T if s else np.zeros((columns, 0))
+    gain: Array = np.zeros((columns, 0))
+    if s:
+        gain = np.asarray(np.linalg.solve(M, right.T).T)
     square -= float(b[columns:] @ np.linalg.solve(M, b[columns:])) if s else 0.0
     b, N = b[:columns] - gain @ b[columns:], N[:columns, :columns] - gain @ right.T
     return _chosen(blank, N, b, gain, square, int(known.sum()), name)
