@@ -16,10 +16,11 @@ from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
 from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
+from errormotion.compare.shift import course_of
 from errormotion.compare.stack import Estimate
 from errormotion.errors import DatasetError
 
-__all__ = ["compare", "temperatures"]
+__all__ = ["compare", "explain"]
 
 SUSPICIOUS = 0.05
 """Probability of a pair below which causes are looked for, divided by the number of pairs."""
@@ -74,16 +75,20 @@ def compare(
     pairs = [pair(a, b) for a, b in _pairs(ground, against)]
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
-    time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     for each in pairs:
         wanted = groups is None and each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
-        heat = temperatures(datasets, ground) if wanted else {}
-        a, b = by_name[each.a], by_name[each.b]
-        found.append(
-            diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
-        )
+        found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else [])
     spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
     return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
+
+
+def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:
+    """Return the causes that could explain the difference of two estimates on common ground."""
+    time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
+    records = {each.name: ground.records[each.name] for each in (a, b) if each.name in ground.records}
+    courses = {name: course for name, ds in records.items() if (course := course_of(ds, ground.freedoms))}
+    heat = _temperatures(datasets, ground)
+    return diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns, courses=courses)
 
 
 def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
@@ -99,7 +104,7 @@ def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
     return [(first, each) for each in estimates if each is not first]
 
 
-def temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
+def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
     """Return the recorded temperatures of all datasets at the instants of the grid, by name."""
     if ground.dim != "time":
         return {}
