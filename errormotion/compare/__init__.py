@@ -14,6 +14,7 @@ from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.diagnosis import Cause, diagnose
 from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
+from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
 from errormotion.compare.shift import course_of
 from errormotion.compare.stack import Estimate
@@ -36,6 +37,7 @@ def compare(
     same_start: bool = False,
     causes: bool | None = None,
     against: str = "",
+    groups: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
     """Compare error datasets of one machine.
 
@@ -46,10 +48,14 @@ def compare(
     at, freedoms, since, same_start
         As of `errormotion.compare.ground.common_ground`.
     causes : bool, optional
-        Whether causes are looked for. Default: for pairs that do not agree.
+        Whether causes are looked for. Default: for pairs that do not agree; not for repeats (``groups``).
     against : str, optional
         Dataset that each of the others is compared with. Default: all pairs of up to 40 datasets; of more, the first
         dataset with each of the others. The consensus is that of all datasets.
+    groups : mapping of str to str, optional
+        Group of each dataset, such as its operator (`errormotion.compare.repeats.labels`): the result then holds
+        repeatability within groups, and reproducibility. With ``same_start`` the datasets are repeats of one procedure
+        at different times: time 0 of all of them counts as one instant, whatever their start.
 
     Returns
     -------
@@ -61,14 +67,19 @@ def compare(
     DatasetError
         The datasets cannot be compared; what is missing.
     """
+    if groups and same_start:  # repeats on other days
+        datasets = {name: ds.copy() for name, ds in datasets.items()}
+        for ds in datasets.values():
+            ds.attrs.pop("start", None)
     ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
     pairs = [pair(a, b) for a, b in _pairs(ground, against)]
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
     for each in pairs:
-        wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
+        wanted = groups is None and each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
         found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else [])
-    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found)
+    spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
+    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
 
 
 def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:

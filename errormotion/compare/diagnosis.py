@@ -262,7 +262,7 @@ def _candidates(
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
     yield from _geometric(mean, k)
-    if not set(freedoms) & set(DOF[3:]):
+    if not set(DOF[3:]) <= set(freedoms):
         for each in (a, b):
             if each.name in turns:
                 yield from _functional_point(turns[each.name], k, f"functional point of '{each.name}'")

@@ -119,7 +119,7 @@ def common_ground(
     dim = _dimension(datasets)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
     moved = {
-        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else ds.em.at(point)
+        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else _at(name, ds, point)
         for name, ds in datasets.items()
     }
     reference: float | None = None
@@ -142,6 +142,7 @@ def common_ground(
     if not chosen:
         states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(placed, seen, strict=True))
         raise DatasetError(f"The datasets have no freedom in common: {states}")
+    _check_rotations(moved, chosen)
     return Ground(
         estimates=[each.estimate(name, chosen) for name, each in placed.items()],
         dim=dim,
@@ -168,7 +169,7 @@ def common_ground(
 def _check(name: str, ds: xr.Dataset) -> None:
     try:
         validate(ds)
-        ds.em  # noqa: B018 - refuses what is no error dataset
+        ds.em.names  # noqa: B018 - refuses what is no error dataset
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:
@@ -210,6 +211,33 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     return values.pop()
 
 
+def _at(name: str, ds: xr.Dataset, point: Array) -> xr.Dataset:
+    try:
+        moved: xr.Dataset = ds.em.at(point)
+    except DatasetError as error:
+        own = ",".join(f"{1e3 * each:g}" for each in ds.attrs["functional_point"])
+        raise DatasetError(f"'{name}': {error}, or compare at its own point (--at {own})") from None
+    return moved
+
+
+def _check_rotations(datasets: Mapping[str, xr.Dataset], freedoms: Sequence[str]) -> None:
+    """Refuse rotations of different bodies: of the tool, and of the frame of the axes that a probe sees."""
+    turns = [name for name in freedoms if name in DOF[3:]]
+    levers = {name: str(ds.attrs.get("lever_axes", "XYZ")) for name, ds in datasets.items()}
+    if turns and len(set(levers.values())) > 1:
+        stated = "; ".join(f"'{name}': {axes}" for name, axes in levers.items())
+        raise DatasetError(
+            f"The rotations ({', '.join(turns)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
+            "is one rigid motion of the tool, anything less the frame of the axes that carry the tool. Compare the "
+            f"displacements: {_displacements(freedoms)}"
+        )
+
+
+def _displacements(freedoms: Sequence[str]) -> str:
+    left = [name for name in freedoms if name in DOF[:3]]
+    return f"--freedoms {','.join(left)}" if left else "these datasets have none in common"
+
+
 def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     dims = {name: ds["EX"].dims for name, ds in datasets.items()}
     if len(set(dims.values())) > 1:
@@ -231,7 +259,7 @@ def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: li
             "(same_start, --same-start)"
         )
     if missing:
-        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")
+        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} without start.")
     offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
     return {
         name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))
@@ -275,7 +303,9 @@ def _in_time(
     placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
     for name, each in placed.items():
         if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
-            raise DatasetError(f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state")
+            raise DatasetError(
+                f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state"
+            )
     return {name: each.since_first() for name, each in placed.items()}, grid
 
 

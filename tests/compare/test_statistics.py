@@ -180,3 +180,12 @@ def test_datasets_that_are_left_out_together_are_those_left_out_one_by_one():
     assert found.square == pytest.approx(whole.square, rel=1e-9)
     left = [solve(parts[:i] + parts[i + 1 :], len(keys)).square for i in range(len(parts))]
     np.testing.assert_allclose(whole.square - reduced.falls(), left, rtol=1e-9)
+
+
+def test_datasets_without_sources_have_a_consensus():
+    rng = np.random.default_rng(8)
+    one, other = (
+        Estimate(name, rng.normal(size=(4, 2)), np.tile(np.eye(2), (4, 1, 1)), np.zeros((0, 4, 2)), ())
+        for name in ("a", "b")
+    )
+    np.testing.assert_allclose(consensus([one, other]).estimate.value, (one.value + other.value) / 2)
