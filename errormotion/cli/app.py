@@ -384,6 +384,10 @@ def compare(
     chain: Annotated[
         str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
     ] = None,
+    by: Annotated[
+        Literal["test", "operator", "instrument", "method"] | None,
+        typer.Option(help="Repeatability and reproducibility of groups; a folder of runs stands for all its results."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
@@ -397,7 +401,7 @@ def compare(
         own, _, text = each.rpartition("=")
         origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    stated = command.Stated(name or [], change or [], origins, chain)
+    stated = command.Stated(name or [], change or [], origins, chain, by)
     command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
 
 

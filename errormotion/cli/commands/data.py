@@ -24,6 +24,8 @@ from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from errormotion.campaign.batch import Outcome
 
 
@@ -212,7 +214,7 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
     else:
         with reading(run), datasets.load(run) as errors:
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-            path = write_report(errors, out or run.with_suffix(".html"), run=state)
+            path = write_report([errors, *_evaluations(errors, run)], out or run.with_suffix(".html"), run=state)
             found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
@@ -222,6 +224,17 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         show(str(path))
     if found is not None:
         end_with([found.plain()])
+
+
+def _evaluations(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
+    """Return the Monte Carlo evaluation beside a file of errors where it belongs to them."""
+    from errormotion.cli.commands.monte_carlo import EVALUATION
+
+    beside = file.with_suffix(EVALUATION)
+    if not beside.exists():
+        return []
+    evaluation = datasets.load(beside)
+    return [evaluation] if evaluation.attrs.get("errors_hash") == datasets.hash_dataset(errors) else []
 
 
 def validate(file: Path) -> list[str]:
