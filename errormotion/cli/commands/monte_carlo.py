@@ -10,6 +10,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.cli.output import show, table
 from errormotion.cli.progress import Bars
+from errormotion.cli.summary import notes_of
 from errormotion.errors import DatasetError, MethodError
 from errormotion.montecarlo.result import lines
 
@@ -90,6 +91,5 @@ def show_evaluation(found: xr.Dataset, file: Path) -> None:
         f"{percent:g} % intervals"
     )
     show(table(*texts(found)))
-    for note in found.attrs["notes"]:
-        if note:
-            show(f"  note: {note}")
+    for note in notes_of(found):
+        show(f"  note: {note}")
