@@ -23,6 +23,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.storage import reading
 from errormotion.errors import MethodError, RunError
 from errormotion.montecarlo.adaptive import block_size, propagate, summarise
+from errormotion.montecarlo.intervals import fewest
 from errormotion.montecarlo.places import chosen_places
 from errormotion.montecarlo.result import build
 from errormotion.montecarlo.store import Store
@@ -36,8 +37,8 @@ CHUNK = 20
 """Trials of one task; a process that is killed loses at most those in work."""
 MOST = 100_000
 """Trials after which the adaptive procedure stops."""
-FEWEST = 100
-"""Smallest number of trials that is accepted: an interval of 95 % needs samples beyond its ends."""
+FEWEST = fewest(PROBABILITY)
+"""Smallest number of trials that is accepted: the interval needs samples beyond both of its ends."""
 FLOOR = 1e-13
 """Differences below are rounding, m or rad."""
 
