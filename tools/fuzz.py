@@ -92,6 +92,11 @@ def row(codec: fuzzing.Codec, found: fuzzing.Found) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _exceptions() -> str:
+    named = [f"{each.name}: {each.per_byte}" for each in CODECS if each.per_byte != fuzzing.MEMORY_PER_BYTE]
+    return f" ({', '.join(named)})" if named else ""
+
+
 def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
     """Return the section of the page from the rows of the table by codec."""
     frames = sum(int(text.split("|")[2]) for text in rows.values())
@@ -100,8 +105,9 @@ def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
         "and inserted, numbers replaced by unusual ones, lengths and counts that are not true. Every one must be "
         f"read, or refused with an error of the project, within {1e3 * fuzzing.SLOWEST:.0f} ms of processor time and "
         f"within {fuzzing.OWN_MEMORY >> 10} KiB of memory and {fuzzing.MEMORY_PER_BYTE} bytes for each byte of the "
-        f"longest frame that was tried. One in {fuzzing.LENGTHENED} was lengthened to the longest frame, or to 64 KiB "
-        f"with up to some thousand frames; it comes in pieces of up to {PIECE >> 10} KiB, as a connection delivers it, "
+        f"longest frame that was tried{_exceptions()}. One in {fuzzing.LENGTHENED} was lengthened to the longest "
+        "frame, or to 64 KiB with up to some thousand frames; it comes in pieces of up to "
+        f"{PIECE >> 10} KiB, as a connection delivers it, "
         "and the same limit holds for each piece. Memory was measured with one in "
         f"{fuzzing.SAMPLED}. Good frames are the golden vectors, frames of the codecs themselves and of the "
         "simulators.",

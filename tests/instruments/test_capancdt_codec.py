@@ -1,8 +1,5 @@
 """Commands, answers and blocks of a capaNCDT 6200, against what documents and independent drivers show."""
 
-import random
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,10 +7,8 @@ from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.point_lds.blocks import MAX_BLOCK_BYTES
 from errormotion.instruments.point_lds.capancdt import blocks, codec
-from errormotion.instruments.point_lds.capancdt.blocks import HEADER, LONGEST_GAP, block_decoder, column, readings_of
-from errormotion.instruments.point_lds.counted import CountedReadings
+from errormotion.instruments.point_lds.capancdt.blocks import HEADER, block_decoder, column
 
 
 def layer(name: str) -> pytest.MarkDecorator:
@@ -160,101 +155,6 @@ def test_both_orders_of_the_header_are_read(preamble: bytes, frames_first: bool)
     data = block(5, (1, 2), (3, 4), (5, 6), preamble=preamble, frames_first=frames_first)
     (found,) = block_decoder().feed(data, last=True)
     assert found.values.tolist() == [[1, 2], [3, 4], [5, 6]]
-
-
-def test_stray_bytes_are_discarded_and_the_block_before_them_is_not_trusted() -> None:
-    decoder = block_decoder()
-    found = decoder.feed(b"xy" + block(1, (1,)) + block(2, (2,)) + b"SAE" + block(3, (3,)) + block(4, (4,)))
-    assert [(each.counter, each.intact) for each in found] == [(1, True), (2, False), (3, True)]
-    assert decoder.stray == 5
-
-
-def test_bytes_within_a_block_spoil_this_block_only() -> None:
-    data = bytearray(block(1, *[(n,) for n in range(50)]) + block(51, (7,)) + block(52, (8,)))
-    data[100:100] = b"\x55\x66"
-    found = block_decoder().feed(bytes(data), last=True)
-    assert [(each.counter, each.count, each.intact) for each in found] == [
-        (1, 50, False),
-        (51, 1, True),
-        (52, 1, True),
-    ]
-
-
-def test_a_header_that_states_more_than_a_packet_is_none() -> None:
-    longest = (MAX_BLOCK_BYTES - HEADER.size) // 4
-    for frames, count in ((longest, 0), (longest + 1, 2)):
-        data = HEADER.pack(b"SAEM", 1, 1, 1, 0, 4, frames, 0) + block(9, (1,)) + block(10, (1,))
-        assert len(block_decoder().feed(data, last=True)) == count
-
-
-def test_decoding_takes_linear_time_and_bounded_memory() -> None:
-    worst = [
-        b"SAEM" * 250_000,
-        b"SAE" * 330_000,
-        HEADER.pack(b"SAEM", 1, 1, 1, 0, 4, 16000, 0) * 30_000,
-        block(1, (1,)) * 27_000,
-        bytes(1_000_000),
-    ]
-    for data in worst:
-        decoder = block_decoder()
-        start = time.perf_counter()
-        for place in range(0, len(data), 65536):
-            decoder.feed(data[place : place + 65536])
-            assert len(decoder._buffer) <= MAX_BLOCK_BYTES + 4
-        assert time.perf_counter() - start < 5.0
-
-
-def test_mutated_blocks_give_blocks_or_nothing() -> None:
-    rng = random.Random(3)
-    sound = b"".join(block(n, (n, 2 * n), (n, n)) for n in range(4))
-    for _ in range(3000):
-        data = bytearray(sound)
-        for _ in range(rng.randint(1, 6)):
-            place = rng.randrange(len(data))
-            match rng.randrange(3):
-                case 0:
-                    data[place] = rng.randrange(256)
-                case 1:
-                    del data[place : place + rng.randint(1, 8)]
-                case 2:
-                    data[place:place] = rng.randbytes(rng.randint(1, 8))
-        for each in block_decoder().feed(bytes(data), last=True):
-            assert each.count > 0
-            assert each.values.shape == ((each.count, len(each.channels)) if each.intact else (0, 0))
-
-
-# ---------------------------------------------------------------------- sequence
-
-RANGE = codec.Channel("DL6220", "1", 0.0, 1e-3)
-
-
-def sequence(*data: bytes, channel: int = 1) -> CountedReadings:
-    found = readings_of(channel, RANGE)
-    for each in block_decoder().feed(b"".join(data), last=True):
-        found.add(each)
-    return found
-
-
-def test_gaps_of_the_counter_are_lost_readings() -> None:
-    found = sequence(block(0xFFFFFFFE, (100,), (200,)), block(3, (300,)))
-    assert found.waiting == 6
-    values, codes = found.take(6)
-    assert found.counts(codes) == {"lost": 3}
-    assert np.flatnonzero(np.isnan(values)).tolist() == [2, 3, 4]
-    assert values[5] == pytest.approx(300 / 0xFFFFFF * 1e-3)
-
-
-def test_a_jump_of_the_counter_back_or_far_is_an_error() -> None:
-    for counter in (0, LONGEST_GAP + 12):
-        with pytest.raises(ProtocolError, match="jumps from 11"):
-            sequence(block(10, (1,)), block(counter, (1,)))
-
-
-def test_readings_of_an_untrusted_block_are_counted() -> None:
-    found = sequence(block(1, (5,), (6,)), b"stray", block(3, (7,)), block(4, (8,)))
-    values, codes = found.take(4)
-    assert found.counts(codes) == {"garbled": 2}
-    assert np.isfinite(values).tolist() == [False, False, True, True]
 
 
 def test_a_channel_that_is_not_sent_is_an_error() -> None:

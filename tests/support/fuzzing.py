@@ -63,6 +63,8 @@ class Codec:
         Longest frame that the codec's module states, bytes.
     tried : int
         Length up to which frames are lengthened, bytes; longer ones are documents or files, which take their time.
+    per_byte : int
+        Bytes of memory for each byte of the longest frame that is tried.
     """
 
     device: str
@@ -71,6 +73,7 @@ class Codec:
     seeds: Callable[[], Sequence[bytes]]
     longest: int
     tried: int = 1 << 16
+    per_byte: int = MEMORY_PER_BYTE
 
     @property
     def name(self) -> str:
@@ -85,7 +88,7 @@ class Codec:
     @property
     def memory(self) -> int:
         """Largest memory while a frame is read, bytes."""
-        return OWN_MEMORY + MEMORY_PER_BYTE * self.lengthened
+        return OWN_MEMORY + self.per_byte * self.lengthened
 
 
 @dataclass

@@ -281,7 +281,9 @@ CODECS: Sequence[Codec] = (
         emscon.MAX_PACKET_BYTES,
     ),
     Codec("leica_geocom", "replies", geocom.reply, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
-    Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096),
+    Codec(
+        "tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096, per_byte=128
+    ),
     Codec(
         "dcon_temperature",
         "answers",

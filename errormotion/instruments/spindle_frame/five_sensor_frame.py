@@ -55,8 +55,8 @@ class FiveSensorFrame:
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; the simulated clock stands still while no reading is given."""
-        return InstrumentSubject(cls, "sim://cframe?seed=3", repeats=True)
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
         self.address = address
