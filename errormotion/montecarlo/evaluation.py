@@ -134,6 +134,7 @@ def evaluate(
     workers: int | None = None,
     progress: Progress | None = None,
     most: int = MOST,
+    keep: bool = False,
 ) -> xr.Dataset:
     """Evaluate a result by the Monte Carlo method, JCGM 101, and compare its linear intervals.
 
@@ -148,8 +149,7 @@ def evaluate(
     errors : Dataset
         What the method made of the raw dataset with these settings.
     folder : path
-        Folder for the trials while the evaluation is in work; an interrupted one is continued from it, a finished one
-        leaves nothing there.
+        Folder for the trials while the evaluation is in work; an interrupted one is continued from it.
     trials : int, optional
         Number of trials; default: adaptive, 7.9.4, until all results are stable and every verdict is clear.
     digits : int
@@ -164,6 +164,8 @@ def evaluate(
         Receives the progress.
     most : int
         Largest number of trials of the adaptive procedure.
+    keep : bool
+        Whether the trials are kept at the end, until the result is stored: see `Store.remove`.
 
     Returns
     -------
@@ -211,7 +213,8 @@ def evaluate(
         raise MethodError(f"No trial of {summary.trials} gave a value everywhere that the result has one: {reason}")
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
     found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
-    store.remove()
+    if not keep:
+        store.remove()
     return found
 
 

@@ -144,6 +144,13 @@ def test_trials_of_another_evaluation_are_not_used(measured, tmp_path):
         _evaluate(measured, tmp_path / "trials", scheduler="sync")
 
 
+@pytest.mark.parametrize("text", ["", "[" * 10**5, "3", " " * (2**20 + 1)])
+def test_a_damaged_folder_is_refused_in_words(tmp_path, text):
+    (tmp_path / "evaluation.json").write_text(text)
+    with pytest.raises(RunError, match="trials"), Store(tmp_path, {"seed": 1}):
+        pass
+
+
 def test_damaged_trials_are_made_again(tmp_path):
     with Store(tmp_path / "trials", {"seed": 1}) as store:
         store.keep(0, range(2), np.ones((2, 3)))
@@ -240,6 +247,7 @@ def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
     answer = json.loads(result.stdout)
     stored = datasets.load(answer["monte_carlo"])
     assert not list(datasets.violations(stored))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["errors.monte_carlo.nc", "errors.nc"]
     assert [verdict["freedom"] for verdict in answer["verdicts"]] == ["EX", "EY"]
     assert {verdict["verdict"] for verdict in answer["verdicts"]} <= {"validated", "not validated", "undecided"}
     page = tmp_path / "report.html"
