@@ -28,7 +28,7 @@ PARTS = {
 }
 """The modules of the folder beside this file, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``.
 
-A section with an argument ``workers`` runs in as many processes.
+A section with the arguments ``workers`` and ``cache`` runs in several processes, and keeps what it has.
 """
 INTRODUCTION = """\
 # Validation
@@ -51,6 +51,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(PARTS)}; default: all")
     parser.add_argument("--seeds", type=int, help="number of virtual machines; each part has its own default")
     parser.add_argument("--workers", type=int, default=1, help="processes, for the parts that can use several")
+    parser.add_argument("--cache", type=Path, help="folder of results of single machines, to go on with a run")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):
@@ -59,7 +60,8 @@ def main() -> None:
     for name in options.parts or PARTS:
         part, start = PARTS[name], time.perf_counter()
         seeds = options.seeds or part.SEEDS
-        more = {"workers": options.workers} if "workers" in signature(part.section).parameters else {}
+        given = {"workers": options.workers, "cache": options.cache}
+        more = {name: value for name, value in given.items() if name in signature(part.section).parameters}
         lines = [*part.section(seeds, **more), "", f"errormotion {__version__}, {seeds} seeds."]
         found[part.TITLE] = "\n".join(lines)
         print(f"## {part.TITLE}\n\n{found[part.TITLE]}\n\n{time.perf_counter() - start:.0f} s\n", flush=True)

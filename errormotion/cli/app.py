@@ -41,6 +41,7 @@ Runs = Annotated[
 Tolerances = Annotated[
     Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
 ]
+Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 
 
 def _version(value: bool) -> None:
@@ -144,6 +145,7 @@ def identify(
     workers: Annotated[
         int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
     ] = None,
+    tolerances: Limits = None,
     monte_carlo: Annotated[
         str | None,
         typer.Option(
@@ -165,7 +167,7 @@ def identify(
         from errormotion.cli.commands.monte_carlo import trials_of
 
         trials = data.Trials(trials_of(monte_carlo), digits, seed)
-    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_, trials)
+    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, tolerances, json_, trials)
 
 
 @app.command()
@@ -382,6 +384,10 @@ def compare(
     chain: Annotated[
         str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
     ] = None,
+    by: Annotated[
+        Literal["test", "operator", "instrument", "method"] | None,
+        typer.Option(help="Repeatability and reproducibility of groups; a folder of runs stands for all its results."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
@@ -395,7 +401,7 @@ def compare(
         own, _, text = each.rpartition("=")
         origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    stated = command.Stated(name or [], change or [], origins, chain)
+    stated = command.Stated(name or [], change or [], origins, chain, by)
     command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
 
 
@@ -408,12 +414,15 @@ def runs(
     machine: Annotated[str | None, typer.Option(help="Only the runs of this machine.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
     since: Annotated[str | None, typer.Option(metavar="DATE", help="Only runs from this date on, UTC.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the runs.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """List the runs of folders, newest first, each with its figure of merit."""
     from errormotion.cli.commands import runs as command
 
-    command.runs(folders or [], machine, method, since, json_)
+    command.runs(folders or [], machine, method, since, tolerances, json_)
 
 
 @app.command()

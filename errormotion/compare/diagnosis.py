@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from errormotion.arrays import Array
 from errormotion.compare.consensus import consensus
 from errormotion.compare.low_rank import Whitener, whitener
+from errormotion.compare.shift import Course, fitted, smooth
 from errormotion.compare.stack import Estimate, difference
 from errormotion.kinematics.iso import DOF
 
@@ -39,10 +39,6 @@ TURNS = {
     "degrees taken as radians": 180 / np.pi,
     "radians taken as degrees": np.pi / 180,
 }
-SMALL_SHIFT = 1.0
-"""Shift in time for which the courses are straight lines, s."""
-SHIFTS = 3
-"""Repetitions of the estimate of a shift, each with the difference of the courses at the last one."""
 UNEXPLAINED = 1e-3
 """Probability of the rest below which a cause does not explain a difference."""
 
@@ -107,17 +103,11 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class _Shift:
-    """A shift in time: the mean course (n, d) as a curve over time, s."""
+    """A shift in time: the course of the first dataset (sign 1) or of the second (-1)."""
 
-    course: CubicSpline
+    course: Course
+    sign: float
     time: Array
-
-    def at(self, shift: float) -> _Candidate:
-        """Return the effect of 1 s for shifts of about this size, s: a difference that is central to both courses."""
-        effect = (self.course(self.time + shift / 2) - self.course(self.time - shift / 2)) / shift
-        return _Candidate(
-            "shift in time", (effect - effect[0])[None], (("shift", "s"),)
-        )  # changes since the first instant
 
 
 @dataclass(frozen=True)
@@ -138,6 +128,7 @@ def diagnose(
     time: Array | None = None,
     temperatures: Mapping[str, Array] | None = None,
     turns: Mapping[str, Array] | None = None,
+    courses: Mapping[str, Course] | None = None,
 ) -> list[Cause]:
     """Return the causes that could explain the difference of two estimates, the most likely one first.
 
@@ -153,6 +144,8 @@ def diagnose(
         Recorded temperatures, degC, for an expansion.
     turns : mapping of str to ndarray (n, 3), optional
         Rotations by the name of the dataset, rad: for its functional point, where rotations are not compared.
+    courses : mapping of str to Course, optional
+        Smooth courses by the name of the dataset, over its whole record, for a shift in time.
 
     Returns
     -------
@@ -165,29 +158,29 @@ def diagnose(
         return []
     whole = white.square(d.value)
     count = max(white.degrees, 2)
-    fitted: dict[str, Cause] = {}
-    for candidate in _candidates(a, b, freedoms, time, temperatures or {}, turns or {}):
-        if (found := _fitted(candidate, d, white, whole, count)) is None:
+    by_kind: dict[str, Cause] = {}
+    for candidate in _candidates(a, b, freedoms, time, temperatures or {}, turns or {}, courses or {}):
+        if (found := _judged(candidate, d, white, whole, count)) is None:
             continue
         kind = (candidate.kind if isinstance(candidate, _Candidate) else "") or found.name
-        if kind not in fitted or found.score > fitted[kind].score:
-            fitted[kind] = found  # of a search the best one
-    causes = sorted(fitted.values(), key=lambda each: -each.score)
+        if kind not in by_kind or found.score > by_kind[kind].score:
+            by_kind[kind] = found  # of a search the best one
+    causes = sorted(by_kind.values(), key=lambda each: -each.score)
     return [_with_alike(cause, causes) for cause in causes]
 
 
-def _fitted(
+def _judged(
     candidate: _Candidate | _Corrected | _Shift, d: Estimate, white: Whitener, whole: float, count: int
 ) -> Cause | None:
     if isinstance(candidate, _Corrected):
         return _corrected(candidate, d, white, whole)
     if isinstance(candidate, _Shift):
-        found, span = _fitted(candidate.at(SMALL_SHIFT), d, white, whole, count), float(np.ptp(candidate.time))
-        for _ in range(SHIFTS):
-            if found is None or not SMALL_SHIFT < abs(found.sizes[0].value) < span / 4:
-                break
-            found = _fitted(candidate.at(found.sizes[0].value), d, white, whole, count)
-        return found
+        shift = fitted(candidate.course, candidate.sign, candidate.time, d.value, white)
+        if shift is None or shift.gain <= 0:
+            return None
+        p = float(chi2.sf(max(whole - shift.gain, 0.0), max(white.degrees - 1, 1)))
+        size = Size("shift", shift.value, shift.standard_uncertainty, "s")
+        return Cause("shift in time", (size,), shift.gain / 2, float(shift.gain - np.log(count)), p)
     effects = np.where(np.isfinite(d.value), np.nan_to_num(candidate.effects), 0.0)
     normal, gradient = white.product(effects, effects), white.product(effects, d.value[None])[:, 0]
     choices = candidate.choices or (tuple(range(len(effects))),)
@@ -249,8 +242,8 @@ def _corrected(candidate: _Corrected, d: Estimate, white: Whitener, whole: float
     return Cause(candidate.name, (), gain / 2, gain, p)
 
 
-def _with_alike(cause: Cause, fitted: Sequence[Cause]) -> Cause:
-    names = [other.name for other in fitted if other is not cause and abs(other.score - cause.score) <= CLOSE]
+def _with_alike(cause: Cause, causes: Sequence[Cause]) -> Cause:
+    names = [other.name for other in causes if other is not cause and abs(other.score - cause.score) <= CLOSE]
     return replace(cause, alike=tuple(names))
 
 
@@ -264,11 +257,12 @@ def _candidates(
     time: Array | None,
     temperatures: Mapping[str, Array],
     turns: Mapping[str, Array],
+    courses: Mapping[str, Course],
 ) -> Iterator[_Candidate | _Corrected | _Shift]:
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
     yield from _geometric(mean, k)
-    if not set(freedoms) & set(DOF[3:]):
+    if not set(DOF[3:]) <= set(freedoms):
         for each in (a, b):
             if each.name in turns:
                 yield from _functional_point(turns[each.name], k, f"functional point of '{each.name}'")
@@ -279,13 +273,24 @@ def _candidates(
     choices = _alone_and_together(freedoms)
     yield _Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units, choices=choices)
     if time is not None and n > 2:
-        yield _Shift(CubicSpline(time, mean[:, k]), time)
+        yield from _shift(a, b, time, courses)
         yield from _steps(n, units, time, choices)
     for name, temperature in temperatures.items():
         change = temperature - temperature[0]
         if np.ptp(change) > 0:
             labels = tuple((label, f"{unit}/K") for label, unit in units)
             yield _Candidate(f"expansion with {name}", _columns(change, len(k)), labels, choices=choices)
+
+
+def _shift(a: Estimate, b: Estimate, time: Array, courses: Mapping[str, Course]) -> Iterator[_Shift]:
+    found = {
+        sign: courses.get(each.name) or smooth(time, each.value, np.sqrt(np.diagonal(each.own, axis1=1, axis2=2)))
+        for each, sign in ((a, 1.0), (b, -1.0))
+    }
+    known = {sign: course for sign, course in found.items() if course is not None}
+    if known:
+        sign = max(known, key=lambda sign: known[sign].instants)
+        yield _Shift(known[sign], sign, time)
 
 
 def _geometric(E: Array, k: list[int]) -> Iterator[_Candidate]:

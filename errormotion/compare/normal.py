@@ -66,7 +66,8 @@ class Information:
         y = np.where(known, filled(each.value), 0.0)
         place = np.array([keys[key] for key in each.source], dtype=np.intp)
         s = F.shape[-1]
-        inner = F.reshape(-1, s).T @ WF.reshape(-1, s)
+        n = F.shape[0] * F.shape[1]  # -1 is undefined where there is no source
+        inner = F.reshape(n, s).T @ WF.reshape(n, s)
         return cls(W, F, WF, inner, place, y, np.matmul(W, y[..., None])[..., 0], known)
 
     @property

@@ -61,11 +61,8 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
     F = np.moveaxis(influence_of(ds), axis + 1, 1)
     total = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
-    before, share, exact, inside = _neighbours(t, new)
-    if exact.all():
-        values, covariance, influence, q = E[before], total[before], F[:, before], np.zeros((1, 6))
-    else:
-        values, covariance, influence, q = _between(t, E, total, F, (before, share, exact, inside))
+    values, covariance, influence, q = interpolated(t, E, total, F, new)
+    before = _neighbours(t, new)[0]
     base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
     base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
     return rebuilt(
@@ -79,9 +76,23 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     )
 
 
-def _between(t: Array, E: Array, total: Array, F: Array, places: Places) -> tuple[Array, Array, Array, Array]:
-    """Return values (point, ..., 6), covariance, influence (source, point, ..., 6) and intensity of each point."""
-    before, share, exact, inside = places
+def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tuple[Array, Array, Array, Array]:
+    """Return errors at new points with their covariance, influence and intensity; see `to_points`.
+
+    Parameters
+    ----------
+    t, new : ndarray, (n,) and (m,)
+        Known and new points, increasing.
+    E, total, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
+        Errors, total covariance, influence.
+
+    Returns
+    -------
+    E, total, F, q : ndarray, (m, ...)
+    """
+    before, share, exact, inside = _neighbours(t, new)
+    if exact.all():
+        return E[before], total[before], F[:, before], np.zeros((1, 6))
     own = total - products(F)
     after = np.minimum(before + ~exact, len(t) - 1)
     w = share.reshape(-1, *[1] * (E.ndim - 1))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
@@ -58,7 +59,39 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
         raise DatasetError(
             f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
         )
-    m = np.maximum(count, 1)
+    changed, total, influence, further = changes(E, C, F, used)
+    zero = (first + last) / 2
+    values = np.moveaxis(changed, 0, axis)
+    return rebuilt(
+        ds,
+        values,
+        np.moveaxis(total, 0, axis),
+        np.moveaxis(influence, 1, axis + 1),
+        further,
+        {"time": ("time", t - zero, dict(ds["time"].attrs))},
+        reference=f"mean of the errors from {first:g} s to {last:g} s",
+        reference_interval=np.array([first - zero, last - zero]),
+        **_started(ds, zero),
+    )
+
+
+def changes(E: Array, C: Array, F: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, Array, list[str]]:
+    """Return the changes of errors since the mean of some of them, with their covariance; see `since`.
+
+    Parameters
+    ----------
+    E, C, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
+        Errors, total covariance, influence.
+    used : ndarray of bool, (n, ...)
+        Which errors the reference state is the mean of.
+
+    Returns
+    -------
+    E, C, F : ndarray
+    further : list of str
+        Names of the sources that are the uncertainty of the reference state, the last ones of F.
+    """
+    m = np.maximum(used.sum(axis=0), 1)
     own = filled(C - products(F))
     E_ref = np.where(used[..., None], filled(E), 0.0).sum(axis=0) / m[..., None]
     F_ref = np.where(used[None, ..., None], filled(F), 0.0).sum(axis=1) / m[None, ..., None]
@@ -75,20 +108,7 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     influence[:, nan] = np.nan
     own[nan[..., :, None] | nan[..., None, :]] = np.nan
     total = own + products(influence)
-    zero = (first + last) / 2
-    values = np.moveaxis(E - E_ref, 0, axis)
-    names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
-    return rebuilt(
-        ds,
-        values,
-        np.moveaxis(total, 0, axis),
-        np.moveaxis(influence, 1, axis + 1),
-        names,
-        {"time": ("time", t - zero, dict(ds["time"].attrs))},
-        reference=f"mean of the errors from {first:g} s to {last:g} s",
-        reference_interval=np.array([first - zero, last - zero]),
-        **_started(ds, zero),
-    )
+    return E - E_ref, total, influence, [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
 
 
 def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:

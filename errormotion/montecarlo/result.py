@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset
+from errormotion.datasets.schemas import ERROR_ROWS
 from errormotion.errors import DatasetError
 from errormotion.montecarlo.adaptive import Summary
 from errormotion.montecarlo.validation import NOT_VALIDATED, UNDECIDED, VALIDATED, WORDS, Validation
@@ -36,6 +37,8 @@ TABLE: dict[str, tuple[tuple[str, ...], str]] = {
 """Variables: dimensions, ``...`` those of the error dataset, and meaning."""
 ATTRIBUTES = ("method", "method_version", "machine", "component", "frame", "functional_point", "reference", "sign")
 NUMBERS = ("trials", "probability", "digits", "seed")
+
+UNITS = {row.name: row.unit for row in ERROR_ROWS}
 
 
 def build(
@@ -226,6 +229,6 @@ def _place(ds: xr.Dataset, dims: list[str], number: int) -> str:
         if ds.sizes[dim] == 1:
             continue
         label = ds[dim].values[i] if dim in ds.coords else i + 1
-        unit = str(ds[dim].attrs.get("units", "")) if dim in ds.coords else ""
+        unit = str(ds[dim].attrs.get("units", UNITS.get(dim, ""))) if dim in ds.coords else ""
         parts.append(f"{dim} {label:g} {unit}".strip() if isinstance(label, float) else f"{dim} {label}")
     return ", ".join(parts)

@@ -69,7 +69,7 @@ def linear_uncertainty(errors: xr.Dataset) -> Array:
     inner = [dim for dim in covariance.dims if dim not in dims]
     C = np.asarray(covariance.transpose(*dims, *inner).values, dtype=float)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(np.diagonal(C, axis1=-2, axis2=-1)).reshape(-1, C.shape[-1])
+        return np.asarray(np.sqrt(np.diagonal(C, axis1=-2, axis2=-1)).reshape(-1, C.shape[-1]))
 
 
 def trial(method: Any, redrawing: Redrawing, sequence: SeedSequence, only: Iterable[str] | None = None) -> xr.Dataset:

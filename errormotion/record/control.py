@@ -3,8 +3,8 @@
 Between two steps the centre is the generalised mean of the values that do not depart alone, with weights w for the
 covariance ``V = V0 + tau^2``: V0 is what the runs state, and tau the reproducibility of the machine and its set-up from
 the moving ranges. The limits are three standard deviations of a value from this centre,
-``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has limits of its own, and a source that all runs share cancels.
-The limit of a moving range is its expectation plus three of its standard deviations, for normal values
+``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has limits of its own, and a source that all runs share
+cancels. The limit of a moving range is its expectation plus three of its standard deviations, for normal values
 ``(sqrt(2 / pi) + 3 sqrt(1 - 2 / pi)) sd = 2.606 sd``, where sd is that of the difference.
 """
 
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.record.regression import by_moving_ranges, difference_variance
@@ -38,9 +39,9 @@ class Chart:
     range_limit: Array
     tau: float
 
-    def outside(self, value: Array) -> Array:
+    def outside(self, value: Array) -> NDArray[np.bool_]:
         """Return which values are outside of their limits, bool (n,)."""
-        found: Array = (value < self.lower) | (value > self.upper)
+        found: NDArray[np.bool_] = (value < self.lower) | (value > self.upper)
         return found
 
 

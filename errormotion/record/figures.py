@@ -149,7 +149,8 @@ def _parts(text: str) -> list[str | float]:
 def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
     """Return a figure of merit with the effects of the shared sources, as far as the error dataset states them."""
     u = _checked(stated.value, stated.expanded_uncertainty / 2)
-    effects, origin = dict[str, float](), (entry.method,)
+    effects = dict[str, float]()
+    origin: tuple[str, ...] = (entry.method,)
     if entry.errors and (path / entry.errors).exists():
         from errormotion import datasets
 

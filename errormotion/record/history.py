@@ -210,7 +210,7 @@ def violations(ds: xr.Dataset) -> list[str]:
         variable = ds.variables[name]
         if variable.dims != dims:
             found.append(f"{name}: expected dims ({', '.join(dims)}); found ({', '.join(map(str, variable.dims))})")
-        elif (variable.dtype.kind in "UO") != (unit == "text") or (unit != "text" and variable.dtype.kind not in "fiu"):
+        elif variable.size and variable.dtype.kind not in ("UO" if unit == "text" else "fiu"):
             found.append(f"{name}: expected {'text' if unit == 'text' else 'numbers'}; found {variable.dtype}")
     return found or _wrong_values(ds)
 

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure as Drawing
 
+from errormotion.arrays import Array
 from errormotion.datasets.files.events import instant
 from errormotion.record.text import date, field_of, sentences, sized, trend_text
 from errormotion.report.canvas import BLACK, BLUE, GREEN, PURPLE, VERMILLION, WIDTH, draw
@@ -70,31 +71,33 @@ def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
     ]
 
 
-def _dates(ds: xr.Dataset, seconds: np.ndarray) -> list[datetime]:
-    start = (instant(str(ds.attrs["start"])) or datetime.fromtimestamp(0, UTC)).timestamp()
-    return [datetime.fromtimestamp(start + float(each), UTC).replace(tzinfo=None) for each in seconds]
+def _days(ds: xr.Dataset, seconds: Array) -> Array:
+    """Return times of a history in days since 1970, as axes of dates hold them."""
+    start = instant(str(ds.attrs["start"])) or datetime.fromtimestamp(0, UTC)
+    days: Array = (start.timestamp() + seconds) / 86400.0
+    return days
 
 
 def _axes(drawing: Drawing, ds: xr.Dataset, label: str) -> Axes:
     wide, high = drawing.get_size_inches()
     axes = drawing.add_axes((0.62 / wide, 0.42 / high, (wide - 0.72) / wide, (high - 0.87) / high))
-    locator = AutoDateLocator(minticks=4, maxticks=9)
+    locator: Any = AutoDateLocator(minticks=4, maxticks=9)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
-    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     axes.set_ylabel(label)
     t = ds["time"].values
     margin = 0.02 * float(t[-1] - t[0]) or 86400.0
-    axes.set_xlim(*_dates(ds, np.array([t[0] - margin, t[-1] + margin])))
+    axes.set_xlim(*map(float, _days(ds, np.array([t[0] - margin, t[-1] + margin]))))
     return axes
 
 
 def _marks(axes: Axes, ds: xr.Dataset) -> None:
     """Draw notes as dotted lines with their numbers, and the interval of each step as a band."""
     for low, high in zip(ds["step_low"].values, ds["step_high"].values, strict=True):
-        axes.axvspan(*_dates(ds, np.array([low, high])), color=VERMILLION, alpha=0.18, linewidth=0)
+        axes.axvspan(*map(float, _days(ds, np.array([low, high]))), color=VERMILLION, alpha=0.18, linewidth=0)
     low, high = ds["time"].values[[0, -1]]
     inside = [k for k, t in enumerate(ds["event_time"].values) if low <= t <= high]
-    for k, when in zip(inside, _dates(ds, ds["event_time"].values[inside]), strict=True):
+    for k, when in zip(inside, map(float, _days(ds, ds["event_time"].values[inside])), strict=True):
         axes.axvline(when, color=PURPLE, linewidth=0.9, linestyle=(0, (1.5, 1.5)))
         axes.annotate(
             str(k + 1),
@@ -118,7 +121,7 @@ def _label(ds: xr.Dataset) -> str:
 
 def _values_figure(ds: xr.Dataset, key: str) -> Figure:
     factor, _ = field_of(ds)
-    when, y = _dates(ds, ds["time"].values), factor * ds["value"].values
+    when, y = _days(ds, ds["time"].values), factor * ds["value"].values
     U, fitted, half = (factor * ds[name].values for name in ("expanded_uncertainty", "fitted", "fitted_half_width"))
     alone = ds["departing"].values > 0
     bounds = [0, *np.searchsorted(ds["time"].values, ds["step_time"].values), len(y)]
@@ -130,13 +133,13 @@ def _values_figure(ds: xr.Dataset, key: str) -> Figure:
             piece = slice(int(first), int(last))
             # A run that departs alone has a parameter of its own: the line goes on across it.
             kept = [k for k in range(len(y))[piece] if not alone[k]]
-            x = [when[k] for k in kept]
-            axes.fill_between(x, (fitted - half)[kept], (fitted + half)[kept], color=GREEN, alpha=0.2, linewidth=0)
-            axes.plot(x, fitted[kept], color=GREEN, label="trend and steps" if first == 0 else None)
+            axes.fill_between(
+                when[kept], (fitted - half)[kept], (fitted + half)[kept], color=GREEN, alpha=0.2, linewidth=0
+            )
+            axes.plot(when[kept], fitted[kept], color=GREEN, label="trend and steps" if first == 0 else None)
         axes.errorbar(when, y, yerr=U, fmt="o", ms=3, lw=0.8, color=BLUE, label="value with U (k = 2)")
         if alone.any():
-            x = [each for each, one in zip(when, alone, strict=True) if one]
-            axes.plot(x, y[alone], "D", ms=6, mfc="none", color=VERMILLION, label="departs alone")
+            axes.plot(when[alone], y[alone], "D", ms=6, mfc="none", color=VERMILLION, label="departs alone")
         if ds.sizes["step"]:
             axes.fill_between([], [], color=VERMILLION, alpha=0.18, label="time of a step")
         if ds.sizes["event"]:
@@ -146,15 +149,15 @@ def _values_figure(ds: xr.Dataset, key: str) -> Figure:
     coverage = f"{100 * float(ds.attrs['coverage']):.0f} %"
     return Figure(
         draw(paint, f"{key}-values", HEIGHTS["values"], WIDTH),
-        f"Values with their expanded uncertainty (k = 2), and trend with steps with its {coverage} interval. Red bands: "
-        "interval of the time of each step. The numbers are those of the notes below.",
+        f"Values with their expanded uncertainty (k = 2), and trend with steps with its {coverage} interval. Red: "
+        "the interval of the time of each step. The numbers are those of the notes below.",
         f"{ds.sizes['run']} values over time, trend {trend_text(ds)}, {ds.sizes['step']} steps",
     )
 
 
 def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
     factor, _ = field_of(ds)
-    when, y = _dates(ds, ds["time"].values), factor * ds["value"].values
+    when, y = _days(ds, ds["time"].values), factor * ds["value"].values
     centre, low, high = (factor * ds[name].values for name in ("centre", "lower_limit", "upper_limit"))
     out = ds["outside"].values > 0
     bounds = [0, *np.searchsorted(ds["time"].values, ds["step_time"].values), len(y)]
@@ -172,8 +175,7 @@ def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
                 )
         axes.plot(when, y, "o-", ms=3, lw=0.6, color=BLUE, label="value")
         if out.any():
-            x = [each for each, one in zip(when, out, strict=True) if one]
-            axes.plot(x, y[out], "o", ms=6.5, mfc="none", color=VERMILLION, label="outside")
+            axes.plot(when[out], y[out], "o", ms=6.5, mfc="none", color=VERMILLION, label="outside")
         _legend(axes)
 
     return Figure(
@@ -186,7 +188,7 @@ def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
 
 def _ranges_figure(ds: xr.Dataset, key: str) -> Figure:
     factor, unit = field_of(ds)
-    when = _dates(ds, ds["time"].values)
+    when = _days(ds, ds["time"].values)
     ranges, limit = (factor * ds[name].values for name in ("moving_range", "range_limit"))
 
     def paint(drawing: Drawing) -> None:

@@ -68,12 +68,14 @@ def fit(X: Array, y: Array, V0: Array) -> Fit | None:
     tau = _paule_mandel(X, y, V0)
     V = V0 + tau**2 * np.eye(n)
     factor = cho_factor(V)
-    C = np.linalg.inv(X.T @ cho_solve(factor, X))
-    b = C @ (X.T @ cho_solve(factor, y))
+    C: Array = np.linalg.inv(X.T @ cho_solve(factor, X))
+    b: Array = C @ (X.T @ cho_solve(factor, y))
     quantile = float(student.ppf(0.5 + COVERAGE / 2, n - p))
-    spread = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))
+    spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))
     below = float(chi_square.cdf(chi2, n - p))
-    return Fit(b, quantile * np.sqrt(np.diag(C)), C, tau, chi2, below, n - p, X @ b, quantile * spread)
+    half_width: Array = quantile * np.sqrt(np.diag(C))
+    fitted: Array = X @ b
+    return Fit(b, half_width, C, tau, chi2, below, n - p, fitted, quantile * spread)
 
 
 def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> float:
@@ -84,12 +86,12 @@ def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> f
         d, v = d[used], v[used]
     if not d.size:
         return 0.0
-    total = float(np.sum(d)) * np.sqrt(np.pi / 2)
+    total = float(np.sum(d) * np.sqrt(np.pi / 2))
 
     def excess(tau: float) -> float:
         return float(np.sum(np.sqrt(2 * tau**2 + v))) - total
 
-    return 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, total / d.size))
+    return 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, total / d.size, xtol=1e-6 * total / d.size))
 
 
 def difference_variance(V: Array) -> Array:
@@ -101,7 +103,7 @@ def difference_variance(V: Array) -> Array:
 
 def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
     """Return tau; the sum of squares falls with tau, so that there is one root at most."""
-    degrees = X.shape[0] - X.shape[1]
+    degrees = int(X.shape[0] - X.shape[1])
 
     def excess(tau: float) -> float:
         return float(_residual_square(X, y, V0, tau)) - degrees
@@ -110,7 +112,7 @@ def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
         return 0.0
     rest = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
     high = float(np.sqrt(rest @ rest / degrees))  # with tau alone the sum is at most n - p here
-    return float(brentq(excess, 0.0, high, rtol=1e-6)) if excess(high) < 0 else high
+    return float(brentq(excess, 0.0, high, xtol=1e-6 * high)) if excess(high) < 0 else high
 
 
 def _residual_square(X: Array, y: Array, V0: Array, tau: float) -> float:

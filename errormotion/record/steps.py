@@ -206,9 +206,8 @@ class _Trial:
         self.candidates = [c for c, keep in zip(candidates, kept, strict=True) if keep]
         self._G = Z[:, kept] / np.sqrt(rest[kept])
         self._v = difference_variance(V)
-        self._own = np.zeros((series.size - 1, len(self.candidates)))  # the ranges that a candidate itself changes
-        for number, each in enumerate(self.candidates):
-            self._own[max(each.index - 1, 0) : each.index + each.single, number] = 1.0
+        self._index = np.array([c.index for c in self.candidates], dtype=int)
+        self._single = np.array([c.single for c in self.candidates])
         self._white = solve_triangular(self._L, y, lower=True)
 
     def squares(self) -> Array:
@@ -238,7 +237,12 @@ class _Trial:
         """Return the statistics of the candidates for each row of whitened values (m, n)."""
         rest = white - (white @ self._Q) @ self._Q.T
         d = np.abs(np.diff(rest @ self._L.T, axis=1)) / np.sqrt(np.maximum(self._v, TINY))
-        scale = (d.sum(axis=1, keepdims=True) - d @ self._own) / (d.shape[1] - self._own.sum(axis=0))
+        # The ranges that a candidate itself changes: the one before its value, and of a single value the one behind.
+        around = np.pad(d, ((0, 0), (1, 1)))
+        own = around[:, self._index] + np.where(self._single, around[:, self._index + 1], 0.0)
+        ends = (self._index == 0) | (self._index == d.shape[1])
+        count = d.shape[1] - 1 - (self._single & ~ends)
+        scale = (d.sum(axis=1, keepdims=True) - own) / count
         gain = (white @ self._G) ** 2
         square = ((rest**2).sum(axis=1, keepdims=True) - gain) / (white.shape[1] - self._Q.shape[1] - 1)
         ranges = np.pi / 4 * scale**2

@@ -7,34 +7,60 @@ from pathlib import Path
 import pytest
 from typer.testing import Result
 
+from errormotion.campaign.files import load_campaign
+from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration
 
 SHORTER = {
-    'procedure = "beam_detection"': 'procedure = "beam_detection"\nsteps = 21\nscan_length = "1.6 mm"',
-    '"104 min"': '"130 s"',
-    '"101 min"': '"60 s"',
-    '"102 min"': '"90 s"',
+    "steps = 41": "steps = 21",
+    'procedure = "beam_detection"': 'procedure = "beam_detection"\nscan_length = "1.6 mm"',
+    '"61.4 min"': '"132 s"',
+    '{ at = "121 min"': '{ at = "61 min"',
+    '{ at = "121.2 min"': '{ at = "61.6 min"',
+    '{ at = "61 min", compensation = { Z = false } },\n    { at = "61.2 min"': (
+        '{ at = "1 min", compensation = { Z = false } },\n    { at = "1.6 min"'
+    ),
+    'running_end = "61 min"': 'running_end = "1 min"',
+    'at = "54 min"': 'at = "57.8 min"',
+    'duration = "65 min"': 'duration = "3.7 min"',
+    'interval = "5 min"': 'interval = "72 s"',
 }
 
 
-@pytest.fixture
-def short_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[RunFolder]]:
+    """Run the short campaign once; return the campaign and its run folders."""
+    folder = tmp_path_factory.mktemp("demo")
     text = demonstration.CAMPAIGN.read_text()
     for long, short in SHORTER.items():
         assert long in text
         text = text.replace(long, short)
-    (tmp_path / "campaign.toml").write_text(text)
-    (tmp_path / "bench.toml").write_text((demonstration.CAMPAIGN.parent / "bench.toml").read_text())
+    (folder / "campaign.toml").write_text(text)
+    (folder / "bench.toml").write_text((demonstration.CAMPAIGN.parent / "bench.toml").read_text())
+    campaign = folder / "campaign.toml"
+    return campaign, demonstration.work(load_campaign(campaign), runs=folder / "runs", quiet=True)
+
+
+@pytest.fixture
+def short_campaign(measured: tuple[Path, list[RunFolder]], monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign, folders = measured
     run = demonstration.run
-    monkeypatch.setattr(demonstration, "run", lambda runs, as_json: run(runs, as_json, tmp_path / "campaign.toml"))
+    monkeypatch.setattr(demonstration, "run", lambda runs, as_json: run(runs, as_json, campaign))
+    monkeypatch.setattr(demonstration, "work", lambda *_, **__: folders)
 
 
 @pytest.mark.usefixtures("short_campaign")
 def test_demo_prints_numbers_beside_the_truth(run: Callable[..., Result], tmp_path: Path) -> None:
     found = json.loads(run("demo", "--json").stdout)
-    assert [test["status"] for test in found["tests"]] == ["finished", "finished"]
+    assert [test["status"] for test in found["tests"]] == ["finished", "finished", "finished"]
     for test in found["tests"]:
         assert "<html" in (tmp_path / test["report"]).read_text()
+    assert [pair["pair"] for pair in found["comparison"]["pairs"]] == [
+        "drift - balls",
+        "drift - truth",
+        "balls - truth",
+    ]
+    assert all(pair["p"] > 1e-3 for pair in found["comparison"]["pairs"])
     numbers = {number["name"]: number for number in found["numbers"]}
     step = numbers["EZ step, compensation of Z switched off"]
     # a cold machine has nothing to compensate yet: the step is small, and its stated uncertainty holds (k = 4)
@@ -47,4 +73,5 @@ def test_demo_prints_numbers_beside_the_truth(run: Callable[..., Result], tmp_pa
 def test_demo_says_where_the_report_is(run: Callable[..., Result]) -> None:
     text = run("demo").stdout
     assert ["measured", "U", "(k=2)", "truth"] in [line.split() for line in text.splitlines()]
-    assert "report on drift: runs/" in text
+    assert "Do the five sensors and the probing of four balls agree?" in text
+    assert "report on drift: " in text

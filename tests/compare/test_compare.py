@@ -257,3 +257,34 @@ def test_sizes_are_printed_in_the_units_of_the_field():
     assert re.search(r"EZ 7\.\d+ ± 0\.\d+ um", step.size)
     point = cause_text(compare(two(rng, functional_point=(0.0, 0.0, 0.03))), 0, 0)
     assert re.search(r"^Z -?[23]\d\.?\d* ± \d\.?\d* mm$", point.size)
+
+
+def single(values):
+    """Return errors at one position."""
+    return datasets.build_errors(
+        np.array(values) * 1e-6, np.diag([1e-12] * 6), dims=(), coords={}, component="spindle", machine="M",
+        frame="machine", functional_point=(0, 0, 0), reference="cold", method="m", method_version="1", provenance={},
+    )  # fmt: skip
+
+
+def test_a_comparison_is_drawn():
+    found = compare(two(np.random.default_rng(2)), causes=False)
+    figure = found.em.plot()
+    assert len(figure.axes) == 2 * found.sizes["dof"]
+    values, en = figure.axes[4], figure.axes[5]  # of EZ
+    shown = [line.get_ydata() for line in values.lines if len(line.get_ydata())]
+    np.testing.assert_allclose(shown[0], 1e6 * found["value"].values[0, :, 2])
+    assert values.get_ylabel() == "EZ / um"
+    drawn = next(line.get_ydata() for line in en.lines if len(line.get_ydata()) == found.sizes["time"])
+    np.testing.assert_allclose(drawn, found["en"].values[0, :, 2])
+    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
+    legend = [text.get_text() for each in legends for text in each.texts]
+    assert legend == ["drift", "probing", "drift - probing"]
+    with pytest.raises(DatasetError, match=r"'\.em\.at' belongs to error datasets"):
+        found.em.at((0, 0, 0))
+
+
+def test_single_values_are_compared_and_drawn():
+    found = compare({"a": single(range(6)), "b": single(range(1, 7)), "c": single([9] * 6)})
+    assert found["value"].dims == ("dataset", "dof")
+    assert len(found.em.plot().axes) == 12

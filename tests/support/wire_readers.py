@@ -45,7 +45,7 @@ from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
 from errormotion.instruments.thermometer import cia404, dcon
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings
 from errormotion.instruments.thermometer.scpi import codec as scpi
-from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, from_iso_code, parse_line, text_of
 from errormotion.instruments.transports.base import PIECE, Transport
 from errormotion.instruments.transports.can import pdo, sdo
 from errormotion.instruments.transports.http.answer import Head, Input, Lines, header_fields
@@ -278,6 +278,7 @@ def dcon_answer(data: bytes) -> None:
     each(
         lambda: dcon.parse_temperatures(dcon.decode(data)),
         lambda: dcon.parse_temperatures(dcon.decode(data, with_checksum=True)),
+        lambda: dcon.check_configuration(dcon.decode(data).removeprefix("!01")),
     )
 
 
@@ -433,6 +434,9 @@ _LINE = re.compile(PATTERN)
 
 
 def dprnt_line(data: bytes) -> None:
-    text = text_of(data)
-    if text:
-        parse_line(text, _LINE)
+    def read(line: bytes) -> None:
+        text = text_of(line)
+        if text:
+            parse_line(text, _LINE)
+
+    each(lambda: read(from_iso_code(data)), lambda: read(data))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from validation.comparisons.drawn import NOISE, at, warm_up
-from validation.comparisons.pool import mapped
+from validation.comparisons.pool import Pool
 
 Z95 = 1.959964
 STEPS = (60.0, 120.0, 240.0, 600.0)
@@ -31,13 +31,13 @@ def one(task: tuple[str, int, float, float]) -> tuple[np.ndarray, np.ndarray, np
     return score, new, 1 - noise / variance
 
 
-def section(seeds: int, workers: int) -> list[str]:
+def section(seeds: int, pool: Pool) -> list[str]:
     """Return the lines of the section."""
     rows, every = [], []
     for kind in ("gantry", "cframe"):
         for step in STEPS:
             for factor in FACTORS:
-                runs = mapped(one, [(kind, seed, step, factor) for seed in range(seeds)], workers)
+                runs = pool.mapped(one, [(kind, seed, step, factor) for seed in range(seeds)])
                 score, new, added = (np.concatenate([run[k] for run in runs]) for k in range(3))
                 inside = np.abs(score) <= Z95
                 early = new < START_UP

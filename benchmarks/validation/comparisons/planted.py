@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2, ncx2
 
-from errormotion.compare import compare, temperatures
-from errormotion.compare.diagnosis import CLOSE, diagnose
+from errormotion.compare import compare, explain
+from errormotion.compare.diagnosis import CLOSE
 from errormotion.compare.ground import common_ground
 from errormotion.compare.low_rank import whitener
 from errormotion.compare.stack import difference
 from errormotion.datasets.timing import later
 from errormotion.kinematics import twists
 from validation.comparisons.drawn import Drawn, at
-from validation.comparisons.pool import mapped
+from validation.comparisons.pool import Pool
 
 LEVEL, POWER = 0.05, 0.9
 STEP_AT = 3600.0
@@ -136,9 +136,7 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
     ground = common_ground(sets)
-    time = np.asarray(ground.coords["time"].values, dtype=float)
-    heat = temperatures(sets, ground)
-    causes = diagnose(*ground.estimates, ground.freedoms, time=time, temperatures=heat)
+    causes = explain(*ground.estimates, sets, ground)
     planted = next(cause.score for cause in causes if _same(cause.name, mistake.cause))
     return planted - max(cause.score for cause in causes if not _same(cause.name, mistake.cause))
 
@@ -165,14 +163,14 @@ def one(task: tuple[int, int, float, float]) -> dict:
     }
 
 
-def section(seeds: int, workers: int) -> list[str]:
+def section(seeds: int, pool: Pool) -> list[str]:
     """Return the lines of the section."""
     plans = [planned(mistake) for mistake in MISTAKES]
     margins = [margin(mistake, *plan) for mistake, plan in zip(MISTAKES, plans, strict=True)]
-    alarms = mapped(one, [(seed, -1, 0.0, 1.0) for seed in range(2 * seeds)], workers)
+    alarms = pool.mapped(one, [(seed, -1, 0.0, 1.0) for seed in range(2 * seeds)])
     rows = []
     for number, (mistake, (size, factor), ahead) in enumerate(zip(MISTAKES, plans, margins, strict=True)):
-        runs = mapped(one, [(seed, number, size, factor) for seed in range(seeds)], workers)
+        runs = pool.mapped(one, [(seed, number, size, factor) for seed in range(seeds)])
         rows.append(_row(mistake, size, factor, ahead, runs))
     degrees = noncentrality(*pair(0))[1]
     false = np.mean([run["p"] < LEVEL for run in alarms])
@@ -181,13 +179,14 @@ def section(seeds: int, workers: int) -> list[str]:
         f"{seeds} virtual gantries warm up for two hours at 12000 /min. Two datasets of six freedoms are drawn from "
         "their own covariance about the true errors: A every minute, with the radius of a bar as a source of all "
         "values; B every 4 minutes, with an expansion; 0.1 um and 0.5 urad of noise. B has one mistake. The joint "
-        f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its non-centrality is "
-        f"d' V^-1 d; {needed(degrees):.1f} is detected with a probability of {POWER:.0%} at the level {LEVEL:g}. Sizes "
-        "are those of this power on the first machine; where a mistake has no size, all uncertainties are multiplied "
-        "by the factor instead. `margin`: by how much the score of the planted cause (twice the logarithm of the "
-        "likelihood ratio, less the penalties) exceeds that of the next one without noise; below "
-        f"{CLOSE:g} the two cannot be told apart at this size. `right first`: among those detected, the planted cause "
-        "has the first rank; `or alike`: it has, or the first one is said to be indistinguishable from it.",
+        f"chi-square has {degrees} degrees of freedom. With the effect d of the mistake and the covariance V its "
+        f"non-centrality is d' V^-1 d; {needed(degrees):.1f} is detected with a probability of "
+        f"{POWER:.0%} at the level {LEVEL:g}. Sizes are those of this power on the first machine; where a mistake has "
+        "no size, all uncertainties are multiplied by the factor instead. `margin`: by how much the score of the "
+        "planted cause (twice the logarithm of the likelihood ratio, less the penalties) exceeds that of the next one "
+        f"without noise; below {CLOSE:g} the two cannot be told apart at this size. `right first`: among those "
+        "detected, the planted cause has the first rank; `or alike`: it has, or the first one is said to be "
+        "indistinguishable from it.",
         "",
         "| mistake | size | uncertainties | predicted power | detected | margin | right first | or alike "
         "| first instead | named as alike |",

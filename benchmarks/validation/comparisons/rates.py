@@ -16,7 +16,7 @@ from errormotion.methods.normal_vector import simulation as probing
 from errormotion.methods.spindle_drift import simulation as drifting
 from errormotion.twin import Event, VirtualMachine
 from validation.comparisons.drawn import START, Drawn, at
-from validation.comparisons.pool import mapped
+from validation.comparisons.pool import Pool
 
 Z95 = 1.959964
 STEP, INTERVAL, DURATION = 20.0, 600.0, 7200.0
@@ -58,7 +58,7 @@ def methods(seed: int) -> dict:
         "drift": drift(machine, seed),
         "probing": identified("normal_vector", balls, tool_axes="Z", **POINT),
     }
-    return _judged(sets, _truth(machine), freedoms=DISPLACEMENTS)
+    return {"shared": _counted(sets, _truth(machine), {"freedoms": DISPLACEMENTS})}
 
 
 def records(seed: int) -> dict:
@@ -125,23 +125,23 @@ CASES = (
 )
 
 
-def section(seeds: int, workers: int) -> list[str]:
+def section(seeds: int, pool: Pool) -> list[str]:
     """Return the lines of the section."""
     rows = []
     for name, function, option in CASES:
-        runs = mapped(function, [seed if option is None else (seed, option) for seed in range(seeds)], workers)
+        runs = pool.mapped(function, [seed if option is None else (seed, option) for seed in range(seeds)])
         rows += [_row(name, "as stated", [run["shared"] for run in runs])]
         if function is not methods:
             rows += [_row("", "left out", [run["apart"] for run in runs])]
     return [
         f"{seeds} virtual machines each. The first two cases are results of methods on simulated raw data of one "
-        f"C-frame that warms up for two hours: a bar before five sensors (every {STEP:g} s) and four balls probed every "
-        f"{INTERVAL / 60:g} minutes; displacements at the origin. The last two are drawn from their own covariance "
-        "about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by 5 % (k = 1), and a "
-        "thermometer. `correlation`: whether sources with the same identity are one draw (as stated) or counted as two "
-        "(left out). Of datasets that agree 95.4 % of |En| are below 1 (k = 2), p is uniform and 95 % intervals of the "
-        "consensus hold the true errors in 95 %. Behind ± the standard error of the mean over machines, since the "
-        "instants of one machine share their sources.",
+        f"C-frame that warms up for two hours: a bar before five sensors (every {STEP:g} s) and four balls probed "
+        f"every {INTERVAL / 60:g} minutes; displacements at the origin. The last two are drawn from their own "
+        "covariance about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by "
+        "5 % (k = 1), and a thermometer. `correlation`: whether sources with the same identity are one draw (as "
+        "stated) or counted as two (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
+        "uniform, and 95 % intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of "
+        "the mean over machines, since the instants of one machine share their sources.",
         "",
         "| datasets | correlation | abs(En) <= 1 | p uniform (Kolmogorov-Smirnov) | p < 0.05 | consensus: coverage |",
         "|---|---|---|---|---|---|",

@@ -13,6 +13,9 @@ from errormotion.cli.progress import Bars
 from errormotion.errors import DatasetError, MethodError
 from errormotion.montecarlo.result import lines
 
+EVALUATION = ".monte_carlo.nc"
+"""Ending of the file of an evaluation, beside that of the errors."""
+
 
 def trials_of(text: str) -> int | None:
     """Return the number of trials, None for ``auto``."""
@@ -26,7 +29,7 @@ def trials_of(text: str) -> int | None:
 
 def beside(out: Path) -> Path:
     """Return the file of the evaluation of a result; MethodError where it exists."""
-    file = out.with_suffix(".monte_carlo.nc")
+    file = out.with_suffix(EVALUATION)
     if file.exists():
         raise DatasetError(f"{file}: exists already, and a result is never overwritten; give another name to --out")
     return file

@@ -38,10 +38,10 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     sources = {"readings": _readings(float(errors["noise"]))}
     if settings.together and "repeatability" in errors:
         sources["repeatability"] = _positions(float(errors["repeatability"]), errors)
-    scales = dict(air_scale(raw, settings.air, [])[1]) | {"tracker scale": settings.scale_uncertainty}
-    for name, relative in scales.items():
+    refraction = float(np.linalg.norm(list(air_scale(raw, settings.air, [])[1].values())))  # all act alike
+    for group, relative in (("refraction", refraction), ("scale of the tracker", settings.scale_uncertainty)):
         if relative > 0:
-            sources[name] = _scale(relative, "scale of the tracker" if name == "tracker scale" else "refraction")
+            sources[group] = _scale(relative, group)
     if settings.expansion is not None:
         warmer, _ = scale_strain(raw, settings.expansion)
         reduced["scale_temperature"] = (("station", "direction"), warmer + settings.expansion.reference)
