@@ -26,6 +26,7 @@ from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
+from errormotion.campaign.limits import NO_MOTIONS
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.datasets import provenance
@@ -281,6 +282,7 @@ class _Session:
         attrs = {"instruments": json.dumps(provenance.plain(folder.data["instruments"])), "start": now()}
         if bench.description is not None:
             attrs["chain"] = bench.description.moving_chain
+        bench.hold("" if hasattr(method, "motions") else NO_MOTIONS.format(method.info.id))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None
