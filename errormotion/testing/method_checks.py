@@ -76,11 +76,10 @@ def motions_stated(subject: MethodSubject) -> str:
 
 def _texts_of(plugin: Any) -> set[str]:
     """Return the texts in the source of a plugin's package, or of its module where it is in none."""
-    module = sys.modules[plugin.__module__]
-    source = Path(str(module.__file__))
-    folder = "." in plugin.__module__ or source.name == "__init__.py"
+    source = Path(str(sys.modules[plugin.__module__].__file__))
+    in_package = (source.parent / "__init__.py").exists()
     found: set[str] = set()
-    for path in source.parent.rglob("*.py") if folder else [source]:
+    for path in source.parent.rglob("*.py") if in_package else [source]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value)
