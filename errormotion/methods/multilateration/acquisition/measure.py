@@ -141,7 +141,7 @@ class Stand:
         self.position, self.target, self.order = tour(settings, measuring.returns)
         self.station = np.array(settings.layout.stations, np.float64)
         self.names = station_names(len(self.station))
-        self.sequence = stations(settings)
+        self.sequence = stations(settings, measuring)
         self.air_reported: bool | None = None  # not known before the first set-up
         self.scales = Scales(bench, measuring.scale_sensors)
 

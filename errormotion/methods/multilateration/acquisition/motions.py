@@ -13,7 +13,7 @@ from errormotion.methods.multilateration.planning import layout
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.settings import Measuring, Settings
 
 
 def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
@@ -26,10 +26,10 @@ def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
     return np.concatenate([position, position[again]]), np.concatenate([target, target[again]]), order
 
 
-def stations(settings: Settings) -> list[int]:
+def stations(settings: Settings, measuring: Measuring) -> list[int]:
     """Return the stations in the order of their set-ups, from 0; MethodError for one that does not exist."""
     count = len(settings.layout.stations)
-    wanted = settings.measuring.sequence or tuple(range(1, count + 1))
+    wanted = measuring.sequence or tuple(range(1, count + 1))
     if strange := [k for k in wanted if not 1 <= k <= count]:
         raise MethodError(f"expected numbers of stations from 1 to {count}; found {strange}")
     return [k - 1 for k in wanted]
@@ -39,7 +39,7 @@ def steps(settings: Settings) -> list[Step]:
     """Return every step of all set-ups, without repetitions: moves in rapid, and rests."""
     position, _, order = tour(settings, settings.measuring.returns)
     found: list[Step] = []
-    for _ in stations(settings):
+    for _ in stations(settings, settings.measuring):
         for i in (order[0], *order):
             x, y, z = (float(each) for each in position[i])
             found.append(Step("move", (x, y, z), math.nan, math.nan))
