@@ -15,7 +15,6 @@ def made(size: int, sources: int, rng: np.random.Generator, truth: np.ndarray) -
     F = rng.normal(0, 1e-7, (sources, 1, 6)) * np.linspace(0, 1, size)[None, :, None]
     noise = 1e-7
     values = truth + np.einsum("sti,s->ti", F, rng.normal(size=sources)) + noise * rng.normal(size=(size, 6))
-    values[0] = 0.0
     covariance = noise**2 * np.eye(6) + np.einsum("sti,stj->tij", F, F, optimize=True)
     names = [f"source {k}" for k in range(sources)]
     return datasets.build_errors(

@@ -13,6 +13,7 @@ import pkgutil
 import re
 import time
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
 import validation
@@ -21,9 +22,14 @@ from errormotion import __version__
 
 PAGE = Path(__file__).parent.parent / "docs" / "validation.md"
 PARTS = {
-    module.name: import_module(f"validation.{module.name}") for module in pkgutil.iter_modules(validation.__path__)
+    module.name: import_module(f"validation.{module.name}")
+    for module in pkgutil.iter_modules(validation.__path__)
+    if not module.ispkg
 }
-"""The modules of the folder beside this file, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``."""
+"""The modules of the folder beside this file, each with ``TITLE``, ``SEEDS`` and ``section(seeds)``.
+
+A section with the arguments ``workers`` and ``cache`` runs in several processes, and keeps what it has.
+"""
 INTRODUCTION = """\
 # Validation
 
@@ -44,6 +50,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", metavar="part", help=f"{', '.join(PARTS)}; default: all")
     parser.add_argument("--seeds", type=int, help="number of virtual machines; each part has its own default")
+    parser.add_argument("--workers", type=int, default=1, help="processes, for the parts that can use several")
+    parser.add_argument("--cache", type=Path, help="folder of results of single machines, to go on with a run")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     if unknown := set(options.parts) - set(PARTS):
@@ -52,7 +60,9 @@ def main() -> None:
     for name in options.parts or PARTS:
         part, start = PARTS[name], time.perf_counter()
         seeds = options.seeds or part.SEEDS
-        lines = [*part.section(seeds), "", f"errormotion {__version__}, {seeds} seeds."]
+        given = {"workers": options.workers, "cache": options.cache}
+        more = {name: value for name, value in given.items() if name in signature(part.section).parameters}
+        lines = [*part.section(seeds, **more), "", f"errormotion {__version__}, {seeds} seeds."]
         found[part.TITLE] = "\n".join(lines)
         print(f"## {part.TITLE}\n\n{found[part.TITLE]}\n\n{time.perf_counter() - start:.0f} s\n", flush=True)
     shown = [part.TITLE for part in PARTS.values() if part.TITLE in found]

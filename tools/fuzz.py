@@ -1,13 +1,16 @@
 """Damaged frames of every codec: ``make fuzz`` tries them, and writes a section of ``docs/reliability.md``.
 
 ``make fuzz ARGS="--frames 1e5 --only shdr"`` tries other numbers of frames, or some codecs, and leaves the rows of the
-others. Codecs and good frames are those of ``tests/support/wire_codecs.py``; a failure is repeated with the seed and
-the number of its mutant.
+others. A row is written when its codec is done. One that is there already, with as many frames of the same code and
+without failures, is kept (``--again`` tries it once more), so that a run that was ended goes on where it was. Codecs
+and good frames are those of ``tests/support/wire_codecs.py``; a failure is repeated with the seed and the number of
+its mutant.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import multiprocessing
 import os
 import platform
@@ -15,6 +18,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -22,6 +26,9 @@ sys.path.insert(0, str(ROOT / "tests" / "support"))
 
 import fuzzing  # noqa: E402
 from wire_codecs import CODECS  # noqa: E402
+
+from errormotion import plugins  # noqa: E402
+from errormotion.instruments.transports.base import PIECE  # noqa: E402
 
 PAGE = ROOT / "docs" / "reliability.md"
 TITLE = "Damaged frames"
@@ -33,9 +40,13 @@ HEADING = """\
 Every figure on this page comes from a run; none is typed in.
 """
 TABLE = (
-    "| codec | frames | slowest frame | slowest piece | largest memory | longest frame | errors of the project |",
-    "|---|---|---|---|---|---|---|",
+    "| codec | frames | slowest frame | slowest piece | largest memory | longest frame | errors | code |",
+    "|---|---|---|---|---|---|---|---|",
 )
+INSTRUMENTS = "errormotion/instruments"
+OF_PROGRAMME = tuple(f"tests/support/{name}.py" for name in ("fuzzing", "mutants", "wire_readers"))
+SAME_FOR_ALL = (f"{INSTRUMENTS}/transports/**/*.py", f"{INSTRUMENTS}/*.py", *OF_PROGRAMME)
+"""Files that every row depends on."""
 
 
 def tasks(codecs: Sequence[int], frames: int) -> Iterator[tuple[int, int, int]]:
@@ -51,6 +62,20 @@ def work(task: tuple[int, int, int]) -> tuple[int, fuzzing.Found]:
     return codec, fuzzing.fuzz(CODECS[codec], range(start, end))
 
 
+@cache
+def code_of(device: str) -> str:
+    """Return a checksum of what a row depends on: the code of all instruments of the kind, and the good frames."""
+    patterns = [*SAME_FOR_ALL, f"tests/data/vectors/{device}.toml"]
+    for plugin in plugins.available("instruments"):
+        if plugin.id == device:
+            kind = plugin.entry_point.value.removeprefix(INSTRUMENTS.replace("/", ".") + ".").partition(".")[0]
+            patterns.append(f"{INSTRUMENTS}/{kind}/**/*.py")
+    total = hashlib.sha256()
+    for path in sorted({path for pattern in patterns for path in ROOT.glob(pattern)}):
+        total.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    return total.hexdigest()[:10]
+
+
 def row(codec: fuzzing.Codec, found: fuzzing.Found) -> str:
     """Return a row of the table."""
     errors = ", ".join(f"{name} {count}" for name, count in found.errors.most_common()) or "none"
@@ -62,8 +87,14 @@ def row(codec: fuzzing.Codec, found: fuzzing.Found) -> str:
         f"{found.memory / 1024:.0f} KiB",
         f"{codec.longest} bytes",
         errors,
+        f"`{code_of(codec.device.partition(' ')[0])}`",
     )
     return f"| {' | '.join(cells)} |"
+
+
+def _exceptions() -> str:
+    named = [f"{each.name}: {each.per_byte}" for each in CODECS if each.per_byte != fuzzing.MEMORY_PER_BYTE]
+    return f" ({', '.join(named)})" if named else ""
 
 
 def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
@@ -74,16 +105,21 @@ def section(rows: Mapping[str, str], failures: Sequence[str]) -> str:
         "and inserted, numbers replaced by unusual ones, lengths and counts that are not true. Every one must be "
         f"read, or refused with an error of the project, within {1e3 * fuzzing.SLOWEST:.0f} ms of processor time and "
         f"within {fuzzing.OWN_MEMORY >> 10} KiB of memory and {fuzzing.MEMORY_PER_BYTE} bytes for each byte of the "
-        f"longest frame that was tried. One in {fuzzing.LENGTHENED} was lengthened to the longest frame, or to a piece "
-        "of up to 64 KiB as a connection delivers it, with up to some thousand frames: these have "
-        f"{1e3 * fuzzing.SLOWEST_PIECE:.0f} ms. Memory was measured with one in {fuzzing.SAMPLED}. Good frames are the "
-        "golden vectors, frames of the codecs themselves and of the simulators.",
+        f"longest frame that was tried{_exceptions()}. One in {fuzzing.LENGTHENED} was lengthened to the longest "
+        "frame, or to 64 KiB with up to some thousand frames; it comes in pieces of up to "
+        f"{PIECE >> 10} KiB, as a connection delivers it, "
+        "and the same limit holds for each piece. Memory was measured with one in "
+        f"{fuzzing.SAMPLED}. Good frames are the golden vectors, frames of the codecs themselves and of the "
+        "simulators.",
         "",
         *TABLE,
         *rows.values(),
         "",
-        "A document or file may be longer than a piece; it takes its time by its length. `InstrumentTimeoutError`: the "
-        "frame was cut off, and the rest of it did not arrive.",
+        "A document or file may be longer than a piece, up to the length in the table. It is read when it is complete, "
+        "so that its time grows with its length; it was tried up to "
+        f"{', '.join(f'{each.tried >> 10} KiB ({each.name})' for each in CODECS if each.tried < each.longest)}. "
+        "`InstrumentTimeoutError`: the frame was cut off, and the rest of it did not arrive. The code is a checksum of "
+        "the files that the row depends on.",
         "",
         *(["Failures:", "", *failures] if failures else ["No failure."]),
         "",
@@ -116,6 +152,16 @@ def updated(body: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -
     return section({name: rows[name] for name in names if name in rows}, [*kept, *failures])
 
 
+def is_done(body: str, codec: fuzzing.Codec, frames: int) -> bool:
+    """Whether the section has a row of as many frames of the present code, without failures."""
+    for line in body.splitlines():
+        cells = [each.strip() for each in line.strip("| ").split("|")]
+        if cells[0] == codec.name and len(cells) == TABLE[1].count("---"):
+            same = cells[-1] == f"`{code_of(codec.device.partition(' ')[0])}`"
+            return same and int(cells[1]) >= frames and f"* {codec.name}: " not in body
+    return False
+
+
 def write(page: Path, title: str, results: Sequence[tuple[fuzzing.Codec, fuzzing.Found]]) -> None:
     """Replace the rows of a section of the page."""
     head, found = sections(page)
@@ -130,11 +176,15 @@ def main() -> None:
     parser.add_argument("--frames", type=lambda text: int(float(text)), default=1_000_000, help="of each codec")
     parser.add_argument("--only", default="", help="codecs whose name this regular expression finds; other rows stay")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--again", action="store_true", help="also codecs whose row is up to date")
     parser.add_argument("--out", type=Path, default=PAGE)
     options = parser.parse_args()
     chosen = [number for number, codec in enumerate(CODECS) if re.search(options.only, codec.name)]
     if not chosen:
         parser.error(f"expected a part of a name: {', '.join(codec.name for codec in CODECS)}")
+    body = sections(options.out)[1].get(TITLE, "")
+    if not options.again:
+        chosen = [number for number in chosen if not is_done(body, CODECS[number], options.frames)]
     found = {number: fuzzing.Found() for number in chosen}
     start, failed = time.monotonic(), False
     with multiprocessing.get_context("spawn").Pool(options.processes) as pool:

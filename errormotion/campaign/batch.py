@@ -9,22 +9,17 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
-import os
 import platform
-import signal
 import sys
 import threading
 import time
 import traceback as tracebacks
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 from errormotion import __version__, datasets, plugins
 from errormotion.campaign.folder import RunFolder
@@ -34,20 +29,14 @@ from errormotion.datasets import provenance
 from errormotion.datasets.files.hashing import has_hash
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError, RunError
+from errormotion.parallel import CPU_COUNT, SCHEDULERS, Workers, checked_scheduler, one_thread_at_a_time
 from errormotion.plugins import PluginSettings
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 log = logging.getLogger(__name__)
 _turn = threading.Lock()
 
-SCHEDULERS = ("threads", "processes", "sync")
 MARK = "identified_from"
 """Attribute of a result: hashes of the raw dataset and of the settings, from which a batch recognises its results."""
-CPU_COUNT = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-CLUSTER_TIMEOUT = 15.0
-"""Time within which a cluster must answer and have a worker, s."""
 
 
 @dataclass(frozen=True)
@@ -190,25 +179,14 @@ def choose_scheduler(wanted: str | None) -> tuple[str, str]:
     RunError
         There is no such scheduler.
     """
-    if wanted is not None and "://" not in wanted and wanted not in SCHEDULERS:
-        raise RunError(
-            f"Expected {', '.join(SCHEDULERS)} or the address of a Dask scheduler, such as tcp://host:8786; "
-            f"found '{wanted}'"
-        )
-    if wanted == "threads" and _one_thread_at_a_time():
+    if wanted is not None:
+        checked_scheduler(wanted)
+    if wanted == "threads" and one_thread_at_a_time():
         return wanted, (
             "The threads identify one run at a time: numba has only its 'workqueue' layer, which ends the process "
             "when two threads use it simultaneously. Use processes, or install OpenMP (libgomp, libomp) or TBB."
         )
     return wanted or ("processes" if CPU_COUNT > 1 else "sync"), ""
-
-
-def _one_thread_at_a_time() -> bool:
-    """Return whether numba's parallel kernels may be called from only one thread at a time."""
-    import numba
-
-    numba.get_num_threads()  # selects the layer
-    return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
 
 
 def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]]:
@@ -264,103 +242,14 @@ def _names(raws: Sequence[Path]) -> list[str]:
 
 def _work(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
     """Execute all tasks, and call ``done`` with each outcome."""
-    if scheduler == "sync":
-        for task in tasks:
-            done(_identify(*task))
-    elif scheduler in SCHEDULERS:
-        _locally(tasks, scheduler, workers, done)
-    else:
-        _on_cluster(tasks, scheduler, done)
+    local = scheduler in SCHEDULERS
+    count = max(1, min(workers or CPU_COUNT, len(tasks))) if local else None
 
+    def lost(number: int, reason: str) -> None:
+        done(Outcome(Path(tasks[number].raw), reason=reason))
 
-def _locally(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Callable[[Outcome], None]) -> None:
-    """Execute the tasks in threads or processes of this machine."""
-    try:
-        from dask.base import compute
-        from dask.callbacks import Callback
-        from dask.delayed import delayed
-    except ImportError as error:
-        raise _missing("dask") from error
-    finished: set[str] = set()
-
-    def after(_key: Any, value: Any, *_: Any) -> None:
-        if isinstance(value, Outcome):
-            finished.add(str(value.raw))
-            done(value)
-
-    graph = [delayed(_identify, pure=False)(*task) for task in tasks]
-    count = max(1, min(workers or CPU_COUNT, len(tasks)))
-    executor: Executor
-    if scheduler == "threads":
-        executor = ThreadPoolExecutor(count)
-    else:
-        executor = ProcessPoolExecutor(
-            count, multiprocessing.get_context("spawn"), _start_process, (max(1, CPU_COUNT // count),)
-        )
-    try:
-        with executor, Callback(posttask=after):
-            compute(*graph, scheduler=scheduler, pool=executor, chunksize=1)
-    except BrokenProcessPool:
-        for task in tasks:
-            if task.raw not in finished:
-                reason = "the process ended unexpectedly (use fewer --workers if memory is short); repeat the command"
-                done(Outcome(Path(task.raw), reason=reason))
-
-
-def _start_process(threads: int) -> None:
-    """Set up a process: its number of threads; Ctrl-C is handled by the parent process."""
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _on_cluster(tasks: Sequence[Task], address: str, done: Callable[[Outcome], None]) -> None:
-    """Execute the tasks on a Dask cluster."""
-    try:
-        from dask.delayed import delayed
-        from distributed import Client, as_completed
-    except ImportError as error:
-        raise _missing("distributed") from error
-    try:
-        client = Client(address, timeout=CLUSTER_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise RunError(f"{address}: expected a Dask scheduler; none answers ({error})") from error
-    with client:
-        _check_workers(client, address)
-        futures = client.compute([delayed(_identify, pure=False)(*task) for task in tasks])
-        task_of = dict(zip(futures, tasks, strict=True))
-        for future in as_completed(futures, loop=client.loop):
-            if future.status == "finished":
-                done(future.result())
-            else:  # the task did not reach its own error handling: a worker died, or lacks errormotion
-                reason = f"the cluster did not execute it: {future.exception() or future.status}"
-                done(Outcome(Path(task_of[future].raw), reason=reason))
-
-
-def _check_workers(client: Client, address: str) -> None:
-    """Raise RunError for a cluster without workers, or whose workers have another version of errormotion."""
-    try:
-        client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
-    except TimeoutError as error:
-        raise RunError(
-            f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'"
-        ) from error
-    versions: Any = client.get_versions(packages=["errormotion"])
-    wrong = [
-        f"{worker} has {found['packages'].get('errormotion') or 'none'}"
-        for worker, found in versions["workers"].items()
-        if found["packages"].get("errormotion") != __version__
-    ]
-    if wrong:
-        raise RunError(
-            f"{address}: expected errormotion {__version__} on every worker; {', '.join(wrong)}. Install it there."
-        )
-
-
-def _missing(package: str) -> RunError:
-    return RunError(
-        f"Parallel identification needs the package '{package}', which is not installed: "
-        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' identifies one run after another."
-    )
+    with Workers(scheduler, count, __version__) as pool:
+        pool.run(_identify, tasks, lambda _, outcome: done(outcome), lost)
 
 
 def _identify(raw: str, out: str, method_id: str, method_version: str, settings: str, version: str) -> Outcome:
@@ -400,7 +289,7 @@ def _identify_or_raise(task: Task) -> bool:
                 f"{path}: exists already, from other raw data, other settings or another version of the method, and "
                 "a result is never overwritten; specify another folder with --out"
             )
-        with _turn if _one_thread_at_a_time() else nullcontext():
+        with _turn if one_thread_at_a_time() else nullcontext():
             errors = method().identify(dataset, settings)
         mark = {"raw": datasets.hash_dataset(dataset), "settings": settings_mark}
     datasets.validate(errors)

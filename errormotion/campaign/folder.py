@@ -109,8 +109,19 @@ class RunFolder:
 
     @property
     def errors(self) -> Path | None:
-        """The error dataset of the last identification; None where there is none."""
-        return self.path / self.data["errors"] if self.data.get("errors") else None
+        """The error dataset of the last identification; None where there is none.
+
+        Raises
+        ------
+        RunError
+            ``run.json`` names no file of this folder.
+        """
+        name = self.data.get("errors")
+        if name is None or name == "":
+            return None
+        if isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts:
+            return self.path / name
+        raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
 
     @property
     def finished(self) -> bool:

@@ -42,7 +42,9 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
             raise RunError(f"{folder.path}: no truth is stated for these errors, of {errors.attrs['component']}")
         start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
         found: xr.Dataset = truth(machine, errors, between(clock["start"], start))
-        found = found.assign_attrs({key: errors.attrs[key] for key in ("machine", "frame")}, start=start)
+        found = found.assign_attrs(
+            {key: errors.attrs[key] for key in ("machine", "frame", "lever_axes") if key in errors.attrs}, start=start
+        )
         found["covariance"] = found["covariance"] + EXACTNESS**2 * np.eye(6)
     try:
         datasets.validate(found)

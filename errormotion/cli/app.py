@@ -41,6 +41,7 @@ Runs = Annotated[
 Tolerances = Annotated[
     Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the campaign.")
 ]
+Limits = Annotated[Path | None, typer.Option("--tolerances", help="A TOML file of limits; decide on each result.")]
 
 
 def _version(value: bool) -> None:
@@ -49,6 +50,16 @@ def _version(value: bool) -> None:
 
         show(f"errormotion {__version__}")
         raise typer.Exit
+
+
+def _millimetres(option: str, text: str) -> tuple[float, float, float]:
+    """Return the point that an option states in mm, m."""
+    try:
+        x, y, z = (float(part) / 1e3 for part in text.split(","))
+    except ValueError:
+        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
+        raise typer.Exit(USAGE) from None
+    return x, y, z
 
 
 @app.callback()
@@ -127,17 +138,36 @@ def identify(
     settings: Annotated[Path | None, typer.Option(help="A TOML file of settings.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="For several runs: processes, threads, sync, or a Dask scheduler, tcp://host:port."),
+        typer.Option(
+            help="For several runs or --monte-carlo: processes, threads, sync, or a Dask scheduler, tcp://host:port."
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="How many processes or threads; default: one for each processor.")
     ] = None,
+    tolerances: Limits = None,
+    monte_carlo: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|auto",
+            help="Evaluate the uncertainty by N trials (JCGM 101) as well, or by as many as the result needs.",
+        ),
+    ] = None,
+    digits: Annotated[
+        int, typer.Option(min=1, max=2, help="For --monte-carlo: meaningful digits of a standard uncertainty.")
+    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="For --monte-carlo: one seed gives one result.")] = 0,
     json_: Json = False,
 ) -> None:
     """Identify the errors of one raw dataset, or of many."""
     from errormotion.cli.commands import data
 
-    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, json_)
+    trials = None
+    if monte_carlo is not None:
+        from errormotion.cli.commands.monte_carlo import trials_of
+
+        trials = data.Trials(trials_of(monte_carlo), digits, seed)
+    data.identify(raw, method, out, set_ or [], settings, scheduler, workers, tolerances, json_, trials)
 
 
 @app.command()
@@ -354,6 +384,10 @@ def compare(
     chain: Annotated[
         str | None, typer.Option(help="Kinematic chain of the machine, for results that state none.")
     ] = None,
+    by: Annotated[
+        Literal["test", "operator", "instrument", "method"] | None,
+        typer.Option(help="Repeatability and reproducibility of groups; a folder of runs stands for all its results."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the comparison as a dataset (.nc).")] = None,
     report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
@@ -367,17 +401,8 @@ def compare(
         own, _, text = each.rpartition("=")
         origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    stated = command.Stated(name or [], change or [], origins, chain)
+    stated = command.Stated(name or [], change or [], origins, chain, by)
     command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
-
-
-def _millimetres(option: str, text: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(part) / 1e3 for part in text.split(","))
-    except ValueError:
-        typer.echo(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
-        raise typer.Exit(USAGE) from None
-    return x, y, z
 
 
 @app.command()
@@ -389,29 +414,57 @@ def runs(
     machine: Annotated[str | None, typer.Option(help="Only the runs of this machine.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
     since: Annotated[str | None, typer.Option(metavar="DATE", help="Only runs from this date on, UTC.")] = None,
+    tolerances: Annotated[
+        Path | None, typer.Option("--tolerances", help="A TOML file of limits, in place of those of the runs.")
+    ] = None,
     json_: Json = False,
 ) -> None:
     """List the runs of folders, newest first, each with its figure of merit."""
     from errormotion.cli.commands import runs as command
 
-    command.runs(folders or [], machine, method, since, json_)
+    command.runs(folders or [], machine, method, since, tolerances, json_)
+
+
+@app.command()
+@guarded
+def note(
+    folder: Annotated[Path, typer.Argument(help="A run folder; or a folder of runs, with --machine and --at.")],
+    text: Annotated[str, typer.Argument(help="What happened, on one line.")],
+    machine: Annotated[str | None, typer.Option(help="The machine, for a note without a run.")] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="DATE", help="When it happened, UTC; default: the time of the run.")
+    ] = None,
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who notes it.")] = "",
+    json_: Json = False,
+) -> None:
+    """Note an event of a machine, such as a collision or a repair."""
+    from errormotion.cli.commands import note as command
+
+    command.note(folder, text, machine, at, by, json_)
 
 
 @app.command()
 @guarded
 def history(
     machine: Annotated[str, typer.Option(help="The machine.")],
-    figure: Annotated[str, typer.Option(help="The name of a figure of merit; * stands for any characters.")],
+    figure: Annotated[
+        str, typer.Option(help="A figure of merit (* stands for any characters), or a freedom such as EZ.")
+    ],
     folders: Annotated[
         list[Path] | None, typer.Argument(help="Folders of runs; default: runs.", show_default=False)
     ] = None,
+    at: Annotated[str | None, typer.Option(help="Place of the freedom 'x,y,z', mm.")] = None,
     method: Annotated[str | None, typer.Option(help="Only the runs of this method.")] = None,
+    test: Annotated[str | None, typer.Option(help="Only the runs of this test.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the history as a dataset (.nc).")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page (.html).")] = None,
     json_: Json = False,
 ) -> None:
-    """Show a figure of a machine over time, with its trend and a step."""
+    """Show a figure of a machine over time: trend, steps, control limits, notes."""
     from errormotion.cli.commands import history as command
 
-    command.history(folders or [], machine, figure, method, json_)
+    point = None if at is None else _millimetres("--at", at)
+    command.history(folders or [], machine, figure, point, method, test, out, report, json_)
 
 
 @app.command()

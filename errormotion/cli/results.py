@@ -13,7 +13,9 @@ from errormotion.campaign.raw_paths import is_runs_folder
 from errormotion.errors import DatasetError, RunError
 
 
-def load(paths: Sequence[Path], names: Mapping[str, Path]) -> tuple[dict[str, xr.Dataset], list[str]]:
+def load(
+    paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False
+) -> tuple[dict[str, xr.Dataset], list[str]]:
     """Return error datasets by name, and the runs that were left out, one sentence each.
 
     Parameters
@@ -22,6 +24,8 @@ def load(paths: Sequence[Path], names: Mapping[str, Path]) -> tuple[dict[str, xr
         An error dataset; a run folder; or a folder of runs, which stands for the newest result of each of its tests.
     names : mapping of str to Path
         Further ones, with their names.
+    every : bool
+        A folder of runs stands for all results of each of its tests.
 
     Raises
     ------
@@ -31,7 +35,7 @@ def load(paths: Sequence[Path], names: Mapping[str, Path]) -> tuple[dict[str, xr
     found: dict[str, xr.Dataset] = {}
     left_out: list[str] = []
     for path in paths:
-        for name, file in _files(path, left_out):
+        for name, file in _files(path, left_out, every):
             _add(found, name, file)
     for name, path in names.items():
         files = _files(path, left_out)
@@ -49,7 +53,7 @@ def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
     found[own] = datasets.load(file)
 
 
-def _files(path: Path, left_out: list[str]) -> list[tuple[str, Path]]:
+def _files(path: Path, left_out: list[str], every: bool = False) -> list[tuple[str, Path]]:
     """Return names and files of the error datasets that a path stands for."""
     if path.is_file():
         return [(path.stem, path)]
@@ -59,6 +63,7 @@ def _files(path: Path, left_out: list[str]) -> list[tuple[str, Path]]:
         folder = RunFolder.open(path)
         return [(str(folder.data["test"]), _errors(folder))]
     newest: dict[str, tuple[str, Path]] = {}
+    everything: list[tuple[str, Path]] = []
     for file in sorted(path.glob("*/run.json")):
         try:
             folder = RunFolder.open(file.parent)
@@ -66,11 +71,12 @@ def _files(path: Path, left_out: list[str]) -> list[tuple[str, Path]]:
         except (RunError, KeyError) as error:
             left_out.append(f"left out: {error}")
             continue
+        everything.append((test, errors))
         if test not in newest or created >= newest[test][0]:
             newest[test] = (created, errors)
     if not newest:
         raise DatasetError(f"{path}: none of its runs has errors; identify them first")
-    return [(test, errors) for test, (_, errors) in newest.items()]
+    return everything if every else [(test, errors) for test, (_, errors) in newest.items()]
 
 
 def _errors(folder: RunFolder) -> Path:

@@ -14,12 +14,18 @@ from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.diagnosis import Cause, diagnose
 from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
+from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
+from errormotion.compare.shift import course_of
+from errormotion.compare.stack import Estimate
+from errormotion.errors import DatasetError
 
-__all__ = ["compare"]
+__all__ = ["compare", "explain"]
 
 SUSPICIOUS = 0.05
 """Probability of a pair below which causes are looked for, divided by the number of pairs."""
+MOST_FOR_ALL_PAIRS = 40
+"""Number of datasets up to which every one is compared with every other: the pairs grow with its square."""
 
 
 def compare(
@@ -30,6 +36,8 @@ def compare(
     since: float | None = None,
     same_start: bool = False,
     causes: bool | None = None,
+    against: str = "",
+    groups: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
     """Compare error datasets of one machine.
 
@@ -40,7 +48,14 @@ def compare(
     at, freedoms, since, same_start
         As of `errormotion.compare.ground.common_ground`.
     causes : bool, optional
-        Whether causes are looked for. Default: for pairs that do not agree.
+        Whether causes are looked for. Default: for pairs that do not agree; not for repeats (``groups``).
+    against : str, optional
+        Dataset that each of the others is compared with. Default: all pairs of up to 40 datasets; of more, the first
+        dataset with each of the others. The consensus is that of all datasets.
+    groups : mapping of str to str, optional
+        Group of each dataset, such as its operator (`errormotion.compare.repeats.labels`): the result then holds
+        repeatability within groups, and reproducibility. With ``same_start`` the datasets are repeats of one procedure
+        at different times: time 0 of all of them counts as one instant, whatever their start.
 
     Returns
     -------
@@ -52,19 +67,41 @@ def compare(
     DatasetError
         The datasets cannot be compared; what is missing.
     """
+    if groups and same_start:  # repeats on other days
+        datasets = {name: ds.copy() for name, ds in datasets.items()}
+        for ds in datasets.values():
+            ds.attrs.pop("start", None)
     ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
-    pairs = [pair(a, b) for a, b in combinations(ground.estimates, 2)]
+    pairs = [pair(a, b) for a, b in _pairs(ground, against)]
     by_name = {each.name: each for each in ground.estimates}
     found: list[list[Cause]] = []
-    time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     for each in pairs:
-        wanted = each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
-        heat = _temperatures(datasets, ground) if wanted else {}
-        a, b = by_name[each.a], by_name[each.b]
-        found.append(
-            diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns) if wanted else []
-        )
-    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found)
+        wanted = groups is None and each.joint.p < SUSPICIOUS / len(pairs) if causes is None else causes
+        found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else [])
+    spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
+    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
+
+
+def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:
+    """Return the causes that could explain the difference of two estimates on common ground."""
+    time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
+    records = {each.name: ground.records[each.name] for each in (a, b) if each.name in ground.records}
+    courses = {name: course for name, ds in records.items() if (course := course_of(ds, ground.freedoms))}
+    heat = _temperatures(datasets, ground)
+    return diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns, courses=courses)
+
+
+def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
+    estimates = ground.estimates
+    if against and against not in (names := [each.name for each in estimates]):
+        raise DatasetError(f"against: expected one of the datasets {', '.join(names)}; found '{against}'")
+    if not against and len(estimates) > MOST_FOR_ALL_PAIRS:
+        against = estimates[0].name
+        ground.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
+    if not against:
+        return list(combinations(estimates, 2))
+    first = next(each for each in estimates if each.name == against)
+    return [(first, each) for each in estimates if each is not first]
 
 
 def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:

@@ -14,19 +14,17 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from errormotion.arrays import Array
 from errormotion.compare.consensus import consensus
 from errormotion.compare.low_rank import Whitener, whitener
+from errormotion.compare.shift import Course, fitted, smooth
 from errormotion.compare.stack import Estimate, difference
 from errormotion.kinematics.iso import DOF
 
-ALIKE = 0.95
-"""Correlation of two effects from which on the data cannot tell them apart."""
 CLOSE = 6.0
-"""Difference of scores up to which two causes with similar effects are named together."""
+"""Difference of scores up to which the data cannot tell two causes apart: a likelihood ratio of 20."""
 MOST_STEPS = 60
 """Instants at which a step is tried."""
 FACTORS = {
@@ -41,10 +39,6 @@ TURNS = {
     "degrees taken as radians": 180 / np.pi,
     "radians taken as degrees": np.pi / 180,
 }
-SMALL_SHIFT = 1.0
-"""Shift in time for which the courses are straight lines, s."""
-SHIFTS = 3
-"""Repetitions of the estimate of a shift, each with the difference of the courses at the last one."""
 UNEXPLAINED = 1e-3
 """Probability of the rest below which a cause does not explain a difference."""
 
@@ -93,27 +87,27 @@ class Cause:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A cause with sizes: effects (p, n, d) of one unit of each, and the name and unit of each."""
+    """A cause with sizes: effects (p, n, d) of one unit of each, and the name and unit of each.
+
+    ``choices`` are the sets of sizes that may be other than zero together: a tool that is too long has one of the three
+    coordinates of a functional point, a holder expands along one axis.
+    """
 
     name: str
     effects: Array
     labels: tuple[tuple[str, str], ...]
     tries: int = 1  # of a search over instants
+    kind: str = ""  # what is searched for
+    choices: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Shift:
-    """A shift in time: the mean course (n, d) as a curve over time, s."""
+    """A shift in time: the course of the first dataset (sign 1) or of the second (-1)."""
 
-    course: CubicSpline
+    course: Course
+    sign: float
     time: Array
-
-    def at(self, shift: float) -> _Candidate:
-        """Return the effect of 1 s for shifts of about this size, s: a difference that is central to both courses."""
-        effect = (self.course(self.time + shift / 2) - self.course(self.time - shift / 2)) / shift
-        return _Candidate(
-            "shift in time", (effect - effect[0])[None], (("shift", "s"),)
-        )  # changes since the first instant
 
 
 @dataclass(frozen=True)
@@ -123,6 +117,7 @@ class _Corrected:
     name: str
     a: Estimate
     b: Estimate
+    stretch: Array | None = None  # (d,) factors that were applied to the freedoms of one of them
 
 
 def diagnose(
@@ -133,6 +128,7 @@ def diagnose(
     time: Array | None = None,
     temperatures: Mapping[str, Array] | None = None,
     turns: Mapping[str, Array] | None = None,
+    courses: Mapping[str, Course] | None = None,
 ) -> list[Cause]:
     """Return the causes that could explain the difference of two estimates, the most likely one first.
 
@@ -148,6 +144,8 @@ def diagnose(
         Recorded temperatures, degC, for an expansion.
     turns : mapping of str to ndarray (n, 3), optional
         Rotations by the name of the dataset, rad: for its functional point, where rotations are not compared.
+    courses : mapping of str to Course, optional
+        Smooth courses by the name of the dataset, over its whole record, for a shift in time.
 
     Returns
     -------
@@ -160,28 +158,56 @@ def diagnose(
         return []
     whole = white.square(d.value)
     count = max(white.degrees, 2)
-    fitted = []
-    for candidate in _candidates(a, b, freedoms, time, temperatures or {}, turns or {}):
-        if found := _fitted(candidate, d, white, whole, count):
-            fitted.append(found)
-    fitted.sort(key=lambda each: -each[0].score)
-    return [_with_alike(cause, effect, fitted, white) for cause, effect in fitted]
+    by_kind: dict[str, Cause] = {}
+    for candidate in _candidates(a, b, freedoms, time, temperatures or {}, turns or {}, courses or {}):
+        if (found := _judged(candidate, d, white, whole, count)) is None:
+            continue
+        kind = (candidate.kind if isinstance(candidate, _Candidate) else "") or found.name
+        if kind not in by_kind or found.score > by_kind[kind].score:
+            by_kind[kind] = found  # of a search the best one
+    causes = sorted(by_kind.values(), key=lambda each: -each.score)
+    return [_with_alike(cause, causes) for cause in causes]
 
 
-def _fitted(
+def _judged(
     candidate: _Candidate | _Corrected | _Shift, d: Estimate, white: Whitener, whole: float, count: int
-) -> tuple[Cause, Array] | None:
+) -> Cause | None:
     if isinstance(candidate, _Corrected):
-        return _corrected(candidate, d, whole)
+        return _corrected(candidate, d, white, whole)
     if isinstance(candidate, _Shift):
-        found, span = _fitted(candidate.at(SMALL_SHIFT), d, white, whole, count), float(np.ptp(candidate.time))
-        for _ in range(SHIFTS):
-            if found is None or not SMALL_SHIFT < abs(found[0].sizes[0].value) < span / 4:
-                break
-            found = _fitted(candidate.at(found[0].sizes[0].value), d, white, whole, count)
-        return found
+        shift = fitted(candidate.course, candidate.sign, candidate.time, d.value, white)
+        if shift is None or shift.gain <= 0:
+            return None
+        p = float(chi2.sf(max(whole - shift.gain, 0.0), max(white.degrees - 1, 1)))
+        size = Size("shift", shift.value, shift.standard_uncertainty, "s")
+        return Cause("shift in time", (size,), shift.gain / 2, float(shift.gain - np.log(count)), p)
     effects = np.where(np.isfinite(d.value), np.nan_to_num(candidate.effects), 0.0)
-    normal = white.product(effects, effects)
+    normal, gradient = white.product(effects, effects), white.product(effects, d.value[None])[:, 0]
+    choices = candidate.choices or (tuple(range(len(effects))),)
+    # A search is a maximum of dependent statistics: it costs the logarithm of the number of its tries.
+    search = 2 * np.log(candidate.tries * len(choices))
+    best: tuple[float, float, list[int], Array, Array] | None = None
+    for choice in choices:
+        used = list(choice)
+        if (solved := _sizes(normal[np.ix_(used, used)], gradient[used])) is None:
+            continue
+        beta, C, gain = solved
+        score = gain - len(used) * np.log(count) - search
+        if best is None or score > best[0]:
+            best = (score, gain, used, beta, C)
+    if best is None:
+        return None
+    score, gain, used, beta, C = best
+    sizes = tuple(
+        Size(candidate.labels[i][0], float(value), float(u), candidate.labels[i][1])
+        for i, value, u in zip(used, beta, np.sqrt(np.diag(C)), strict=True)
+    )
+    p = float(chi2.sf(max(whole - gain, 0.0), max(white.degrees - len(used), 1)))
+    return Cause(candidate.name, sizes, gain / 2, float(score), p)
+
+
+def _sizes(normal: Array, gradient: Array) -> tuple[Array, Array, float] | None:
+    """Return sizes, their covariance, and the fall of the sum of squares; None where they are not determined."""
     scale = np.sqrt(np.diag(normal))
     if not (scale > 0).all():
         return None
@@ -189,38 +215,35 @@ def _fitted(
     if np.linalg.cond(unit) > 1e10:
         return None
     C = np.linalg.inv(unit) / np.outer(scale, scale)
-    beta = C @ white.product(effects, d.value[None])[:, 0]
-    gain, parameters = float(beta @ normal @ beta), len(beta)
-    sizes = tuple(
-        Size(name, float(value), float(u), unit_)
-        for (name, unit_), value, u in zip(candidate.labels, beta, np.sqrt(np.diag(C)), strict=True)
-    )
-    # A search over instants is a maximum of dependent statistics: it costs the logarithm of their number.
-    score = gain - parameters * np.log(count) - 2 * np.log(candidate.tries)
-    p = float(chi2.sf(max(whole - gain, 0.0), max(white.degrees - parameters, 1)))
-    return Cause(candidate.name, sizes, gain / 2, float(score), p), np.tensordot(beta, effects, axes=1)
+    beta = C @ gradient
+    return beta, C, float(beta @ gradient)
 
 
-def _corrected(candidate: _Corrected, d: Estimate, whole: float) -> tuple[Cause, Array]:
-    """Judge a cause by the profile likelihood of both datasets: the correction changes the covariance as well."""
+def _alone_and_together(freedoms: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return which freedoms something may act on: one, all displacements, all rotations, or all."""
+    parts = [tuple(i for i, name in enumerate(freedoms) if name in names) for names in (DOF[:3], DOF[3:], DOF)]
+    singles = [(i,) for i in range(len(freedoms))]
+    return tuple(dict.fromkeys([*singles, *(part for part in parts if part)]))
+
+
+def _corrected(candidate: _Corrected, d: Estimate, white: Whitener, whole: float) -> Cause:
+    """Judge a cause by the likelihood of both datasets: the correction changes the covariance as well.
+
+    With ``a' = A a``, ``b' = B b`` and the covariance V' of their difference, ``-2 ln L = chi'^2 + ln |V'|``, less
+    ``ln |A| + ln |B|``: a factor that is applied to one dataset or inversely to the other is the same statement.
+    """
     right = difference(candidate.a, candidate.b)
     its = whitener(right.own, right.influence)
     rest = its.square(right.value)
-    gain = whole - rest
+    counted = (np.isfinite(d.value) & (np.nan_to_num(d.variance()) > 0)).sum(axis=0)
+    stretched = float(counted @ np.log(candidate.stretch)) if candidate.stretch is not None else 0.0
+    gain = whole - rest + white.log_determinant - its.log_determinant + stretched
     p = float(chi2.sf(rest, its.degrees)) if its.degrees else float("nan")
-    return Cause(candidate.name, (), gain / 2, gain, p), np.nan_to_num(d.value - right.value)
+    return Cause(candidate.name, (), gain / 2, gain, p)
 
 
-def _with_alike(cause: Cause, effect: Array, fitted: Sequence[tuple[Cause, Array]], white: Whitener) -> Cause:
-    length = white.square(effect)
-    names = []
-    for other, its in fitted:
-        if other is cause or abs(other.score - cause.score) > CLOSE:
-            continue
-        product = white.product(effect[None], its[None])[0, 0]
-        size = np.sqrt(length * white.square(its))
-        if size > 0 and abs(product) / size > ALIKE:
-            names.append(other.name)
+def _with_alike(cause: Cause, causes: Sequence[Cause]) -> Cause:
+    names = [other.name for other in causes if other is not cause and abs(other.score - cause.score) <= CLOSE]
     return replace(cause, alike=tuple(names))
 
 
@@ -234,6 +257,7 @@ def _candidates(
     time: Array | None,
     temperatures: Mapping[str, Array],
     turns: Mapping[str, Array],
+    courses: Mapping[str, Course],
 ) -> Iterator[_Candidate | _Corrected | _Shift]:
     mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
     k = [DOF.index(name) for name in freedoms]
@@ -246,15 +270,27 @@ def _candidates(
     yield from _fixed(a, b, freedoms)
     n = len(a.value)
     units = tuple((name, "m" if name in DOF[:3] else "rad") for name in freedoms)
-    yield _Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units)
+    choices = _alone_and_together(freedoms)
+    yield _Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units, choices=choices)
     if time is not None and n > 2:
-        yield _Shift(CubicSpline(time, mean[:, k]), time)
-        yield from _steps(n, len(k), units, time)
+        yield from _shift(a, b, time, courses)
+        yield from _steps(n, units, time, choices)
     for name, temperature in temperatures.items():
         change = temperature - temperature[0]
         if np.ptp(change) > 0:
             labels = tuple((label, f"{unit}/K") for label, unit in units)
-            yield _Candidate(f"expansion with {name}", _columns(change, len(k)), labels)
+            yield _Candidate(f"expansion with {name}", _columns(change, len(k)), labels, choices=choices)
+
+
+def _shift(a: Estimate, b: Estimate, time: Array, courses: Mapping[str, Course]) -> Iterator[_Shift]:
+    found = {
+        sign: courses.get(each.name) or smooth(time, each.value, np.sqrt(np.diagonal(each.own, axis1=1, axis2=2)))
+        for each, sign in ((a, 1.0), (b, -1.0))
+    }
+    known = {sign: course for sign, course in found.items() if course is not None}
+    if known:
+        sign = max(known, key=lambda sign: known[sign].instants)
+        yield _Shift(known[sign], sign, time)
 
 
 def _geometric(E: Array, k: list[int]) -> Iterator[_Candidate]:
@@ -274,7 +310,9 @@ def _functional_point(turn: Array, k: list[int], name: str) -> Iterator[_Candida
             lever[axis, :, :3] = np.cross(turn, np.eye(3)[axis])
         used = [axis for axis in range(3) if np.abs(lever[axis][:, k]).max() > 0]
         labels = tuple(("XYZ"[axis], "m") for axis in used)
-        yield _Candidate(name, lever[used][:, :, k], labels)
+        together = tuple(range(len(used)))
+        choices = tuple(dict.fromkeys([*((i,) for i in together), together]))
+        yield _Candidate(name, lever[used][:, :, k], labels, choices=choices)
 
 
 def _scales(E: Array, k: list[int], freedoms: Sequence[str]) -> Iterator[_Candidate]:
@@ -312,7 +350,7 @@ def _fixed(a: Estimate, b: Estimate, freedoms: Sequence[str]) -> Iterator[_Corre
             back = np.diag(np.where(inside, 1 / factor, 1.0))
             for wrong in (a, b):
                 pair = (_mapped(a, back), b) if wrong is a else (a, _mapped(b, back))
-                yield _Corrected(f"unit of '{wrong.name}': {what}", *pair)
+                yield _Corrected(f"unit of '{wrong.name}': {what}", *pair, stretch=np.diag(back))
 
 
 def _mapped(each: Estimate, A: Array) -> Estimate:
@@ -325,13 +363,15 @@ def _mapped(each: Estimate, A: Array) -> Estimate:
     )
 
 
-def _steps(n: int, d: int, units: tuple[tuple[str, str], ...], time: Array) -> Iterator[_Candidate]:
+def _steps(
+    n: int, units: tuple[tuple[str, str], ...], time: Array, choices: tuple[tuple[int, ...], ...]
+) -> Iterator[_Candidate]:
     """Yield a step at each instant: something was moved or struck."""
     instants = np.unique(np.linspace(2, max(n - 2, 2), max(min(n - 3, MOST_STEPS), 0)).astype(int)).tolist()
     for i in instants:
         after = np.where(np.arange(n) >= i, 1.0, 0.0)
         name = f"step at {time[i]:.0f} s (something moved)"
-        yield _Candidate(name, _columns(after, d), units, tries=len(instants))
+        yield _Candidate(name, _columns(after, len(units)), units, tries=len(instants), kind="step", choices=choices)
 
 
 def _columns(profile: Array, d: int) -> Array:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled, products
 from errormotion.compare import chain
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
-from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.interpolation import bracket, interpolated
+from errormotion.datasets.reduction import changes, influence_of
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF
@@ -47,6 +48,8 @@ class Ground:
     notes : list of str
     turns : dict of str to ndarray (n, 3)
         Rotations of each dataset that states any, rad, 0 where unknown; also where they are not compared.
+    records : dict of str to Dataset
+        The datasets over time as they are, at the functional point and on the common time axis.
     labels : dict of str to str
         Identity of a source to its name.
     """
@@ -63,6 +66,7 @@ class Ground:
     start: str = ""
     notes: list[str] = field(default_factory=list)
     turns: dict[str, Array] = field(default_factory=dict)
+    records: dict[str, xr.Dataset] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
 
 
@@ -100,10 +104,7 @@ def common_ground(
         raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
     for name, ds in datasets.items():
         _check(name, ds)
-    for i, name in enumerate(names):
-        for other in names[:i]:
-            if datasets[name].identical(datasets[other]):
-                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+    _once(datasets)
     notes: list[str] = []
     datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
     if chain.axis_of(datasets):
@@ -117,45 +118,58 @@ def common_ground(
     machine, frame = _same(datasets, "machine"), _same(datasets, "frame")
     dim = _dimension(datasets)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
-    moved = {name: ds if component == "beam" else ds.em.at(point) for name, ds in datasets.items()}
+    moved = {
+        name: ds if component == "beam" or np.array_equal(point, ds.attrs["functional_point"]) else _at(name, ds, point)
+        for name, ds in datasets.items()
+    }
     reference: float | None = None
+    records: dict[str, xr.Dataset] = {}
     if dim == "time":
-        moved, reference = _in_time(moved, since, same_start, notes)
-    elif dim:
-        moved = _in_place(moved, dim, notes)
-    seen = [_seen(ds) for ds in moved.values()]
+        records = _on_one_axis(moved, same_start, notes)
+        placed, grid = _in_time(records, since, notes)
+        reference = float(grid[0])
+        coords = {"time": xr.DataArray(grid, dims=("time",), attrs=first["time"].attrs)}
+    else:
+        found = _in_place(moved, dim, notes) if dim else moved
+        placed = {name: Placed.of(ds) for name, ds in found.items()}
+        coords = _coordinates(next(iter(found.values())), dim)
+    seen = [each.seen for each in placed.values()]
     chosen = tuple(name for name in (freedoms or DOF) if all(name in each for each in seen))
     for name in freedoms:
-        for dataset, each in zip(moved, seen, strict=True):
+        for dataset, each in zip(placed, seen, strict=True):
             if name not in each:
                 raise DatasetError(f"'{dataset}' does not state {name}; it states {', '.join(each) or 'nothing'}")
     if not chosen:
-        states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(moved, seen, strict=True))
+        states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(placed, seen, strict=True))
         raise DatasetError(f"The datasets have no freedom in common: {states}")
-    estimates = [_estimate(name, ds, chosen) for name, ds in moved.items()]
-    grid = next(iter(moved.values()))
-    coords = {str(name): grid[name] for name in grid.coords if dim and grid[name].dims == (dim,) and name != "source"}
+    _check_rotations(moved, chosen)
     return Ground(
-        estimates=estimates,
+        estimates=[each.estimate(name, chosen) for name, each in placed.items()],
         dim=dim,
-        coords={name: value.drop_vars(set(value.coords) - {name}) for name, value in coords.items()},
+        coords=coords,
         freedoms=chosen,
         component=component,
         machine=machine,
         frame=frame,
         point=point,
         since=reference,
-        start=str(grid.attrs.get("start", "")),
+        start=str(first.attrs.get("start", "")),
         notes=notes,
-        turns={name: turn for name, ds in moved.items() if (turn := _turns(ds)).any()},
-        labels={identity: name for ds in moved.values() for identity, name in _labels(ds)},
+        turns={name: turn for name, each in placed.items() if (turn := each.turns).any()},
+        records=records,
+        labels={
+            identity: source
+            for each in placed.values()
+            for identity, source in zip(each.identity, each.source, strict=True)
+            if identity
+        },
     )
 
 
 def _check(name: str, ds: xr.Dataset) -> None:
     try:
         validate(ds)
-        ds.em  # noqa: B018 - refuses what is no error dataset
+        ds.em.names  # noqa: B018 - refuses what is no error dataset
     except DatasetError as error:
         raise DatasetError(f"'{name}': {error}") from None
     if ds.em.names != DOF:
@@ -172,6 +186,17 @@ def _check_dimensions(name: str, ds: xr.Dataset) -> None:
         )
 
 
+def _once(datasets: Mapping[str, xr.Dataset]) -> None:
+    """Refuse one dataset under two names; only those with the same values are compared as a whole."""
+    seen: dict[bytes, list[str]] = {}
+    for name, ds in datasets.items():
+        alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
+        for other in alike:
+            if datasets[name].identical(datasets[other]):
+                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+        alike.append(name)
+
+
 def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str, str] | None = None) -> str:
     found = {name: str(ds.attrs[attribute]) for name, ds in datasets.items()}
     values = {(alike or {}).get(value, value) for value in found.values()}
@@ -186,6 +211,33 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
     return values.pop()
 
 
+def _at(name: str, ds: xr.Dataset, point: Array) -> xr.Dataset:
+    try:
+        moved: xr.Dataset = ds.em.at(point)
+    except DatasetError as error:
+        own = ",".join(f"{1e3 * each:g}" for each in ds.attrs["functional_point"])
+        raise DatasetError(f"'{name}': {error}, or compare at its own point (--at {own})") from None
+    return moved
+
+
+def _check_rotations(datasets: Mapping[str, xr.Dataset], freedoms: Sequence[str]) -> None:
+    """Refuse rotations of different bodies: of the tool, and of the frame of the axes that a probe sees."""
+    turns = [name for name in freedoms if name in DOF[3:]]
+    levers = {name: str(ds.attrs.get("lever_axes", "XYZ")) for name, ds in datasets.items()}
+    if turns and len(set(levers.values())) > 1:
+        stated = "; ".join(f"'{name}': {axes}" for name, axes in levers.items())
+        raise DatasetError(
+            f"The rotations ({', '.join(turns)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
+            "is one rigid motion of the tool, anything less the frame of the axes that carry the tool. Compare the "
+            f"displacements: {_displacements(freedoms)}"
+        )
+
+
+def _displacements(freedoms: Sequence[str]) -> str:
+    left = [name for name in freedoms if name in DOF[:3]]
+    return f"--freedoms {','.join(left)}" if left else "these datasets have none in common"
+
+
 def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     dims = {name: ds["EX"].dims for name, ds in datasets.items()}
     if len(set(dims.values())) > 1:
@@ -195,10 +247,8 @@ def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     return str(found[0]) if found else ""
 
 
-def _in_time(
-    datasets: Mapping[str, xr.Dataset], since: float | None, same_start: bool, notes: list[str]
-) -> tuple[dict[str, xr.Dataset], float]:
-    """Return the datasets on the instants of the sparsest one, as changes since a common instant."""
+def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: list[str]) -> dict[str, xr.Dataset]:
+    """Return the datasets with their times counted from the start of the first one."""
     names = list(datasets)
     starts = {name: str(ds.attrs.get("start", "")) for name, ds in datasets.items()}
     missing = [name for name, start in starts.items() if not start]
@@ -209,12 +259,19 @@ def _in_time(
             "(same_start, --same-start)"
         )
     if missing:
-        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} states no start.")
+        notes.append(f"Time 0 of all datasets is taken as the same instant: {', '.join(missing)} without start.")
     offset = {name: 0.0 if missing else between(starts[names[0]], start) for name, start in starts.items()}
-    shifted = {
+    return {
         name: ds.assign_coords(time=("time", ds["time"].values + offset[name], ds["time"].attrs))
         for name, ds in datasets.items()
     }
+
+
+def _in_time(
+    shifted: Mapping[str, xr.Dataset], since: float | None, notes: list[str]
+) -> tuple[dict[str, Placed], Array]:
+    """Return the datasets on the instants of the sparsest one, as changes since a common instant, and the instants."""
+    names = list(shifted)
     known = {name: ds["time"].values[_known(ds)] for name, ds in shifted.items()}
     first = max((times[0] if times.size else np.inf) for times in known.values())
     last = min((times[-1] if times.size else -np.inf) for times in known.values())
@@ -232,16 +289,37 @@ def _in_time(
         grid = np.concatenate([[since], grid])
         if not first <= since <= last:
             raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+    others = [name for name in names if name != sparse]
+    kept = _apart(grid, [shifted[name]["time"].values for name in others])
+    if (~kept).any():
+        notes.append(
+            f"{int((~kept).sum())} of {grid.size} instants are left out, so that no two interpolated values share a "
+            "measured one."
+        )
+        grid = grid[kept]
     if grid.size < 2:
         raise DatasetError("The datasets have fewer than two common instants; a change needs a reference and a value")
-    others = [name for name in names if name != sparse]
     notes.append(f"Grid: the {grid.size} instants of '{sparse}'; interpolated: {', '.join(others)}.")
-    placed = {name: ds.em.to_times(grid).em.since(float(grid[0])) for name, ds in shifted.items()}
-    start = starts[names[0]]
-    for ds in placed.values():
-        ds["time"] = ("time", grid, ds["time"].attrs)
-        ds.attrs["start"] = start
-    return placed, float(grid[0])
+    placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
+    for name, each in placed.items():
+        if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
+            raise DatasetError(
+                f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state"
+            )
+    return {name: each.since_first() for name, each in placed.items()}, grid
+
+
+def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return which instants of a grid are kept so that each value of a dataset serves for one of them at most."""
+    used = np.array([bracket(t, grid) for t in times])  # (dataset, before and after, instant)
+    kept = np.ones(grid.size, dtype=bool)
+    if (used[:, 0, 1:] > used[:, 1, :-1]).all():
+        return kept
+    last = np.full(len(times), -1)
+    for i in range(grid.size):
+        kept[i] = bool((used[:, 0, i] > last).all())
+        last = used[:, 1, i] if kept[i] else last
+    return kept
 
 
 def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) -> dict[str, xr.Dataset]:
@@ -287,37 +365,60 @@ def _match(point: Any, points: list[Any]) -> int | None:
     return points.index(point) if point in points else None
 
 
-def _known(ds: xr.Dataset) -> Array:
-    values = ds.em.twist().values
-    known: Array = np.isfinite(values).any(axis=-1)
+def _known(ds: xr.Dataset) -> NDArray[np.bool_]:
+    known: NDArray[np.bool_] = np.isfinite(np.stack([ds[name].values for name in DOF])).any(axis=0)
     return known
 
 
-def _seen(ds: xr.Dataset) -> list[str]:
-    return [name for name in DOF if np.isfinite(ds[name].values).any()]
+def _coordinates(ds: xr.Dataset, dim: str) -> dict[str, xr.DataArray]:
+    coords = {str(name): ds[name] for name in ds.coords if dim and ds[name].dims == (dim,) and name != "source"}
+    return {name: value.drop_vars(set(value.coords) - {name}) for name, value in coords.items()}
 
 
-def _labels(ds: xr.Dataset) -> list[tuple[str, str]]:
-    if "source_id" not in ds.coords:
-        return []
-    pairs = zip(ds["source_id"].values.tolist(), ds["source"].values.tolist(), strict=True)
-    return [(str(identity), str(name)) for identity, name in pairs if identity]
+@dataclass(frozen=True)
+class Placed:
+    """Errors of one dataset at n points as arrays: values (n, 6), covariance (n, 6, 6), influence (source, n, 6)."""
 
+    value: Array
+    total: Array
+    influence: Array
+    source: list[str]
+    identity: list[str]
 
-def _turns(ds: xr.Dataset) -> Array:
-    found: Array = np.nan_to_num(ds.em.twist().values.reshape(-1, 6)[:, 3:])
-    return found
+    @classmethod
+    def of(cls, ds: xr.Dataset) -> Placed:
+        """Read a dataset with one dimension or none."""
+        value = np.stack([np.asarray(ds[name].values, dtype=float) for name in DOF], axis=-1).reshape(-1, 6)
+        F = influence_of(ds)
+        source = [str(each) for each in ds["source"].values.tolist()] if len(F) else []
+        identity = ds["source_id"].values.tolist() if len(F) and "source_id" in ds.coords else [""] * len(F)
+        total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)
+        return cls(value, total, F.reshape(len(F), len(value), 6), source, [str(each) for each in identity])
 
+    @property
+    def seen(self) -> list[str]:
+        """Freedoms with known values."""
+        return [name for name, values in zip(DOF, self.value.T, strict=True) if np.isfinite(values).any()]
 
-def _estimate(name: str, ds: xr.Dataset, freedoms: Sequence[str]) -> Estimate:
-    k = [DOF.index(freedom) for freedom in freedoms]
-    value = ds.em.twist().values.reshape(-1, 6)[:, k]
-    F = influence_of(ds)
-    F = F.reshape(len(F), len(value), 6)[..., k]
-    total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)[:, k][:, :, k]
-    own = total - np.einsum("sni,snj->nij", F, F)
-    size = len(F)
-    sources = ds["source"].values.tolist() if size else []
-    ids = ds["source_id"].values.tolist() if size and "source_id" in ds.coords else [""] * size
-    keys = tuple(identity or f"{name}: {source}" for identity, source in zip(ids, sources, strict=True))
-    return Estimate(name, value, own, F, keys)
+    @property
+    def turns(self) -> Array:
+        """Rotations (n, 3), 0 where unknown."""
+        return filled(self.value[:, 3:])
+
+    def at_times(self, time: Array, grid: Array) -> Placed:
+        """Return the errors at other instants."""
+        E, C, F, _ = interpolated(np.asarray(time, dtype=float), self.value, self.total, self.influence, grid)
+        return replace(self, value=E, total=C, influence=F)
+
+    def since_first(self) -> Placed:
+        """Return the changes since the first point."""
+        E, C, F, further = changes(self.value, self.total, self.influence, np.arange(len(self.value)) == 0)
+        return Placed(E, C, F, [*self.source, *further], [*self.identity, *[""] * len(further)])
+
+    def estimate(self, name: str, freedoms: Sequence[str]) -> Estimate:
+        """Return some freedoms as an estimate; a source without identity is of this dataset alone."""
+        k = [DOF.index(freedom) for freedom in freedoms]
+        F = self.influence[..., k]
+        own = self.total[:, k][:, :, k] - products(F)
+        keys = (identity or f"{name}: {source}" for identity, source in zip(self.identity, self.source, strict=True))
+        return Estimate(name, self.value[:, k], own, F, tuple(keys))

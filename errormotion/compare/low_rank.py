@@ -2,8 +2,12 @@
 
 For n points with d freedoms and s sources the covariance is ``V = D + F F'`` with blocks D (n, d, d) and F (n d, s).
 By the matrix inversion lemma ``V^-1 = D^-1 - D^-1 F (1 + F' D^-1 F)^-1 F' D^-1`` only matrices of s x s are inverted.
-A direction without variance of its own, such as that of the reference state, has no inverse in D: it is left out where
-its variance is 0 in F as well, and enters F where it is not. The degrees of freedom are what remains.
+
+A direction without variance of its own, such as that of a reference state, has no inverse in D. There the sources must
+explain the whole value: with F = (G, H) on the directions with and without own variance, and the singular values
+``H = U S W'``, the sources are ``z = W S^-1 U' h + W0 t`` with ``W0' W = 0``. The square of a vector (g, h) is then
+``|S^-1 U' h|^2`` plus that of ``g - G W S^-1 U' h`` with the covariance ``1 + G W0 W0' G'``. This is ``a' V^+ a`` with
+the pseudo-inverse for every vector that V can produce. What no variance allows has no weight.
 """
 
 from __future__ import annotations
@@ -11,8 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled
 
 LEAST = 1e-12
 """Share of the largest variance of a freedom below which a direction counts as without variance of its own."""
@@ -25,14 +30,21 @@ class Whitener:
     Attributes
     ----------
     degrees : int
-        Directions with variance.
+        Directions with variance: the rank of the covariance.
+    log_determinant : float
+        Of the covariance over these directions.
     """
 
     scale: Array  # (d,)
     root: Array  # (n, d, d): root_i' D_i root_i = projector
-    factor: Array  # (k, k) Cholesky factor of 1 + G'G
-    G: Array  # (n d, k): whitened influence
+    bound: Array  # (m, d): the directions without own variance that sources move, scaled
+    at: NDArray[np.intp]  # (m,) their points
+    pinned: Array  # (r, m): S^-1 U'
+    carried: Array  # (n d, r): G W
+    G: Array  # (n d, k): whitened influence of what the bound directions leave free
+    factor: Array  # (k, k) inverse Cholesky factor of 1 + G'G
     degrees: int
+    log_determinant: float
 
     def product(self, a: Array, b: Array) -> Array:
         """Return ``a' V^-1 b`` for arrays (p, n, d) and (q, n, d); NaN counts as unknown, and has no weight.
@@ -41,19 +53,24 @@ class Whitener:
         -------
         ndarray, (p, q)
         """
-        wa, wb = self._white(a), self._white(b)
-        ga, gb = (np.linalg.solve(self.factor, self.G.T @ w.T) for w in (wa, wb))
-        result: Array = wa @ wb.T - ga.T @ gb
+        first = self._white(a)
+        second = first if b is a else self._white(b)
+        (free, explained, pinned), (its_free, its_explained, its_pinned) = first, second
+        result: Array = free @ its_free.T - explained @ its_explained.T + pinned @ its_pinned.T
         return result
 
     def square(self, a: Array) -> float:
         """Return ``a' V^-1 a`` of one array (n, d): a chi-square with `degrees` degrees of freedom."""
-        return float(self.product(a[None], a[None])[0, 0])
+        one = a[None]
+        return float(self.product(one, one)[0, 0])
 
-    def _white(self, a: Array) -> Array:
-        filled = np.nan_to_num(np.asarray(a, dtype=float)) / self.scale
-        white: Array = np.einsum("nji,pnj->pni", self.root, filled).reshape(len(filled), -1)
-        return white
+    def _white(self, a: Array) -> tuple[Array, Array, Array]:
+        """Return what is squared: the rest with own variance, less what sources explain of it, and the sources."""
+        scaled = filled(a) / self.scale  # (p, n, d)
+        pinned = np.einsum("pmd,md->pm", scaled[:, self.at], self.bound) @ self.pinned.T  # (p, r)
+        free = np.matmul(scaled[:, :, None, :], self.root)[:, :, 0].reshape(len(scaled), -1)
+        free = free - pinned @ self.carried.T
+        return free, (free @ self.G) @ self.factor.T, pinned
 
 
 def whitener(own: Array, influence: Array) -> Whitener:
@@ -62,31 +79,32 @@ def whitener(own: Array, influence: Array) -> Whitener:
     Directions with no variance at all carry no weight, so that a value that is known exactly on both sides of a
     difference (the zero of a reference state) is no evidence.
     """
-    own, F = np.nan_to_num(own), np.nan_to_num(influence)
-    total = np.einsum("nii->ni", own) + (F**2).sum(axis=0)
+    own, F = filled(own), filled(influence)
+    n, d = own.shape[:2]
+    total = np.diagonal(own, axis1=1, axis2=2) + np.square(F).sum(axis=0)
     scale = np.sqrt(total.max(axis=0, initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    D, F = own / np.multiply.outer(scale, scale), F / scale
+    D = own / np.multiply.outer(scale, scale)
+    F = np.moveaxis(F, 0, -1) / scale[:, None]  # (n, d, s)
     power, vectors = np.linalg.eigh(D)
     strong = power > LEAST
-    # What has no variance of its own but is moved by sources would be infinitely stiff: LEAST is added to it.
-    moved = np.einsum("nji,snj->sni", vectors, F)
-    weak = ~strong & ((moved**2).sum(axis=0) > LEAST)
-    power = np.where(weak, LEAST, power)
-    kept = strong | weak
-    root = vectors * np.where(kept, 1 / np.sqrt(np.where(kept, power, 1.0)), 0.0)[:, None, :]
-    G = np.einsum("nji,snj->nis", root, F).reshape(D[..., 0].size, len(F))
-    inner = np.eye(len(F)) + G.T @ G
-    factor = np.linalg.cholesky(inner)
-    # Directions that sources alone move: no more of them are free than the sources can reach.
-    degrees = int(strong.sum()) + _reached(root, F, weak)
-    return Whitener(scale, root, factor, G, degrees)
-
-
-def _reached(root: Array, F: Array, weak: Array) -> int:
-    """Return the rank of the sources over the directions that have no variance of their own."""
-    if not weak.any():
-        return 0
-    rows = np.einsum("nji,snj->nis", root, F)[weak]  # (weak directions, s)
-    size = np.linalg.svd(rows, compute_uv=False)
-    return int((size > 1e-6 * size.max(initial=0.0)).sum()) if size.size else 0
+    root = vectors * np.where(strong, 1 / np.sqrt(np.where(strong, power, 1.0)), 0.0)[:, None, :]
+    G = np.matmul(np.swapaxes(root, 1, 2), F).reshape(n * d, -1)
+    at, column = np.nonzero(~strong)
+    bound = vectors[at, :, column]
+    H = np.matmul(bound[:, None, :], F[at])[:, 0]  # (m, s)
+    # The singular values of H by a QR decomposition: nothing is as large as the points squared.
+    q, r = np.linalg.qr(H)
+    left, size, right = np.linalg.svd(r, full_matrices=True)
+    rank = int((size > np.sqrt(LEAST)).sum())
+    pinned = (q @ left[:, :rank] / size[:rank]).T
+    fixed, rest = right[:rank].T, right[rank:].T
+    carried, G = (G @ fixed, G @ rest) if rank else (G[:, :0], G)
+    root_of_inner = np.linalg.cholesky(np.eye(G.shape[1]) + G.T @ G)
+    factor = np.linalg.inv(root_of_inner)
+    log_determinant = (
+        2 * float((total > 0).sum(axis=0) @ np.log(scale))
+        + float(np.log(power[strong]).sum())
+        + 2 * float(np.log(size[:rank]).sum() + np.log(np.diag(root_of_inner)).sum())
+    )
+    return Whitener(scale, root, bound, at, pinned, carried, G, factor, int(strong.sum()) + rank, log_determinant)

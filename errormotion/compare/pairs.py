@@ -57,8 +57,7 @@ class Pair:
 def pair(a: Estimate, b: Estimate) -> Pair:
     """Compare two estimates on one grid; what both share, by the keys of their sources, cancels."""
     d = difference(a, b)
-    variance = np.diagonal(d.covariance(), axis1=1, axis2=2)
-    u = np.sqrt(np.maximum(variance, 0.0))
+    u = np.sqrt(np.maximum(d.variance(), 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         en = np.where(u > 0, d.value / (COVERAGE_FACTOR * u), np.nan)
     curves = []

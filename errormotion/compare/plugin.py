@@ -17,3 +17,4 @@ class ComparisonDataset:
     )
     violations = lazy("errormotion.compare.result:violations")
     chapters = lazy("errormotion.compare.report:chapters")
+    plot = lazy("errormotion.compare.report.picture:plot")

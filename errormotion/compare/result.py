@@ -14,6 +14,7 @@ from errormotion.compare.consensus import Consensus
 from errormotion.compare.diagnosis import Cause
 from errormotion.compare.ground import Ground
 from errormotion.compare.pairs import Pair
+from errormotion.compare.repeats import KINDS, Repeats
 from errormotion.compare.stack import Estimate, shared
 from errormotion.errors import DatasetError
 
@@ -57,12 +58,26 @@ TABLE: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
+#: Variables of a comparison with groups; all of them or none.
+REPEATS: dict[str, tuple[tuple[str, ...], str]] = {
+    "group": (("dataset",), "what the datasets are grouped by: test, operator, instrument or method"),
+    "spread": (("kind", "dof"), "standard deviation found: repeatability, between groups, reproducibility; m, rad"),
+    "spread_low": (("kind", "dof"), "lower end of its interval of 95 %; m, rad"),
+    "spread_high": (("kind", "dof"), "upper end; m, rad"),
+    "spread_degrees": (("kind", "dof"), "effective degrees of freedom; NaN for a difference of mean squares"),
+    "spread_stated": (("kind", "dof"), "standard deviation that the stated uncertainties let expect; m, rad"),
+    "spread_p": (("kind", "dof"), "probability of a larger spread if the stated uncertainties are right"),
+    "common": (("dof",), "stated standard uncertainty that all groups share and no repeat shows; m, rad"),
+}
+
+
 def build(
     ground: Ground,
     pairs: Sequence[Pair],
     agreed: Consensus,
     robust: tuple[Array, Array, Array],
     causes: Sequence[Sequence[Cause]],
+    spread: Repeats | None = None,
 ) -> xr.Dataset:
     """Return the result of a comparison as a dataset of the schema."""
     estimates = ground.estimates
@@ -95,7 +110,12 @@ def build(
             values = np.take(values, 0, axis=dims.index("..."))
         names = [ground.dim if dim == "..." else dim for dim in dims if not (dim == "..." and single)]
         variables[name] = (names, values, {"long_name": meaning})
+    if spread is not None:
+        groups = {f"spread{end}": getattr(spread, name) for end, name in _SPREAD.items()}
+        groups |= {"group": spread.groups, "common": spread.common}
+        variables |= {name: (dims, groups[name], {"long_name": text}) for name, (dims, text) in REPEATS.items()}
     coords: dict[str, Any] = {
+        **({"kind": list(KINDS)} if spread is not None else {}),
         "dataset": [each.name for each in estimates],
         "pair": [f"{each.a} - {each.b}" for each in pairs],
         "dof": list(ground.freedoms),
@@ -125,6 +145,9 @@ def build(
     return ds
 
 
+_SPREAD = {"": "value", "_low": "low", "_high": "high", "_degrees": "degrees", "_stated": "stated", "_p": "p"}
+
+
 def _causes(causes: Sequence[Sequence[Cause]]) -> dict[str, Any]:
     most = max([1, *(len(cause.sizes) for each in causes for cause in each[:CAUSES])])
     shape = (len(causes), CAUSES)
@@ -151,23 +174,24 @@ def _causes(causes: Sequence[Sequence[Cause]]) -> dict[str, Any]:
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema, one sentence each."""
     found = [f"attribute '{name}': missing" for name in ("machine", "component", "frame") if name not in ds.attrs]
-    own = {dim for dims, _ in TABLE.values() for dim in dims}
+    table = TABLE | (REPEATS if REPEATS.keys() & set(ds.variables) else {})
+    own = {dim for dims, _ in table.values() for dim in dims}
     value = ds.variables.get("value")
     common = [dim for dim in (() if value is None else value.dims) if dim not in own]
     if len(common) > 1:
         found.append(f"value: expected one common dimension at most; found {', '.join(map(str, common))}")
-    for name, (dims, meaning) in TABLE.items():
+    for name, (dims, meaning) in table.items():
         if name not in ds.variables:
             found.append(f"{name}: missing; expected {meaning}")
             continue
         expected = tuple(part for dim in dims for part in (common if dim == "..." else [dim]))
         if ds.variables[name].dims != expected:
             found.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {ds.variables[name].dims}")
-    for name in ("dataset", "pair", "dof", "dof_"):
+    for name in ("dataset", "pair", "dof", "dof_", "kind"):
         if name in ds.dims and name not in ds.coords:
             found.append(f"{name}: missing; expected its labels")
     if not found:
-        for name in ("p", "curve_p", "misfit_p", "rest_p"):
+        for name in ("p", "curve_p", "misfit_p", "rest_p", *(["spread_p"] if "spread_p" in ds.variables else [])):
             values = ds.variables[name].values
             if values.dtype.kind != "f" or ((values < 0) | (values > 1)).any():
                 found.append(f"{name}: expected probabilities from 0 to 1")

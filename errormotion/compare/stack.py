@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,14 @@ class Estimate:
 
     def covariance(self) -> Array:
         """Return the total covariance at every point, (n, d, d)."""
-        total: Array = self.own + np.einsum("sni,snj->nij", self.influence, self.influence)
+        total: Array = self.own + products(self.influence)
+        return total
+
+    def variance(self) -> Array:
+        """Return the total variance of every value, (n, d)."""
+        total: Array = np.diagonal(self.own, axis1=1, axis2=2) + np.einsum(
+            "sni,sni->ni", self.influence, self.influence
+        )
         return total
 
     def scaled(self, weight: float) -> Estimate:
@@ -60,9 +67,19 @@ def difference(a: Estimate, b: Estimate) -> Estimate:
         name=f"{a.name} - {b.name}",
         value=a.value - b.value,
         own=a.own + b.own,
-        influence=gathered(a, keys) - gathered(b, keys),
+        influence=_gathered_difference(a, b, keys),
         source=keys,
     )
+
+
+def _gathered_difference(a: Estimate, b: Estimate, keys: Sequence[str]) -> Array:
+    nothing = np.where(a.known & b.known, 0.0, np.nan)
+    found = np.broadcast_to(nothing, (len(keys), *nothing.shape)).copy()
+    place = {key: k for k, key in enumerate(keys)}
+    for estimate, add in ((a, np.add), (b, np.subtract)):
+        for key, row in zip(estimate.source, estimate.influence, strict=True):
+            add(found[place[key]], row, out=found[place[key]])
+    return found
 
 
 def gathered(estimate: Estimate, keys: Sequence[str]) -> Array:

@@ -20,6 +20,43 @@ MOST_SHARED = 6
 """Shared sources that are named."""
 
 
+class Spread(NamedTuple):
+    """One component of the spread of a freedom, ready to be printed."""
+
+    freedom: str
+    kind: str
+    value: str
+    interval: str
+    stated: str
+    p: str
+    unit: str
+
+
+def spreads(ds: xr.Dataset) -> list[Spread]:
+    """Return repeatability and reproducibility of a comparison with groups; nothing without groups."""
+    if "spread" not in ds.variables:
+        return []
+    found = []
+    for k, freedom in enumerate(str(name) for name in ds["dof"].values):
+        factor, unit = (1e6, "um") if freedom in ("EX", "EY", "EZ") else FIELD["rad"]
+        for i, kind in enumerate(str(name) for name in ds["kind"].values):
+            value, low, high, stated = (
+                factor * float(ds[name].values[i, k])
+                for name in ("spread", "spread_low", "spread_high", "spread_stated")
+            )
+            if np.isfinite(value):
+                p = probability(float(ds["spread_p"].values[i, k]))
+                interval = f"{low:.3g} to {high:.3g}"
+                found.append(Spread(freedom, kind, f"{value:.3g}", interval, f"{stated:.3g}", p, unit))
+        common = factor * float(ds["common"].values[k])
+        if np.isfinite(common):
+            found.append(Spread(freedom, "shared by all", "", "", f"{common:.3g}", "", unit))
+    return found
+
+
+SPREAD_HEAD = ["freedom", "standard deviation", "found", "95 % interval", "stated", "p", "unit"]
+
+
 class CauseText(NamedTuple):
     """One cause, ready to be printed."""
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from errormotion import plugins
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import COMPONENTS, DOF, SCHEMA
 from errormotion.errors import DatasetError
@@ -29,7 +30,41 @@ class Combination(NamedTuple):
     covariance: xr.DataArray
 
 
-@xr.register_dataset_accessor("em")  # type: ignore[no-untyped-call]
+class Pictured:
+    """The accessor ``ds.em`` of datasets that their plugin draws, such as comparisons: ``ds.em.plot()`` alone."""
+
+    def __init__(self, ds: xr.Dataset, draw: Callable[[xr.Dataset], Figure]) -> None:
+        self._ds = ds
+        self._draw = draw
+
+    def plot(self) -> Figure:
+        """Return the figure of the dataset."""
+        return self._draw(self._ds)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        raise _no_errors(self._ds, f"'.em.{name}'")
+
+
+def _no_errors(ds: xr.Dataset, asked: str) -> DatasetError:
+    schema = ds.attrs.get("schema")
+    hint = ". Identify a raw dataset first" if str(schema).startswith("errormotion.raw.") or schema is None else ""
+    return DatasetError(
+        f"{asked} belongs to error datasets (attribute schema = '{SCHEMA}'); found schema = {schema!r}{hint}"
+    )
+
+
+def _accessor(ds: xr.Dataset) -> ErrorMotion | Pictured:
+    schema = ds.attrs.get("schema")
+    owner = plugins.owner_of_schema(schema) if isinstance(schema, str) and schema != SCHEMA else None
+    draw = getattr(owner, "plot", None)
+    return ErrorMotion(ds) if draw is None else Pictured(ds, draw)
+
+
+xr.register_dataset_accessor("em")(_accessor)  # type: ignore[no-untyped-call]
+
+
 class ErrorMotion:
     """The accessor ``ds.em`` of error datasets.
 
@@ -41,10 +76,7 @@ class ErrorMotion:
 
     def __init__(self, ds: xr.Dataset) -> None:
         if ds.attrs.get("schema") != SCHEMA:
-            raise DatasetError(
-                f"'.em' belongs to error datasets (attribute schema = '{SCHEMA}'); "
-                f"found schema = {ds.attrs.get('schema')!r}. Identify a raw dataset first"
-            )
+            raise _no_errors(ds, "'.em'")
         self._ds = ds
 
     @property
@@ -124,7 +156,8 @@ class ErrorMotion:
         Raises
         ------
         DatasetError
-            Not three finite coordinates, or beams: each is stated about its own zero point, and has no common one.
+            Not three finite coordinates; beams, each of which is stated about its own zero point; a shift along an axis
+            that is no lever of the rotations (attribute ``lever_axes``).
         """
         target = _point(point)
         if self._ds.attrs.get("component") == "beam":
@@ -132,7 +165,9 @@ class ErrorMotion:
                 "The errors of beams are stated about each beam's own zero point and have no common functional point. "
                 "A beam's origin and direction are in the dataset."
             )
-        moved = self._transformed(twists.adjoint(shift=target - _point(self._ds.attrs["functional_point"])))
+        shift = target - _point(self._ds.attrs["functional_point"])
+        self._check_levers(shift)
+        moved = self._transformed(twists.adjoint(shift=shift))
         return moved.assign_attrs(functional_point=target)
 
     def in_frame(self, pose: RigidTransform, name: str) -> xr.Dataset:
@@ -151,8 +186,14 @@ class ErrorMotion:
         Raises
         ------
         DatasetError
-            Only some of ``x y z`` are known, so that they cannot be transformed.
+            Only some of ``x y z`` are known, so that they cannot be transformed; a rotation of errors with the
+            attribute ``lever_axes``.
         """
+        if "lever_axes" in self._ds.attrs and pose.rotation.magnitude() > 1e-9:
+            raise DatasetError(
+                "The errors are not those of one rigid motion (attribute lever_axes): they have no other directions "
+                "than those of the axes, and cannot be rotated into another frame"
+            )
         ds = self._transformed(twists.adjoint(rotation=pose.rotation))
         present = [axis for axis in "xyz" if axis in ds.variables]
         if len(present) == 3:
@@ -298,6 +339,17 @@ class ErrorMotion:
         from errormotion.datasets.plotting import plot_errors  # matplotlib only when something is drawn
 
         return plot_errors(self._ds)
+
+    def _check_levers(self, shift: Array) -> None:
+        """Refuse a shift along axes whose travel is no lever of the rotations."""
+        levers = str(self._ds.attrs.get("lever_axes", "XYZ"))
+        wrong = [axis for axis, length in zip("XYZ", shift, strict=True) if axis not in levers and abs(length) > 1e-9]
+        if wrong and self._ds.attrs.get("component") != "beam":
+            raise DatasetError(
+                "The errors are not those of one rigid motion (attribute lever_axes): only the travel of "
+                f"{' and '.join(levers)} is a lever of their rotations, and they cannot be moved along "
+                f"{' and '.join(wrong)}. Identify them at the other functional point"
+            )
 
     def _values(self) -> Array:
         return np.asarray(self.estimates().values, dtype=float)

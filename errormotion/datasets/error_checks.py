@@ -8,6 +8,7 @@ hold all that was measured.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Hashable, Sequence
 from datetime import datetime
 from typing import Any
@@ -267,7 +268,7 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
 
 def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
     F = np.asarray(ds.variables["influence"].values, dtype=float)
-    F = F.reshape(F.shape[0], -1, 6)
+    F = F.reshape(F.shape[0], math.prod(F.shape[1:-1]), 6)
     if not np.array_equal(np.isnan(F), np.broadcast_to(unseen, F.shape)):
         return [_pattern("influence", np.isnan(F) != unseen)]
     F = np.where(unseen, 0.0, F) / scale

@@ -4,10 +4,9 @@ Between two neighbours the errors are taken as an integrated Wiener process of i
 line. At the share w of an interval of length h, with nothing known of the slope, it adds the variance
 ``q h^3 w^2 (1 - w)^2 / 3``. The intensity is estimated for each freedom from second differences: with neighbours
 ``a, b, c`` at distances ``h`` and ``g``, the deviation of b from the line through a and c has the variance
-``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a
-warm-up starts, so the intensity of an interval is that of the second differences at its
-ends. Sources that are one draw for
-many values go through the same weights. Nothing is extrapolated.
+``q h^2 g^2 / (3 (h + g))`` plus what the noise of the three adds. Errors bend most when a warm-up starts, so the
+intensity of an interval is that of the second differences at its ends. Sources that are one draw for many values go
+through the same weights. Nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -16,10 +15,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import Array
-from errormotion.datasets.reduction import TOLERANCE, rebuilt
+from errormotion.arrays import Array, products
+from errormotion.datasets.reduction import TOLERANCE, influence_of, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
+
+Places = tuple[NDArray[np.intp], Array, NDArray[np.bool_], NDArray[np.bool_]]
+"""Of each new point: the known one before it, its share of the interval, whether it is one, whether it is inside."""
 
 
 def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> xr.Dataset:
@@ -57,15 +59,41 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
         raise DatasetError(f"{coordinate}: expected values that increase along '{dim}'")
     axis = ds["EX"].dims.index(dim)
     E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
-    F = (
-        np.asarray(ds["influence"].values, dtype=float)
-        if "influence" in ds.variables
-        else np.zeros((0, *ds["EX"].shape, 6))
-    )
-    F = np.moveaxis(F, axis + 1, 1)
+    F = np.moveaxis(influence_of(ds), axis + 1, 1)
     total = np.moveaxis(np.asarray(ds["covariance"].values, dtype=float), axis, 0)
-    own = total - np.einsum("s...i,s...j->...ij", F, F)
+    values, covariance, influence, q = interpolated(t, E, total, F, new)
+    before = _neighbours(t, new)[0]
+    base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
+    base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
+    return rebuilt(
+        base,
+        np.moveaxis(values, 0, axis),
+        np.moveaxis(covariance, 0, axis),
+        np.moveaxis(influence, 1, axis + 1),
+        [],
+        {coordinate: (dim, new, dict(ds[coordinate].attrs))},
+        interpolation_intensity=q.max(axis=tuple(range(q.ndim - 1)), initial=0.0),
+    )
+
+
+def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tuple[Array, Array, Array, Array]:
+    """Return errors at new points with their covariance, influence and intensity; see `to_points`.
+
+    Parameters
+    ----------
+    t, new : ndarray, (n,) and (m,)
+        Known and new points, increasing.
+    E, total, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
+        Errors, total covariance, influence.
+
+    Returns
+    -------
+    E, total, F, q : ndarray, (m, ...)
+    """
     before, share, exact, inside = _neighbours(t, new)
+    if exact.all():
+        return E[before], total[before], F[:, before], np.zeros((1, 6))
+    own = total - products(F)
     after = np.minimum(before + ~exact, len(t) - 1)
     w = share.reshape(-1, *[1] * (E.ndim - 1))
     between = ~exact & inside
@@ -81,19 +109,9 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
     values[~inside] = np.nan
     unknown = np.isnan(values)
     influence[:, unknown] = np.nan
-    covariance = rest + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    covariance = rest + products(influence)
     covariance[unknown[..., :, None] | unknown[..., None, :]] = np.nan
-    base = ds.isel({dim: np.clip(before, 0, len(t) - 1)}).drop_vars(f"{dim}{INDEX}", errors="ignore")
-    base = base.drop_vars([name for name in base.coords if base[name].dims == (dim,) and name != coordinate])
-    return rebuilt(
-        base,
-        np.moveaxis(values, 0, axis),
-        np.moveaxis(covariance, 0, axis),
-        np.moveaxis(influence, 1, axis + 1),
-        [],
-        {coordinate: (dim, new, dict(ds[coordinate].attrs))},
-        interpolation_intensity=q.max(axis=tuple(range(q.ndim - 1)), initial=0.0),
-    )
+    return values, covariance, influence, q
 
 
 def intensity(t: Array, values: Array, own: Array) -> Array:
@@ -124,7 +142,13 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     return found
 
 
-def _neighbours(t: Array, new: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+def bracket(t: Array, new: Array) -> NDArray[np.intp]:
+    """Return the indices of the two known points that the value at each new point is made of, (2, n); alike if one."""
+    before, _, exact, _ = _neighbours(t, new)
+    return np.array([before, np.minimum(before + ~exact, len(t) - 1)])
+
+
+def _neighbours(t: Array, new: Array) -> Places:
     """Return for each new point: the one before it, its share of the interval, whether it is one, whether inside."""
     before = np.clip(np.searchsorted(t, new + TOLERANCE, side="right") - 1, 0, len(t) - 1)
     nearest = np.where(np.abs(t[np.minimum(before + 1, len(t) - 1)] - new) <= TOLERANCE, before + 1, before)

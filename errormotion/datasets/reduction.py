@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
@@ -58,10 +59,42 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
         raise DatasetError(
             f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
         )
-    m = np.maximum(count, 1)
-    own = np.nan_to_num(C - np.einsum("s...i,s...j->...ij", F, F))
-    E_ref = np.where(used[..., None], np.nan_to_num(E), 0.0).sum(axis=0) / m[..., None]
-    F_ref = np.where(used[None, ..., None], np.nan_to_num(F), 0.0).sum(axis=1) / m[None, ..., None]
+    changed, total, influence, further = changes(E, C, F, used)
+    zero = (first + last) / 2
+    values = np.moveaxis(changed, 0, axis)
+    return rebuilt(
+        ds,
+        values,
+        np.moveaxis(total, 0, axis),
+        np.moveaxis(influence, 1, axis + 1),
+        further,
+        {"time": ("time", t - zero, dict(ds["time"].attrs))},
+        reference=f"mean of the errors from {first:g} s to {last:g} s",
+        reference_interval=np.array([first - zero, last - zero]),
+        **_started(ds, zero),
+    )
+
+
+def changes(E: Array, C: Array, F: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, Array, list[str]]:
+    """Return the changes of errors since the mean of some of them, with their covariance; see `since`.
+
+    Parameters
+    ----------
+    E, C, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
+        Errors, total covariance, influence.
+    used : ndarray of bool, (n, ...)
+        Which errors the reference state is the mean of.
+
+    Returns
+    -------
+    E, C, F : ndarray
+    further : list of str
+        Names of the sources that are the uncertainty of the reference state, the last ones of F.
+    """
+    m = np.maximum(used.sum(axis=0), 1)
+    own = filled(C - products(F))
+    E_ref = np.where(used[..., None], filled(E), 0.0).sum(axis=0) / m[..., None]
+    F_ref = np.where(used[None, ..., None], filled(F), 0.0).sum(axis=1) / m[None, ..., None]
     own_ref = np.where(used[..., None, None], own, 0.0).sum(axis=0) / (m**2)[..., None, None]
     rows = _sources_of(own_ref)  # (part, ..., 6)
     rows = np.broadcast_to(rows[:, None], (len(rows), *E.shape)).copy()
@@ -74,21 +107,8 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     nan = np.isnan(E)
     influence[:, nan] = np.nan
     own[nan[..., :, None] | nan[..., None, :]] = np.nan
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
-    zero = (first + last) / 2
-    values = np.moveaxis(E - E_ref, 0, axis)
-    names = [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
-    return rebuilt(
-        ds,
-        values,
-        np.moveaxis(total, 0, axis),
-        np.moveaxis(influence, 1, axis + 1),
-        names,
-        {"time": ("time", t - zero, dict(ds["time"].attrs))},
-        reference=f"mean of the errors from {first:g} s to {last:g} s",
-        reference_interval=np.array([first - zero, last - zero]),
-        **_started(ds, zero),
-    )
+    total = own + products(influence)
+    return E - E_ref, total, influence, [f"{REFERENCE}, part {k + 1}" for k in range(len(rows))]
 
 
 def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
@@ -112,14 +132,14 @@ def mean(ds: xr.Dataset, dim: str) -> xr.Dataset:
     known = ~np.isnan(E)
     count = known.sum(axis=axis)
     weight = np.where(known, 1.0, 0.0) / np.maximum(np.expand_dims(count, axis), 1)
-    F = np.nan_to_num(influence_of(ds))
-    own = np.nan_to_num(np.asarray(ds["covariance"].values) - np.einsum("s...i,s...j->...ij", F, F))
-    value = (weight * np.nan_to_num(E)).sum(axis=axis)
+    F = filled(influence_of(ds))
+    own = filled(np.asarray(ds["covariance"].values) - products(F))
+    value = (weight * filled(E)).sum(axis=axis)
     value[count == 0] = np.nan
     influence = (weight[None] * F).sum(axis=axis + 1)
     influence[:, count == 0] = np.nan
     own = (own * weight[..., :, None] * weight[..., None, :]).sum(axis=axis)
-    total = own + np.einsum("s...i,s...j->...ij", np.nan_to_num(influence), np.nan_to_num(influence))
+    total = own + products(influence)
     total[np.isnan(value)[..., :, None] | np.isnan(value)[..., None, :]] = np.nan
     rest = ds.isel({dim: 0}, drop=True).drop_vars(f"{dim}{INDEX}", errors="ignore")
     return rebuilt(rest, value, total, influence, [], {})

@@ -234,6 +234,8 @@ def reading(path: str | Path) -> Iterator[None]:
         if str(path) not in str(error):
             error.args = (f"{path}: {error}",)
         raise
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise DatasetError(f"{path}: its values cannot be evaluated ({type(error).__name__}: {error})") from error
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         if not any(part in frame.filename for frame in frames for part in _READERS):

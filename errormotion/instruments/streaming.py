@@ -18,6 +18,7 @@ import numpy as np
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import Transport
+from errormotion.instruments.transports.base import CHUNK
 
 POLL_INTERVAL = 0.1
 """Interval at which the thread checks whether it has to end, s."""
@@ -228,7 +229,7 @@ class Reader:
         try:
             while not self._ended:
                 try:
-                    data = self._transport.read(timeout=POLL_INTERVAL)
+                    data = self._transport.read(CHUNK, timeout=POLL_INTERVAL)
                 except InstrumentTimeoutError:
                     continue
                 now = time.monotonic()

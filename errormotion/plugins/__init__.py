@@ -14,6 +14,7 @@ from errormotion.plugins.contracts import (
     Identity,
     Instrument,
     InstrumentInfo,
+    MachineLimits,
     Method,
     MethodInfo,
     Needs,
@@ -26,6 +27,7 @@ from errormotion.plugins.contracts import (
 from errormotion.plugins.kind_registry import contract
 from errormotion.plugins.lazy import lazy, load_object
 from errormotion.plugins.readings import Environment, FrameGeometry, Measurement, Profiles, Scan
+from errormotion.plugins.redrawing import Redraw, Redrawing
 from errormotion.plugins.registry import (
     GROUPS,
     Group,
@@ -55,6 +57,7 @@ __all__ = [
     "Instrument",
     "InstrumentInfo",
     "InstrumentSubject",
+    "MachineLimits",
     "Measurement",
     "Method",
     "MethodInfo",
@@ -63,6 +66,8 @@ __all__ = [
     "Plugin",
     "PluginSettings",
     "Profiles",
+    "Redraw",
+    "Redrawing",
     "Samples",
     "Scan",
     "Status",

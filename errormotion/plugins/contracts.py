@@ -228,6 +228,32 @@ class Step:
     spindle_speed: float = 0.0
 
 
+@dataclass(frozen=True)
+class MachineLimits:
+    """Limits of every order to a machine; what is not stated is not limited.
+
+    Attributes
+    ----------
+    spans : mapping of str to (float, float)
+        Lowest and highest position of X, Y, Z, m.
+    feed : float, optional
+        Highest feed, m/s.
+    spindle_speed : float, optional
+        Highest, 1/min.
+    """
+
+    spans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    feed: float | None = None
+    spindle_speed: float | None = None
+
+    def __str__(self) -> str:
+        """Return the limits as a text."""
+        texts = [f"{axis} {1e3 * low:.6g} to {1e3 * high:.6g} mm" for axis, (low, high) in self.spans.items()]
+        texts += [] if self.feed is None else [f"feed up to {6e4 * self.feed:.6g} mm/min"]
+        texts += [] if self.spindle_speed is None else [f"spindle up to {self.spindle_speed:.6g} /min"]
+        return ", ".join(texts) or "no limits are stated"
+
+
 @runtime_checkable
 class Instrument(Protocol):
     """A driver: one plain class. No communication before ``__enter__`` (or ``open``)."""
@@ -314,6 +340,9 @@ class Method(Protocol):
     ``check_machine(settings, machine)`` : mapping of str to str
         What contradicts the machine, by setting (an empty text for the whole), with what was expected and what was
         found; used when a campaign is read.
+    ``redrawing(raw, settings, errors)`` : `Redrawing`
+        Every source of uncertainty of raw data, to be drawn anew, for ``identify --monte-carlo``; ``errors`` is what
+        ``identify`` made of them.
     ``doctor`` : mapping of str to function
         Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Instruments too.
 

@@ -66,8 +66,10 @@ class InstrumentSubject:
     dead_address : str
         An address at which nothing answers.
     repeats : bool
-        Whether the device gives a reading that was lost once more, such as one whose simulated clock stood still: after
-        a late answer, equal readings are right.
+        Whether the device gives a reading that was lost once more: after a late answer, equal readings are right.
+    vary : callable, optional
+        ``vary(number)`` makes the next reading another one; it is called ahead of each reading whose order is examined.
+        Default: time passes in the simulated world.
     mutants : int
         How many times a recorded session is replayed with a changed frame; 0: never.
     """
@@ -86,6 +88,7 @@ class InstrumentSubject:
     time_limit: float = 10.0
     dead_address: str = "tcp://127.0.0.1:9"
     repeats: bool = False
+    vary: Callable[[int], None] | None = None
     mutants: int = 300
 
     def build(self, *, address: str = "", fault: str = "", record: Path | None = None) -> Any:

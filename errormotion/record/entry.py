@@ -6,10 +6,12 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from errormotion.datasets.files import events
+from errormotion.datasets.files.events import Event
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 
@@ -40,6 +42,10 @@ class Entry:
         Figures of merit, SI; None if they are in the error dataset only, and were not read yet.
     verdict : str
         Decision on the tolerances; empty without tolerances.
+    notes : tuple of Event
+        What people noted on the run.
+    damaged_notes : tuple of str
+        Lines of its notes that cannot be read, one sentence each.
     """
 
     folder: str
@@ -52,15 +58,13 @@ class Entry:
     errors: str
     figures: tuple[FigureOfMerit, ...] | None
     verdict: str = ""
+    notes: tuple[Event, ...] = ()
+    damaged_notes: tuple[str, ...] = ()
 
     @property
     def time(self) -> datetime | None:
         """Creation of the run; None if unknown."""
-        try:
-            time = datetime.fromisoformat(self.created)
-            return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
-        except (ValueError, OverflowError):
-            return None
+        return events.instant(self.created)
 
     @property
     def lacks_figures(self) -> bool:
@@ -73,9 +77,9 @@ class Entry:
 
     def plain(self) -> dict[str, Any]:
         """Return the entry for a JSON file."""
-        found = {name: value for name, value in self.__dict__.items() if name != "figures"}
         figures = None if self.figures is None else [asdict(figure) for figure in self.figures]
-        return {**found, "figures": _without_nan(figures)}
+        notes = [asdict(note) for note in self.notes]
+        return {**self.__dict__, "figures": _without_nan(figures), "notes": notes}
 
 
 def read_entry(folder: Path) -> Entry:
@@ -112,6 +116,7 @@ def read_entry(folder: Path) -> Entry:
         _inside(data.get("errors")),
         figures_from(data.get("results")),
         _text(data.get("conformity"), "verdict"),
+        *events.read(folder),
     )
 
 
@@ -120,8 +125,19 @@ def from_plain(data: Any) -> Entry | None:
     names = ("folder", "created", "machine", "test", "method", "campaign", "status", "errors", "verdict")
     if not isinstance(data, dict) or not all(isinstance(data.get(name), str) for name in names):
         return None
+    notes, damaged = data.get("notes"), data.get("damaged_notes")
+    if (
+        not isinstance(notes, list)
+        or not isinstance(damaged, list)
+        or not all(isinstance(each, str) for each in damaged)
+    ):
+        return None
+    read = [events.from_plain(each) for each in notes]
+    known = tuple(each for each in read if isinstance(each, Event))
+    if len(known) < len(read):
+        return None
     texts = {name: data[name] for name in names}
-    return Entry(**texts, figures=figures_from(data.get("figures")))
+    return Entry(**texts, figures=figures_from(data.get("figures")), notes=known, damaged_notes=tuple(damaged))
 
 
 def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:

@@ -1,7 +1,7 @@
 """The index of a folder of runs: what its ``run.json`` files state, kept for the next call.
 
-The index is never the truth. An entry counts only while time of change and size of its ``run.json`` are those that
-it was read from; a missing, damaged or unwritable index costs time and nothing else.
+The index is never the truth. An entry counts only while time of change and size of its ``run.json`` and of its notes
+are those that it was read from; a missing, damaged or unwritable index costs time and nothing else.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import logging
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from errormotion.record.entry import Entry, from_plain
@@ -26,12 +26,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Stamp:
-    """Time of change, ns, and size, bytes, of a ``run.json``."""
+    """Time of change, ns, and size, bytes, of a ``run.json`` and of the notes beside it; 0 where there are none."""
 
     changed: int
     size: int
+    notes_changed: int = 0
+    notes_size: int = 0
 
 
+STAMP = tuple(field.name for field in fields(Stamp))
 Kept = dict[str, tuple[Stamp, Entry]]
 
 
@@ -49,15 +52,15 @@ def load(folder: Path) -> Kept:
     kept: Kept = {}
     for each in data["runs"]:
         entry = from_plain(each)
-        if entry is None or not isinstance(each.get("changed"), int) or not isinstance(each.get("size"), int):
-            continue
-        kept[entry.folder] = (Stamp(each["changed"], each["size"]), entry)
+        numbers = [each.get(name) for name in STAMP] if entry is not None else []
+        if entry is not None and all(isinstance(number, int) for number in numbers):
+            kept[entry.folder] = (Stamp(*numbers), entry)
     return kept
 
 
 def save(folder: Path, kept: Mapping[str, tuple[Stamp, Entry]]) -> None:
     """Write an index in one step; where the folder cannot be written there is none."""
-    runs = [{**entry.plain(), "changed": stamp.changed, "size": stamp.size} for stamp, entry in kept.values()]
+    runs = [{**entry.plain(), **asdict(stamp)} for stamp, entry in kept.values()]
     part = folder / f"{FILE}.{os.getpid()}.part"
     try:
         part.write_text(json.dumps({"schema": SCHEMA, "runs": runs}, separators=(",", ":")), encoding="utf-8")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
+from errormotion.datasets.files import events
 from errormotion.errors import ErrormotionError, RunError
 from errormotion.record import index
 from errormotion.record.entry import Entry, read_entry
@@ -43,8 +44,7 @@ class Folder:
         self._kept = {} if whole else dict(known)
         for name in names:
             try:
-                status = (self.path / name / "run.json").stat()
-                stamp = Stamp(status.st_mtime_ns, status.st_size)
+                stamp = _stamp(os.path.join(self.path, name))
                 if name in known and known[name][0] == stamp:
                     entry = known[name][1]
                 else:
@@ -54,7 +54,9 @@ class Folder:
                 self.skipped[name] = str(error)
                 continue
             self.entries[name] = entry
-            if now - stamp.changed > SETTLING_TIME:
+            for number, reason in enumerate(entry.damaged_notes):
+                self.skipped[f"{name} (note {number})"] = reason
+            if now - max(stamp.changed, stamp.notes_changed) > SETTLING_TIME:
                 self._kept[name] = (stamp, entry)
         self._stale |= len(self._kept) != len(known)
 
@@ -73,8 +75,20 @@ class Folder:
 
 
 @dataclass(frozen=True)
+class Note:
+    """A note on a run or on a machine; ``run`` is the name of the run folder, empty for a machine."""
+
+    time: datetime | None
+    machine: str
+    run: str
+    text: str
+    by: str
+    noted: str
+
+
+@dataclass(frozen=True)
 class Listing:
-    """Runs, newest first, with their paths.
+    """Runs, newest first, with their paths, and the notes on them and on their machines, oldest first.
 
     ``skipped`` states for each run folder that could not be read the reason, ``waiting`` how many runs have figures
     of merit that were not read yet, ``undated`` how many were left out because their time is unknown.
@@ -86,10 +100,16 @@ class Listing:
     undated: int = 0
     machines: tuple[str, ...] = ()
     methods: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def list_runs(
-    paths: Sequence[Path], *, machine: str | None = None, method: str | None = None, since: datetime | None = None
+    paths: Sequence[Path],
+    *,
+    machine: str | None = None,
+    method: str | None = None,
+    test: str | None = None,
+    since: datetime | None = None,
 ) -> Listing:
     """Return the runs of folders, newest first.
 
@@ -97,8 +117,8 @@ def list_runs(
     ----------
     paths : sequence of Path
         Run folders, folders of runs, or folders of those.
-    machine, method : str, optional
-        Only runs of this machine, or of this method; upper and lower case are the same.
+    machine, method, test : str, optional
+        Only runs of this machine, of this method, or with this name; upper and lower case are the same.
     since : datetime, optional
         Only runs that were created at this time or later; without a time zone it is UTC.
 
@@ -113,9 +133,11 @@ def list_runs(
         folders[-1].read(names, whole)
     everything = [(folder, entry) for folder in folders for entry in folder.entries.values()]
     chosen = [
-        (folder, entry) for folder, entry in everything if _same(machine, entry.machine) and _same(method, entry.method)
+        (folder, entry)
+        for folder, entry in everything
+        if _same(machine, entry.machine) and _same(method, entry.method) and _same(test, entry.test)
     ]
-    undated = 0
+    undated, start = 0, None
     if since is not None:
         start = since.replace(tzinfo=UTC) if since.tzinfo is None else since
         undated = sum(entry.time is None for _, entry in chosen)
@@ -124,14 +146,54 @@ def list_runs(
     waiting = _complete(chosen)
     for folder in folders:
         folder.keep()
+    notes, damaged = _notes(paths, folders, chosen, machine, start)
     return Listing(
         tuple((folder.path / entry.folder, folder.entries[entry.folder]) for folder, entry in chosen),
-        tuple(reason for folder in folders for reason in folder.skipped.values()),
+        (*(reason for folder in folders for reason in folder.skipped.values()), *damaged),
         waiting,
         undated,
         tuple(sorted({entry.machine for _, entry in everything})),
         tuple(sorted({entry.method for _, entry in everything})),
+        notes,
     )
+
+
+def _notes(
+    paths: Sequence[Path],
+    folders: Sequence[Folder],
+    chosen: Sequence[tuple[Folder, Entry]],
+    machine: str | None,
+    start: datetime | None,
+) -> tuple[tuple[Note, ...], list[str]]:
+    """Return the notes on the chosen runs and on machines, and a sentence for each that cannot be read."""
+    found = [
+        Note(events.instant(each.at) or entry.time, entry.machine, entry.folder, each.text, each.by, each.noted)
+        for _, entry in chosen
+        for each in entry.notes
+    ]
+    damaged: list[str] = []
+    places = {folder.path for folder in folders} | {path.resolve() for path in paths}
+    for place in sorted(place for place in places if not (place / "run.json").exists()):
+        made, wrong = events.read(place)
+        damaged += wrong
+        found += [
+            Note(events.instant(each.at), each.machine, "", each.text, each.by, each.noted)
+            for each in made
+            if _same(machine, each.machine)
+        ]
+    if start is not None:
+        found = [note for note in found if note.time is not None and note.time >= start]
+    return tuple(sorted(found, key=lambda note: note.time or datetime.min.replace(tzinfo=UTC))), damaged
+
+
+def _stamp(folder: str) -> Stamp:
+    """Return times of change and sizes of the files of a run that an entry is read from."""
+    status = os.stat(os.path.join(folder, "run.json"))
+    try:
+        notes = os.stat(os.path.join(folder, events.FILE))
+    except OSError:
+        return Stamp(status.st_mtime_ns, status.st_size)
+    return Stamp(status.st_mtime_ns, status.st_size, notes.st_mtime_ns, notes.st_size)
 
 
 def _order(found: tuple[Folder, Entry]) -> tuple[datetime, str]:

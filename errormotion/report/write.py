@@ -20,7 +20,7 @@ from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
 from errormotion.report import generic, provenance
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.document import Cell, Part, Source, Table
+from errormotion.report.document import Cell, Part, Section, Source, Table
 from errormotion.report.parts import beams
 from errormotion.report.text import DASH
 from errormotion.tolerances.conformity import judge
@@ -76,6 +76,7 @@ def write_report(
         sources.append(Source(dataset, raw, dict(run or {}), _provenance(dataset, run or {}), f"p{i + 1}"))
     tolerances = from_run(run or {})
     parts = [part for source in sources for part in _judged(chapters(source), source, tolerances)]
+    parts[:1] = [_noted(part, run or {}) for part in parts[:1]]
     return write_page(sources, parts, Path(out), title)
 
 
@@ -85,6 +86,19 @@ def _judged(parts: list[Part], source: Source, tolerances: Tolerances | None) ->
         return parts
     lines = judge(source.errors, tolerances).lines()
     return [replace(parts[0], summary=[*lines, *parts[0].summary]), *parts[1:]]
+
+
+def _noted(part: Part, run: Mapping[str, Any]) -> Part:
+    """Return a chapter that ends with the notes on its run."""
+    notes, damaged = run.get("events") or ((), ())
+    if not notes and not damaged:
+        return part
+    rows = [
+        [_moment(each.at or str(run.get("created", DASH))), each.text, each.by, _moment(each.noted)] for each in notes
+    ]
+    head = ["time of the event", "note", "by", "noted"]
+    table = Table("Notes on this run", head, rows, numeric=False, notes=damaged)
+    return replace(part, sections=[*part.sections, Section("notes", "Notes", [table])])
 
 
 def chapters(source: Source) -> list[Part]:
@@ -176,6 +190,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
         A result cannot be read.
     """
     from errormotion.datasets import load
+    from errormotion.datasets.files import events
 
     folder = Path(run_folder)
     if not folder.is_dir():
@@ -195,6 +210,7 @@ def write_run_report(run_folder: Path, out: Path | None = None) -> Path:
             raise RunError(
                 f"{folder / 'run.json'} is no JSON: {error}. Restore it, or remove it to report without."
             ) from error
+    run["events"] = events.read(folder)
     target = Path(out) if out is not None else folder / "report.html"
     if log is not None:
         return write_report(log, target, run=run)

@@ -52,7 +52,7 @@ def coverage(subject: MethodSubject) -> str:
     places = tested_places(subject)
     errors, covariances = _samples(subject, places)
     verdicts = [
-        _require_honest(errors[:, i], covariances[:, i], _labels(subject), f"at place {place}", share=len(places))
+        require_honest(errors[:, i], covariances[:, i], _labels(subject), f"at place {place}", share=len(places))
         for i, place in enumerate(places)
     ]
     return f"{len(errors)} seeds; " + "; ".join(verdicts)
@@ -72,7 +72,7 @@ def differences(subject: MethodSubject) -> str:
     difference = errors[:, 1] - errors[:, 0]
     spread = covariances[:, 1] + covariances[:, 0] - np.array(shared)
     between = f"between places {places[0]} and {places[1]}"
-    verdict = _require_honest(difference, spread, _labels(subject), between, share=1)
+    verdict = require_honest(difference, spread, _labels(subject), between, share=1)
     return f"{len(errors)} seeds; {verdict}"
 
 
@@ -109,9 +109,7 @@ def _labels(subject: MethodSubject) -> tuple[str, ...]:
     return names(subject.outcome(0)[0])
 
 
-def _require_honest(
-    errors: np.ndarray, covariances: np.ndarray, labels: tuple[str, ...], where: str, share: int
-) -> str:
+def require_honest(errors: np.ndarray, covariances: np.ndarray, labels: tuple[str, ...], where: str, share: int) -> str:
     """Fail unless errors (seed, n) are as large as covariances (seed, n, n) say.
 
     Half of the allowed false alarms goes to the intervals, half to NEES; ``share`` tests divide them again.

@@ -23,6 +23,7 @@ from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status
 from errormotion.testing.coverage import coverage, differences, recovers_truth
 from errormotion.testing.instrument_checks import check_settings
 from errormotion.testing.kit import Checks, require
+from errormotion.testing.redraw_checks import sources_as_stated, sources_drawn, why_no_redrawing
 from errormotion.testing.results import covariance, functional_point, names, sigma, values
 
 METHOD_CHECKS: Checks[MethodSubject] = Checks()
@@ -112,6 +113,8 @@ def deterministic(subject: MethodSubject) -> str:
 METHOD_CHECKS.add(limit=60.0)(recovers_truth)
 METHOD_CHECKS.add(limit=300.0)(coverage)
 METHOD_CHECKS.add(limit=300.0)(differences)
+METHOD_CHECKS.add(limit=60.0, why_not=why_no_redrawing)(sources_drawn)
+METHOD_CHECKS.add(limit=300.0, why_not=why_no_redrawing)(sources_as_stated)
 
 
 @METHOD_CHECKS.add()

@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments.simulators.device import DEFAULT_MACHINE
+from errormotion.instruments.simulators.virtual_world.world import let_time_pass
+from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.serving import PtyServer, Server, make_server
 from errormotion.plugins import InstrumentSubject
 from errormotion.testing.kit import require
@@ -25,6 +28,8 @@ READINGS_AFTER_ERROR = 4
 MOST_FAILURES = 12
 PAUSE = 0.1
 """After a failed reading, s."""
+TIME_BETWEEN_READINGS = 120.0
+"""Simulated time, s."""
 QUICK, SLOW = 0.2, 1.3
 """Time limits that are tried, s; the default of a transport lies between them."""
 SPEEDS = (19200, 57600, 115200, 230400, 2000000)
@@ -64,7 +69,7 @@ def late_answers(subject: InstrumentSubject) -> str:
         limit = 1.0
     sound = _readings(subject, "")
     seen = [
-        _require_in_step([] if subject.repeats else sound, _late_readings(subject, when), how)
+        _require_in_step(sound, _late_readings(subject, when), how, repeats=subject.repeats)
         for when, how in ((f"&late_by={1.5 * limit:g}", "half a time limit late"), ("", "late until the next answer"))
     ]
     return "; ".join(seen)
@@ -91,6 +96,7 @@ def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
         instrument.open()
         right, failures = 0, 0
         while failures <= MOST_FAILURES and right < (READINGS_AFTER_ERROR if failures else READINGS):
+            _vary(subject, len(found))
             try:
                 found.append(tuple(numbers(instrument.read())))
                 right += 1
@@ -106,7 +112,17 @@ def _readings(subject: InstrumentSubject, fault: str) -> list[Reading]:
     return found
 
 
-def _require_in_step(sound: list[Reading], late: list[Reading], how: str) -> str:
+def _vary(subject: InstrumentSubject, number: int) -> None:
+    """Make the next reading another one: an answer that is taken for another could not be seen in equal ones."""
+    if subject.vary is not None:
+        subject.vary(number)
+    elif subject.simulated:
+        address = parse_address(subject.address)
+        machine, seed = address.host or DEFAULT_MACHINE, int(address.number("seed", 0))
+        let_time_pass(machine, seed, TIME_BETWEEN_READINGS, warm=bool(address.number("warm", 1)))
+
+
+def _require_in_step(sound: list[Reading], late: list[Reading], how: str, *, repeats: bool) -> str:
     errors = [reading for reading in late if isinstance(reading, Exception)]
     for error in errors:
         require(isinstance(error, InstrumentError), f"{how}: expected an InstrumentError, found {error!r}")
@@ -114,14 +130,17 @@ def _require_in_step(sound: list[Reading], late: list[Reading], how: str) -> str
         return f"{how}: no error"
     first = late.index(errors[0])
     after = [reading for reading in late[first:] if not isinstance(reading, Exception)]
+    seen = f"{how}: {type(errors[0]).__name__}, then {len(after)}"
+    if repeats:
+        return f"{seen} readings; the device gives a lost one again, so that their order is not seen"
     if first >= len(sound) or sum(_same(sound[first], reading) for reading in sound) != 1:
-        return f"{how}: {type(errors[0]).__name__}, then {len(after)} readings; equal ones, whose order is not seen"
+        return f"{seen} readings; equal ones, whose order is not seen: state 'vary' in the subject"
     require(
         not any(_same(reading, sound[first]) for reading in after),
         f"{how}: an answer that came too late was taken for that to the next request; send requests within "
         "'with self.exchange() as line:'",
     )
-    return f"{how}: {type(errors[0]).__name__}, then {len(after)} right readings"
+    return f"{seen} right readings"
 
 
 def _same(reading: Reading, other: Reading) -> bool:

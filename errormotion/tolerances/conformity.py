@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -125,17 +126,24 @@ def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
         except Exception as error:  # of a foreign plugin
             log.exception("the figures of merit failed")
             failure = f"{type(error).__name__}: {error}"
-    rows, unused = list[Row](), list[str]()
-    for pattern, limit in tolerances.figures.items():
-        found = [figure for figure in figures if matches(pattern, figure.name)]
-        rows += [_of_figure(figure, limit, tolerances) for figure in found]
-        unused += [] if found else [pattern]
+    stated = judge_figures(figures, tolerances)
+    rows, unused = list(stated.rows), [name for name in stated.unused if name not in tolerances.freedoms]
     for name, limit in tolerances.freedoms.items():
         if name in errors.em.names:
             rows.append(_of_freedom(errors, name, limit, tolerances))
         else:
             unused.append(name)
     return Conformity(tuple(rows), tuple(unused), tolerances, failure)
+
+
+def judge_figures(figures: Sequence[FigureOfMerit], tolerances: Tolerances) -> Conformity:
+    """Decide on figures of merit alone; limits of freedoms are not used."""
+    rows, unused = list[Row](), list[str]()
+    for pattern, limit in tolerances.figures.items():
+        found = [figure for figure in figures if matches(pattern, figure.name)]
+        rows += [_of_figure(figure, limit, tolerances) for figure in found]
+        unused += [] if found else [pattern]
+    return Conformity(tuple(rows), (*unused, *tolerances.freedoms), tolerances)
 
 
 def matches(pattern: str, name: str) -> bool:
@@ -207,4 +215,4 @@ def _line(row: Row, word: str) -> str:
     return f"{text} ({row.remark})" if row.remark else text
 
 
-__all__ = ["INSIDE", "OPEN", "OUTSIDE", "Conformity", "Row", "judge", "matches"]
+__all__ = ["INSIDE", "OPEN", "OUTSIDE", "Conformity", "Row", "judge", "judge_figures", "matches"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from distributed import LocalCluster
 
-from errormotion import datasets, plugins
+from errormotion import datasets, parallel, plugins
 from errormotion.campaign import batch, runner
 from errormotion.campaign.batch import Outcome, identify_runs
 from errormotion.campaign.files import CampaignPlan
@@ -126,19 +126,19 @@ def test_worker_that_came_later_with_another_version_refuses_its_task(
     identify: Identify, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch, "__version__", "99.0")
-    monkeypatch.setattr(batch, "_check_workers", lambda *_: None)
+    monkeypatch.setattr(parallel, "_check_workers", lambda *_: None)
     outcomes = identify(scheduler=str(cluster.scheduler_address))
     assert all("expected errormotion in version 99.0" in outcome.reason for outcome in outcomes)
 
 
 def test_cluster_that_is_not_there_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "CLUSTER_TIMEOUT", 0.3)
+    monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 0.3)
     with pytest.raises(RunError, match="none answers"):
         identify(scheduler="tcp://127.0.0.1:9")
 
 
 def test_cluster_without_workers_is_told(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch, "CLUSTER_TIMEOUT", 2.0)
+    monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 2.0)
     with (
         local_cluster(0) as empty,
         pytest.raises(RunError, match="has no workers; start some with 'dask worker"),

@@ -51,7 +51,12 @@ class Module(socketserver.StreamRequestHandler):
             request += byte
             if byte == b"\r":
                 values = "".join(f"{value:+07.2f}" for value in self.server.values)  # type: ignore[attr-defined]
-                answers = {b"$01M\r": "!014018", b"$01F\r": "!01A1.0", b"#01\r": ">" + values}
+                answers = {
+                    b"$01M\r": "!014018",
+                    b"$01F\r": "!01A1.0",
+                    b"$012\r": "!01100600",
+                    b"#01\r": ">" + values,
+                }
                 self.wfile.write(answers[request].encode() + b"\r")
                 request = b""
 
@@ -150,7 +155,7 @@ def test_a_thermometer_that_is_unplugged_and_comes_back_leaves_a_marked_gap(tmp_
 
 
 def test_a_silent_instrument_keeps_nobody_waiting(tmp_path: Path) -> None:
-    quiet = dcon("quiet", "sim://cframe/a?seed=11&fault=silence&fault_at=2", more="")
+    quiet = dcon("quiet", "sim://cframe/a?seed=11&fault=silence&fault_at=3", more="")
     good = dcon("good", "sim://cframe/b?seed=11", '["front", "rear"]')
     with Monitor(bench(quiet, good), tmp_path, TICK) as monitor:
         seen = list(islice(monitor.watch(), 20))

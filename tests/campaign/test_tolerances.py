@@ -82,3 +82,57 @@ def test_without_tolerances_nothing_is_decided(lab: None, write: Callable[..., P
     assert "Tolerances" not in call("run", write('name = "a"')).stdout
     (run,) = json.loads(call("runs", tmp_path / "runs", "--json").stdout)["runs"]
     assert run["verdict"] == ""
+
+
+def limits(tmp_path: Path, text: str) -> Path:
+    file = tmp_path / "limits.toml"
+    file.write_text(f'schema = "errormotion.tolerances/1"\n[tolerances]\n{text}\n')
+    return file
+
+
+CASES = [
+    ('freedoms = { EX = "10.1 um" }', "neither proved", 5),
+    ('rule = "simple"\nfreedoms = { EX = "10.1 um" }', "within limits", 0),
+    ('rule = "simple"\nfreedoms = { EX = "9.9 um" }', "outside limits", 4),
+    ('rule = "shared risk"\nfreedoms = { EX = "10.1 um" }', "within limits", 0),
+    ('rule = "shared risk"\nlargest_ratio = 0.01\nfreedoms = { EX = "10.1 um" }', "not decided", 5),
+    ('figures = { "EX after*" = "9 um" }', "nonconformity proved", 4),
+    ('figures = { "EX after*" = "9 um", "d(Z)" = "1 um" }', "nonconformity proved", 4),
+    ('figures = { "EX after*" = "11 um", "d(Z)" = "1 um" }', "conformity proved", 5),
+]
+
+
+def test_identify_and_runs_decide_with_a_file_of_limits(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    call("run", write('name = "a"\nsettings = { count = 11 }\n'), "--no-report")
+    (path,) = runs.glob("2*")
+    before = (path / "run.json").read_bytes()
+    for number, (text, verdict, code) in enumerate(CASES):
+        file = limits(tmp_path, text)
+        single = ["identify", path, "--out", tmp_path / f"{number}.nc", "--tolerances", file]
+        assert f"Tolerances: {verdict}" in call(*single, code=code).stdout.splitlines()[1]
+        (run,) = json.loads(call("runs", runs, "--tolerances", file, "--json", code=code).stdout)["runs"]
+        assert (run["verdict"], run["conformity"]["verdict"]) == (verdict, verdict)
+    assert verdict in call("runs", runs, "--tolerances", file, code=code).stdout
+    assert (path / "run.json").read_bytes() == before
+    (run,) = json.loads(call("runs", runs, "--json").stdout)["runs"]
+    assert run["verdict"] == ""
+
+
+def test_each_of_many_results_is_decided(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
+    call("run", write('name = "a"\nsettings = { count = 11 }\n'), "--no-report")
+    several = ["identify", tmp_path / "runs", "--method", "ramp", "--out", tmp_path / "all", "--scheduler", "sync"]
+    for text, verdict, code in CASES[:3]:
+        several_with = [*several, "--tolerances", limits(tmp_path, text)]
+        (run,) = json.loads(call(*several_with, "--json", code=code).stdout)["runs"]
+        assert run["conformity"]["verdict"] == verdict
+        assert f"Tolerances: {verdict}" in call(*several_with, code=code).stdout
+
+
+def test_runs_that_cannot_be_decided_are_reported(lab: None, write: Callable[..., Path], tmp_path: Path) -> None:
+    call("run", write('name = "a"\nsettings = { count = 11 }\n'), "--no-report")
+    (path,) = (tmp_path / "runs").glob("2*")
+    next(path.glob("errors/*/errors.nc")).write_bytes(b"damaged")
+    file = limits(tmp_path, 'freedoms = { EX = "11 um" }')
+    assert "not decided: " in call("runs", tmp_path / "runs", "--tolerances", file, code=5).stdout
+    assert "mistake" in call("runs", tmp_path / "runs", "--tolerances", limits(tmp_path, ""), code=1).stderr

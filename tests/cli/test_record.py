@@ -91,7 +91,7 @@ def test_an_instrument_without_a_stream_is_read_until_the_time_is_over(folder: P
     assert 4 <= recorded["note"]["session"]["readings"]["count"] <= 3 + 1.0 / 0.2
     result = CliRunner().invoke(app, ["replay", "a.rec"])
     assert "reproduced frame by frame" in result.stdout
-    assert "DCON 4018 unit 01 A1.0" in result.stdout
+    assert "DCON 7018 unit 01 A2.0" in result.stdout
 
 
 def test_a_session_that_ends_with_an_error_is_a_recording_too(folder: Path) -> None:

@@ -13,11 +13,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from errormotion import plugins
 from errormotion.cli.app import app
 from errormotion.cli.commands import simulate
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import KeyenceLJX
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
+from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.instruments.transports import load_simulator, parse_address
 from errormotion.plugins import get
 
@@ -65,7 +67,7 @@ def test_a_device_answers_one_client_after_another_and_outlives_them() -> None:
 
 
 def test_a_fault_is_one_of_the_device() -> None:
-    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=3") as (process, printed):
+    with device("dcon_temperature", "--fault", "silence", "--set", "fault_at=4") as (process, printed):
         with DconTemperature(printed["url"], DconSettings(timeout=0.3)) as thermometer:
             thermometer.read()
             with pytest.raises(InstrumentTimeoutError):
@@ -79,7 +81,7 @@ def test_all_lines_of_a_device_are_printed() -> None:
     with device("keyence_ljx", "--port", str(port)) as (_, printed):
         assert printed["url"] == f"tcp://127.0.0.1:{port}"
         assert printed["lines"] == {"stream": f"tcp://127.0.0.1:{port + 1}"}
-        with KeyenceLJX(f"{printed['url']}?stream={port + 1}") as profiler:
+        with KeyenceLJX(printed["address"]) as profiler:
             assert profiler.read().size > 0
 
 
@@ -87,6 +89,31 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> Any:
     """Run the command without its wait."""
     monkeypatch.setattr(simulate, "_wait", lambda: None)
     return CliRunner().invoke(app, ["simulate", *arguments])
+
+
+@pytest.mark.parametrize("wire", ["wire=tcp", "framing=rtu", "wire=pty"])
+def test_the_printed_address_is_that_of_the_driver(monkeypatch: pytest.MonkeyPatch, wire: str) -> None:
+    addresses, readings = [], []
+    inner = simulate._driver_address
+    monkeypatch.setattr(simulate, "_driver_address", lambda *given: addresses.append(inner(*given)) or addresses[-1])
+
+    def read() -> None:
+        with ModbusTemperature(addresses[0]) as thermometer:
+            readings.append(thermometer.read())
+
+    monkeypatch.setattr(simulate, "_wait", read)
+    result = CliRunner().invoke(app, ["simulate", "modbus_temperature", "--set", wire])
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"modbus_temperature: {addresses[0]}\n")
+    assert len(readings) == 1
+
+
+def test_only_what_can_be_simulated_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for wrong in ("nosuch", "tracker_table", "spindle_drift"):
+        listed = run(monkeypatch, wrong).stderr.replace("\n", " ").partition("Known here: ")[2]
+        assert {"dcon_temperature", "optoncdt"} <= set(listed.strip(". ").split(", "))
+        for name in listed.strip(". ").split(", "):
+            assert plugins.get("instruments", name).info.simulator
 
 
 def test_a_bench_file_states_machine_and_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

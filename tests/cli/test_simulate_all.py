@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from errormotion import plugins
+from errormotion.campaign.files import load_bench
 from errormotion.errors import InstrumentTimeoutError
 from errormotion.instruments.simulators.controller import linuxcnc_process
 from errormotion.plugins import Touch
@@ -46,33 +47,26 @@ class Case:
     """How a driver reaches a device that another process simulates."""
 
     arguments: tuple[str, ...] = ()
-    url: Callable[[dict[str, Any], int], str] = lambda printed, port: printed["url"]
-    settings: dict[str, Any] = field(default_factory=dict)
+    settings: str = ""
     read: Callable[[Any], None] = first_reading
-    driver: str = ""
-
-
-def on_two_ports(printed: dict[str, Any], port: int) -> str:
-    """A second line listens at the next port."""
-    (name,) = printed["lines"]
-    assert printed["lines"][name] == f"tcp://127.0.0.1:{port + 1}"
-    return f"{printed['url']}?{name}={port + 1}"
+    lines: int = 0
 
 
 CASES = {
-    "can_temperature": Case(("--set", "bus=udp_multicast"), settings={"timeout": 5.0}),
-    "capancdt": Case(url=on_two_ports),
-    "confocaldt": Case(url=on_two_ports),
+    "can_temperature": Case(("--set", "bus=udp_multicast"), settings="timeout = '5 s'"),
+    "capancdt": Case(lines=1),
+    "confocaldt": Case(lines=1),
     "controller_probe": Case(),
     "dcon_temperature": Case(),
-    "dprnt": Case(settings={"start_timeout": 0.3}, read=no_line_without_a_program),
-    "five_sensor_frame": Case(driver="optoncdt"),  # one sensor: five processes share no clock
-    "keyence_ljx": Case(url=on_two_ports),
+    "dprnt": Case(settings="start_timeout = '0.3 s'", read=no_line_without_a_program),
+    "five_sensor_frame": Case(lines=4),
+    "keyence_ljx": Case(lines=1),
     "keyence_lk": Case(),
     "leica_emscon": Case(),
-    "linuxcnc": Case(("--set", "wait=60")),  # a computer has room for one
-    "modbus_temperature": Case(url=lambda printed, port: f"modbus+tcp://127.0.0.1:{port}?unit=1"),
-    "mtconnect": Case(url=lambda printed, port: f"http://127.0.0.1:{port}/"),
+    # a computer has room for one; the simulated machine takes any token
+    "linuxcnc": Case(("--set", "wait=60"), settings="token_file = 'token'"),
+    "modbus_temperature": Case(),
+    "mtconnect": Case(),
     "leica_geocom": Case(),
     "opcua": Case(),
     "optoncdt": Case(),
@@ -143,15 +137,27 @@ def test_every_simulated_instrument_is_here() -> None:
 
 
 @pytest.mark.parametrize("plugin_id", CASES)
-def test_a_driver_reads_a_device_in_another_process(plugin_id: str) -> None:
+def test_a_bench_with_the_printed_address_reads_a_device_in_another_process(
+    plugin_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "token").write_text("x" * 64)
+    (tmp_path / "token").chmod(0o600)
     if plugin_id == "linuxcnc" and (reason := linuxcnc_process.why_not()):
         pytest.skip(reason)
     case = CASES[plugin_id]
-    driver = plugins.get("instruments", case.driver or plugin_id)
     with simulated(plugin_id, *case.arguments) as (printed, port):
         assert str(port) in printed["url"]
-        url = case.url(printed, port)
+        assert [url.rpartition(":")[2] for url in printed["lines"].values()] == [
+            str(port + number) for number in range(1, case.lines + 1)
+        ]
+        bench = tmp_path / "bench.toml"
+        bench.write_text(
+            'schema = "errormotion.bench/1"\nname = "b"\nmachine = "cframe"\n\n[instruments.device]\n'
+            f"driver = '{plugin_id}'\naddress = '{printed['address']}'\n{case.settings}\n"
+        )
+        (device,) = load_bench(bench).instruments
         for _ in range(2):  # the device outlives its clients
-            with driver(url, driver.Settings(**case.settings)) as instrument:
+            with device.driver(device.address, device.settings) as instrument:
                 assert not instrument.identify().simulated
                 case.read(instrument)

@@ -22,16 +22,20 @@ def drift(t):
     return SIZE * (1 - np.exp(-t / TAU)) + 0.2 * SIZE * np.sin(t / 1700)
 
 
-def made(t, rng, *, name="a", change=lambda values: values, point=(0, 0, 0), start=START, radius="", **more):
-    """Return an error dataset of the warm-up with noise and one source (a radius) that is one draw."""
+def made(t, rng, *, name="a", change=lambda values: values, point=(0, 0, 0), start=START, radius="", unit=1.0, **more):
+    """Return an error dataset of the warm-up with noise and one source (a radius) that is one draw.
+
+    ``unit`` is a wrong unit of the rotations, which their uncertainties have as well.
+    """
     z = rng.normal()
     F = np.zeros((1, len(t), 6))
     F[0, :, :3] = 0.004 * drift(t)[:, :3]
     values = drift(t) - drift([t[0]])[0] + F[0] * z + NOISE * rng.normal(size=(len(t), 6))
-    values = change(values)
+    factor = np.array([1, 1, 1, unit, unit, unit])
+    values, F, noise = change(values) * factor, F * factor, NOISE * factor
     ds = datasets.build_errors(
         values,
-        np.diag(NOISE**2) + np.einsum("sti,stj->tij", F, F),
+        np.diag(noise**2) + np.einsum("sti,stj->tij", F, F),
         dims=("time",),
         coords={"time": np.asarray(t, dtype=float)},
         influence=F,
@@ -138,7 +142,7 @@ PLANTED = {
     "EX and EY exchanged": {"change": exchanged},
     "scale of the displacements": {"change": lambda v: v * [1.06, 1.06, 1.06, 1, 1, 1]},
     "shift in time": {"start": "2026-03-01T08:03:00+00:00"},
-    "unit of 'probing': urad taken as arcsec": {"change": lambda v: v * ([1] * 3 + [4.8481368] * 3)},
+    "unit of 'probing': urad taken as arcsec": {"unit": 4.8481368},
     "step at 3600 s (something moved)": {"change": stepped},
 }
 
@@ -240,8 +244,8 @@ def test_a_wrong_functional_point_is_named_where_only_displacements_are_compared
     found = compare({"drift": made(T1, rng), "probing": wrong}, freedoms=["EX", "EY", "EZ"])
     first = found.isel(pair=0, rank=0)
     assert first["cause"].item().startswith("functional point")
-    size, u = np.abs(first["size"].values), first["size_u"].values
-    assert abs(size[2] - 0.05) < 4 * u[2]
+    z = first["size_name"].values.tolist().index("Z (m)")
+    assert abs(abs(first["size"].values[z]) - 0.05) < 4 * first["size_u"].values[z]
     both = {first["cause"].item(), *first["alike"].item().split("; ")}
     assert both == {"functional point of 'drift'", "functional point of 'probing'"}
 
@@ -252,7 +256,7 @@ def test_sizes_are_printed_in_the_units_of_the_field():
     assert step.name.startswith("step at 3600 s")
     assert re.search(r"EZ 7\.\d+ ± 0\.\d+ um", step.size)
     point = cause_text(compare(two(rng, functional_point=(0.0, 0.0, 0.03))), 0, 0)
-    assert re.search(r"Z -?[23]\d\.?\d* ± \d+ mm", point.size)
+    assert re.search(r"^Z -?[23]\d\.?\d* ± \d\.?\d* mm$", point.size)
 
 
 def test_datasets_without_any_source_are_compared():
@@ -278,3 +282,34 @@ def test_a_wrong_functional_point_is_found_where_some_rotations_are_compared():
     found = compare({"moved": moved, "right": made(t, rng)}, freedoms=("EX", "EY", "EZ", "EA"))
     names = [cause.name for rank in range(found.sizes["rank"]) if (cause := cause_text(found, 0, rank)) is not None]
     assert names[0].startswith("functional point of '")
+
+
+def single(values):
+    """Return errors at one position."""
+    return datasets.build_errors(
+        np.array(values) * 1e-6, np.diag([1e-12] * 6), dims=(), coords={}, component="spindle", machine="M",
+        frame="machine", functional_point=(0, 0, 0), reference="cold", method="m", method_version="1", provenance={},
+    )  # fmt: skip
+
+
+def test_a_comparison_is_drawn():
+    found = compare(two(np.random.default_rng(2)), causes=False)
+    figure = found.em.plot()
+    assert len(figure.axes) == 2 * found.sizes["dof"]
+    values, en = figure.axes[4], figure.axes[5]  # of EZ
+    shown = [line.get_ydata() for line in values.lines if len(line.get_ydata())]
+    np.testing.assert_allclose(shown[0], 1e6 * found["value"].values[0, :, 2])
+    assert values.get_ylabel() == "EZ / um"
+    drawn = next(line.get_ydata() for line in en.lines if len(line.get_ydata()) == found.sizes["time"])
+    np.testing.assert_allclose(drawn, found["en"].values[0, :, 2])
+    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
+    legend = [text.get_text() for each in legends for text in each.texts]
+    assert legend == ["drift", "probing", "drift - probing"]
+    with pytest.raises(DatasetError, match=r"'\.em\.at' belongs to error datasets"):
+        found.em.at((0, 0, 0))
+
+
+def test_single_values_are_compared_and_drawn():
+    found = compare({"a": single(range(6)), "b": single(range(1, 7)), "c": single([9] * 6)})
+    assert found["value"].dims == ("dataset", "dof")
+    assert len(found.em.plot().axes) == 12

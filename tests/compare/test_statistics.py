@@ -158,3 +158,12 @@ def test_unknown_values_of_one_dataset_leave_those_of_the_others():
     assert found.fit.degrees == 2 * N * D - D
     assert np.isnan(pair(values[0], values[1]).en[2]).all()
     assert pair(values[0], values[1]).joint.degrees == N * D - D
+
+
+def test_datasets_without_sources_have_a_consensus():
+    rng = np.random.default_rng(8)
+    one, other = (
+        Estimate(name, rng.normal(size=(4, 2)), np.tile(np.eye(2), (4, 1, 1)), np.zeros((0, 4, 2)), ())
+        for name in ("a", "b")
+    )
+    np.testing.assert_allclose(consensus([one, other]).estimate.value, (one.value + other.value) / 2)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.compare.result import TABLE
+from errormotion.compare.result import REPEATS, TABLE
 from errormotion.datasets.calibrations import inclination as calibration
 from errormotion.datasets.certificates import ITEMS
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RawSchema, Row, raw_schemas
@@ -51,6 +51,12 @@ def test_the_table_of_comparisons_is_the_schema() -> None:
     section = PAGE.partition("\n## Comparison")[2].partition("\n## ")[0]
     rows = [row for row in section.splitlines() if row.startswith("| `")]
     assert rows == [f"| `{name}` | {', '.join(dims)} | {meaning} |" for name, (dims, meaning) in TABLE.items()]
+
+
+def test_the_table_of_repeats_is_the_schema() -> None:
+    section = PAGE.partition("\n## Repeats in a comparison")[2].partition("\n## ")[0]
+    rows = [row for row in section.splitlines() if row.startswith("| `")]
+    assert rows == [f"| `{name}` | {', '.join(dims)} | {meaning} |" for name, (dims, meaning) in REPEATS.items()]
 
 
 def test_the_table_of_calibrations_is_the_schema() -> None:

@@ -1,8 +1,5 @@
 """Commands, answers and blocks of a capaNCDT 6200, against what documents and independent drivers show."""
 
-import random
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,8 +8,7 @@ from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.point_lds.capancdt import blocks, codec
-from errormotion.instruments.point_lds.capancdt.blocks import HEADER, MAX_BLOCK_BYTES, BlockDecoder
-from errormotion.instruments.point_lds.capancdt.sequence import LONGEST_GAP, Sequence, column, reasons
+from errormotion.instruments.point_lds.capancdt.blocks import HEADER, block_decoder, column
 
 
 def layer(name: str) -> pytest.MarkDecorator:
@@ -115,7 +111,7 @@ def test_any_line_gives_an_answer_or_an_error_of_ours(line: bytes) -> None:
 @layer("block")
 def test_blocks_in_any_pieces(vector: Vector) -> None:
     for size in (1, 7, 33, len(vector.data)):
-        decoder = BlockDecoder()
+        decoder = block_decoder()
         found = []
         for start in range(0, len(vector.data), size):
             found += decoder.feed(vector.data[start : start + size], last=True)
@@ -157,107 +153,12 @@ def test_values_at_and_beyond_the_ends_of_the_scale_are_no_readings() -> None:
 @pytest.mark.parametrize("preamble", [b"SAEM", b"MEAS"])
 def test_both_orders_of_the_header_are_read(preamble: bytes, frames_first: bool) -> None:
     data = block(5, (1, 2), (3, 4), (5, 6), preamble=preamble, frames_first=frames_first)
-    (found,) = BlockDecoder().feed(data, last=True)
+    (found,) = block_decoder().feed(data, last=True)
     assert found.values.tolist() == [[1, 2], [3, 4], [5, 6]]
 
 
-def test_stray_bytes_are_discarded_and_the_block_before_them_is_not_trusted() -> None:
-    decoder = BlockDecoder()
-    found = decoder.feed(b"xy" + block(1, (1,)) + block(2, (2,)) + b"SAE" + block(3, (3,)) + block(4, (4,)))
-    assert [(each.counter, each.intact) for each in found] == [(1, True), (2, False), (3, True)]
-    assert decoder.stray == 5
-
-
-def test_bytes_within_a_block_spoil_this_block_only() -> None:
-    data = bytearray(block(1, *[(n,) for n in range(50)]) + block(51, (7,)) + block(52, (8,)))
-    data[100:100] = b"\x55\x66"
-    found = BlockDecoder().feed(bytes(data), last=True)
-    assert [(each.counter, len(each.values), each.intact) for each in found] == [
-        (1, 50, False),
-        (51, 1, True),
-        (52, 1, True),
-    ]
-
-
-def test_a_header_that_states_more_than_a_packet_is_none() -> None:
-    longest = (MAX_BLOCK_BYTES - HEADER.size) // 4
-    for frames, count in ((longest, 0), (longest + 1, 2)):
-        data = HEADER.pack(b"SAEM", 1, 1, 1, 0, 4, frames, 0) + block(9, (1,)) + block(10, (1,))
-        assert len(BlockDecoder().feed(data, last=True)) == count
-
-
-def test_decoding_takes_linear_time_and_bounded_memory() -> None:
-    worst = [
-        b"SAEM" * 250_000,
-        b"SAE" * 330_000,
-        HEADER.pack(b"SAEM", 1, 1, 1, 0, 4, 16000, 0) * 30_000,
-        block(1, (1,)) * 27_000,
-        bytes(1_000_000),
-    ]
-    for data in worst:
-        decoder = BlockDecoder()
-        start = time.perf_counter()
-        for place in range(0, len(data), 65536):
-            decoder.feed(data[place : place + 65536])
-            assert len(decoder._buffer) <= MAX_BLOCK_BYTES + 4
-        assert time.perf_counter() - start < 5.0
-
-
-def test_mutated_blocks_give_blocks_or_nothing() -> None:
-    rng = random.Random(3)
-    sound = b"".join(block(n, (n, 2 * n), (n, n)) for n in range(4))
-    for _ in range(3000):
-        data = bytearray(sound)
-        for _ in range(rng.randint(1, 6)):
-            place = rng.randrange(len(data))
-            match rng.randrange(3):
-                case 0:
-                    data[place] = rng.randrange(256)
-                case 1:
-                    del data[place : place + rng.randint(1, 8)]
-                case 2:
-                    data[place:place] = rng.randbytes(rng.randint(1, 8))
-        for each in BlockDecoder().feed(bytes(data), last=True):
-            assert each.values.shape[0] > 0
-            assert each.values.shape[1] == (len(each.channels) if each.intact else 0)
-
-
-# ---------------------------------------------------------------------- sequence
-
-RANGE = codec.Channel("DL6220", "1", 0.0, 1e-3)
-
-
-def sequence(*data: bytes, channel: int = 1) -> Sequence:
-    found = Sequence(channel, RANGE)
-    for each in BlockDecoder().feed(b"".join(data), last=True):
-        found.add_block(each)
-    return found
-
-
-def test_gaps_of_the_counter_are_lost_readings() -> None:
-    found = sequence(block(0xFFFFFFFE, (100,), (200,)), block(3, (300,)))
-    assert found.waiting == 6
-    values, codes = found.take(6)
-    assert reasons(codes) == {"lost": 3}
-    assert np.flatnonzero(np.isnan(values)).tolist() == [2, 3, 4]
-    assert values[5] == pytest.approx(300 / 0xFFFFFF * 1e-3)
-
-
-def test_a_jump_of_the_counter_back_or_far_is_an_error() -> None:
-    for counter in (0, LONGEST_GAP + 12):
-        with pytest.raises(ProtocolError, match="jumps from 11"):
-            sequence(block(10, (1,)), block(counter, (1,)))
-
-
-def test_readings_of_an_untrusted_block_are_counted() -> None:
-    found = sequence(block(1, (5,), (6,)), b"stray", block(3, (7,)), block(4, (8,)))
-    values, codes = found.take(4)
-    assert reasons(codes) == {"garbled": 2}
-    assert np.isfinite(values).tolist() == [False, False, True, True]
-
-
 def test_a_channel_that_is_not_sent_is_an_error() -> None:
-    (found,) = BlockDecoder().feed(block(1, (5, 6)), last=True)
+    (found,) = block_decoder().feed(block(1, (5, 6)), last=True)
     assert column(found, 2).tolist() == [6]
     with pytest.raises(InstrumentError, match=r"sends the channels 1, 2; expected channel 3"):
         column(found, 3)

@@ -1,27 +1,20 @@
 """The driver of the confocalDT: its codec against documents, and the driver against the simulator."""
 
-import random
-import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
 
-from errormotion.errors import ErrormotionError, InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments import simulators
 from errormotion.instruments.point_lds.confocaldt import ConfocalDT, ConfocalSettings, codec
 from errormotion.instruments.point_lds.confocaldt.blocks import (
     DISTANCE_1,
     HEADER,
-    LONGEST_GAP,
-    MAX_BLOCK_BYTES,
     MEASURED,
-    BlockDecoder,
-    Sequence,
-    reasons,
+    block_decoder,
+    readings,
     scale,
 )
 from errormotion.instruments.point_lds.optoncdt.commands import RefusedCommandError, parse_answer
@@ -89,79 +82,17 @@ def test_a_rate_that_is_none_is_an_error(answer: list[str]) -> None:
 
 @layer("block")
 def test_blocks(vector: Vector) -> None:
-    (found,) = BlockDecoder().feed(vector.data, last=True)
-    values, codes = scale(found.values)
+    (found,) = block_decoder().feed(vector.data, last=True)
+    values, codes = scale(found.values[:, 0])
     assert found.counter == vector.expected["counter"]
     np.testing.assert_allclose(values * 1e6, vector.expected["micrometres"], rtol=1e-12)
-    assert reasons(codes) == vector.expected["reasons"]
+    assert readings().counts(codes) == vector.expected["reasons"]
 
 
 @layer("other")
 def test_other_values_are_refused_with_their_size(vector: Vector) -> None:
     with pytest.raises(InstrumentError, match=f"frames of {vector.expected['size']} bytes"):
-        BlockDecoder().feed(vector.data, last=True)
-
-
-@given(st.lists(st.lists(st.integers(-(2**30), 2**30), min_size=1, max_size=9), min_size=1, max_size=6), st.data())
-def test_blocks_are_found_however_they_arrive(parts: list[list[int]], data: st.DataObject) -> None:
-    stream, counter = b"", 5
-    for part in parts:
-        stream += block(counter, *part)
-        counter += len(part)
-    decoder, found = BlockDecoder(), []
-    while stream:
-        size = data.draw(st.integers(1, len(stream)))
-        found += decoder.feed(stream[:size], last=size == len(stream))
-        stream = stream[size:]
-    assert [each.values.tolist() for each in found] == parts
-    assert decoder.stray == 0
-
-
-def test_a_gap_of_the_counter_is_counted_as_lost_and_a_jump_back_refused() -> None:
-    sequence = Sequence()
-    for each in BlockDecoder().feed(block(2**32 - 1, 10, 20) + block(3, 30), last=True):
-        sequence.add_block(each)
-    values, codes = sequence.take(5)
-    np.testing.assert_allclose(values * 1e9, [10, 20, np.nan, np.nan, 30])
-    assert reasons(codes) == {"lost": 2}
-    for counter in (3, 4 + LONGEST_GAP + 1):
-        with pytest.raises(ProtocolError, match="counter"):
-            sequence.add_block(BlockDecoder().feed(block(counter, 1), last=True)[0])
-
-
-def test_a_damaged_block_is_counted_as_garbled() -> None:
-    first, second = block(0, 1, 2, 3), block(3, 4)
-    sequence = Sequence()
-    for each in BlockDecoder().feed(first[:-5] + second, last=True):
-        sequence.add_block(each)
-    values, codes = sequence.take(4)
-    assert reasons(codes) == {"garbled": 3}
-    assert values[3] == pytest.approx(4e-9)
-
-
-def test_mutated_blocks_raise_only_errors_of_the_project_and_are_bounded_in_time() -> None:
-    rng = random.Random(7)
-    whole = b"".join(block(9 * k, *range(9)) for k in range(20))
-    start = time.monotonic()
-    for _ in range(2000):
-        data = bytearray(whole)
-        for _ in range(rng.randrange(1, 8)):
-            data[rng.randrange(len(data))] = rng.randrange(256)
-        decoder = BlockDecoder()
-        try:
-            for each in decoder.feed(bytes(data), last=True):
-                assert len(each.values) * 4 + HEADER.size <= MAX_BLOCK_BYTES
-        except ErrormotionError:
-            continue
-        assert len(decoder._buffer) <= MAX_BLOCK_BYTES
-    assert time.monotonic() - start < 20.0  # 10 ms a frame
-
-
-def test_noise_is_not_kept() -> None:
-    decoder = BlockDecoder()
-    for _ in range(50):
-        assert decoder.feed(b"\x00SAE" * 10_000) == []
-    assert len(decoder._buffer) < HEADER.size
+        block_decoder().feed(vector.data, last=True)
 
 
 # ---------------------------------------------------------------------- driver

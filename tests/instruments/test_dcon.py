@@ -14,10 +14,10 @@ from errormotion.instruments.simulators import world
 from errormotion.instruments.thermometer.dcon import (
     DconSettings,
     DconTemperature,
+    check_configuration,
     checksum,
     decode,
     encode,
-    format_temperatures,
     parse_temperatures,
 )
 
@@ -33,7 +33,6 @@ def read_often(thermometer: DconTemperature, times: int) -> None:
 def test_vectors() -> None:
     assert encode("#01") == b"#01\r"
     assert parse_temperatures(decode(b">+025.12+026.00\r")) == [25.12, 26.0]
-    assert format_temperatures([25.12, 26.0]) == ">+025.12+026.00"
 
 
 @pytest.mark.parametrize("vector", vectors("dcon_temperature", "reading"), ids=str)
@@ -64,21 +63,70 @@ def test_checksum_is_the_sum_of_the_characters() -> None:
 
 @given(st.lists(st.floats(-200, 1370).map(lambda t: round(t, 2)), min_size=1, max_size=10))
 def test_temperatures_come_back(temperatures: list[float]) -> None:
-    assert parse_temperatures(format_temperatures(temperatures)) == pytest.approx(temperatures, abs=1e-9)
+    answer = ">" + "".join(f"{t:+07.2f}" for t in temperatures)
+    assert parse_temperatures(answer) == pytest.approx(temperatures, abs=1e-9)
 
 
 @pytest.mark.parametrize("value", ["+9999.9", "-9999.9", "+9999", "-0000", "+888888"])
 def test_an_open_sensor_is_nan(value: str) -> None:
     readings = parse_temperatures(f">+025.12{value}+026.00")
+    assert readings[1] is not None
     assert math.isnan(readings[1])
     assert readings[::2] == [25.12, 26.0]
+
+
+def test_a_disabled_channel_is_none() -> None:
+    assert parse_temperatures(">+025.12       +026.00" + " " * 7) == [25.12, None, 26.0, None]
+
+
+@pytest.mark.parametrize(
+    ("configuration", "message"),
+    [
+        ("100601", "writes per cent of the range"),
+        ("0F0682", r"writes hexadecimal \(data format 82\)"),
+        ("200603", "writes ohms"),
+        ("050600", "input range 05, a voltage or current"),
+    ],
+)
+def test_a_module_that_states_no_degrees_is_refused(configuration: str, message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        check_configuration(configuration)
+
+
+@pytest.mark.parametrize("configuration", ["100600", "0F0A80", "200640"])
+def test_engineering_units_of_thermocouples_and_resistors_are_read(configuration: str) -> None:
+    check_configuration(configuration)
+
+
+@pytest.mark.parametrize("configuration", ["", "10060", "1006000", "1g0600"])
+def test_another_answer_is_no_configuration(configuration: str) -> None:
+    with pytest.raises(ProtocolError, match="such as '100600'"):
+        check_configuration(configuration)
+
+
+@pytest.mark.parametrize(("settings", "message"), [("format=percent", "per cent"), ("type=5", "voltage")])
+def test_no_session_starts_with_such_a_module(settings: str, message: str) -> None:
+    with pytest.raises(InstrumentError, match=message):
+        DconTemperature(f"{ADDRESS}&{settings}").open()
+
+
+@pytest.mark.parametrize("model", ["7018", "4018"])
+@pytest.mark.parametrize("type_code", [0x0E, 0x0F, 0x10])
+def test_modules_of_both_makers_are_read(model: str, type_code: int) -> None:
+    with DconTemperature(f"{ADDRESS}&model={model}&type={type_code}&open=2") as thermometer:
+        reading = thermometer.read()
+        assert thermometer.identify().model == model
+        assert thermometer.open_sensors == ("spindle_front",)
+    assert reading["frame"] == pytest.approx(20.0, abs=1.0)
 
 
 def test_zero_degrees_is_no_open_sensor() -> None:
     assert parse_temperatures(">+000.00-000.00") == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("text", ["", ">", "+025.12", ">025.12", ">+025.12x", ">+025.12 +026.00", "!01"])
+@pytest.mark.parametrize(
+    "text", ["", ">", "+025.12", ">025.12", ">+025.12x", ">+025.12 +026.00", ">+025.12      ", "!01"]
+)
 def test_anything_else_is_a_protocol_error(text: str) -> None:
     with pytest.raises(ProtocolError, match="such as '>"):
         parse_temperatures(text)
@@ -93,7 +141,7 @@ def test_temperatures_are_the_twins(wire: str, check: bool) -> None:
     with DconTemperature(address, DconSettings(checksum=check)) as thermometer:
         reading = thermometer.read()
         assert thermometer.open_sensors == ()
-        assert thermometer.identify().model == "4018"
+        assert thermometer.identify().model == "7018"
         assert thermometer.identify().simulated
         twin = world("cframe", 3).machine
         truth = dict(zip(twin.temperature_sensors, twin.temperatures([0.0])[0], strict=True))
@@ -116,19 +164,28 @@ def test_names_and_inputs_are_settings() -> None:
         assert list(thermometer.read()) == ["air", "bed"]
 
 
-def test_fewer_inputs_than_names_is_an_error() -> None:
+def test_a_name_for_a_disabled_channel_is_an_error() -> None:
     with (
         DconTemperature(f"{ADDRESS}&sensors=frame,bed") as thermometer,
-        pytest.raises(ProtocolError, match=r"at least 5 temperatures .* found 2"),
+        pytest.raises(ProtocolError, match="spindle_front, spindle_rear, column are disabled"),
     ):
         thermometer.read()
 
 
-def test_a_refused_request_and_a_foreign_module_are_errors() -> None:
+def test_fewer_inputs_than_names_is_an_error() -> None:
+    settings = DconSettings(channels=tuple(f"input_{i}" for i in range(9)))
+    with (
+        DconTemperature(ADDRESS, settings) as thermometer,
+        pytest.raises(ProtocolError, match=r"at least 9 temperatures .* found 8"),
+    ):
+        thermometer.read()
+
+
+def test_a_refused_request_and_a_missing_module_are_errors() -> None:
     with DconTemperature(ADDRESS) as thermometer, pytest.raises(InstrumentError, match=r"refuses '\$01X': '\?01'"):
         thermometer._query("$01X", "!01")
-    with pytest.raises(InstrumentError, match="refuses"):
-        DconTemperature(ADDRESS, DconSettings(unit=2)).open()
+    with pytest.raises(InstrumentTimeoutError):
+        DconTemperature(ADDRESS, DconSettings(unit=2, timeout=0.3)).open()
 
 
 def test_a_sensor_that_the_machine_does_not_have_is_refused() -> None:
@@ -192,7 +249,7 @@ def test_flags_and_places_tell_what_and_where_a_sensor_is() -> None:
 @pytest.mark.parametrize("wire", ["tcp", "pty"])
 def test_a_module_that_was_unplugged_is_heard_again_by_itself(wire: str) -> None:
     settings = DconSettings(timeout=0.7, retry=0.05)
-    address = f"{ADDRESS}&wire={wire}&fault=unplugged&fault_at=3&unplugged_for=1.6"
+    address = f"{ADDRESS}&wire={wire}&fault=unplugged&fault_at=4&unplugged_for=1.6"
     with DconTemperature(address, settings) as thermometer:
         before = thermometer.read()
         gaps, end = 0, time.monotonic() + 20

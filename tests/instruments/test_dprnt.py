@@ -2,6 +2,7 @@
 
 import math
 import re
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,7 +16,14 @@ from errormotion.errors import InstrumentError, InstrumentTimeoutError, Protocol
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import world
 from errormotion.instruments.touch_probe.dprnt import Dprnt, DprntSettings
-from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, Line, format_line, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import (
+    PATTERN,
+    Line,
+    format_line,
+    from_iso_code,
+    parse_line,
+    text_of,
+)
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.transports.serving import TcpServer
 from errormotion.kinematics.fits import fit_sphere
@@ -52,7 +60,7 @@ def test_lines_are_read_as_controls_print_them(text: str, line: Line) -> None:
     assert found.time == pytest.approx(line.time, nan_ok=True)
 
 
-@pytest.mark.parametrize("vector", vectors("dprnt"), ids=str)
+@pytest.mark.parametrize("vector", vectors("dprnt", "line"), ids=str)
 def test_lines_after_the_manual_of_haas(vector: Vector) -> None:
     found = parse_line(text_of(vector.data), re.compile(vector.expected.get("pattern", PATTERN)))
     assert found.position == pytest.approx([value * 1e-3 for value in vector.expected["position"]], abs=1e-15)
@@ -270,14 +278,14 @@ def ball_touches(item: int = 0) -> list[Touch]:
 
 def program(touches: Sequence[Touch]) -> str:
     """Return a program that makes touches and prints them, from above each time."""
-    lines = ["(touch a ball)", "G21 G90 G94 F3000"]
+    lines = ["(touch a ball)", "G21 G90 G94 F3000", "POPEN"]
     for number, touch in enumerate(touches, 1):
         (x, y, z), target = (np.array(touch.start) * 1e3, np.array(touch.target) * 1e3)
         lines += [f"G0 Z{z + 40:.4f}", f"G0 X{x:.4f} Y{y:.4f}", f"G0 Z{z:.4f}"]
         lines.append(f"G31 X{target[0]:.4f} Y{target[1]:.4f} Z{target[2]:.4f} F30")
         lines.append(f"DPRNT[N{number}*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]")
         lines.append(f"G1 X{x:.4f} Y{y:.4f} Z{z:.4f} F3000")
-    return "\n".join([*lines, f"G0 Z{z + 40:.4f}", "M30"])
+    return "\n".join([*lines, "PCLOS", f"G0 Z{z + 40:.4f}", "M30"])
 
 
 def run(
@@ -308,6 +316,57 @@ def test_the_machine_prints_and_the_ball_is_found(wire: str) -> None:
     true = machine.balls.centre[0] - machine.probe_error(ball.centre, 0.0)[0]
     # printed to 1 um, tripped to 0.25 um, lobes and form of 2 um
     np.testing.assert_allclose(ball.centre, true, atol=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("port", "settings"),
+    [
+        ("zeros=none", {}),
+        ("eob=lfcrcr&percent=1", {}),
+        ("code=iso", {"code": "iso"}),
+        ("control=haas", {"line_end": "cr"}),
+        ("control=haas&eob=crlf", {}),
+        ("control=haas&code=iso&percent=1", {"line_end": "cr", "code": "iso"}),
+    ],
+)
+def test_lines_of_all_controls_are_read(port: str, settings: dict[str, str]) -> None:
+    _, contacts, raised = run(ADDRESS)
+    probe, found, raised_too = run(f"{ADDRESS}&{port}", DprntSettings(timeout=0.3, start_timeout=0.3, **settings))
+    assert (raised, raised_too, flags(found), probe.unreadable) == (None, None, [""] * 5, 0)
+    for one, other in zip(contacts, found, strict=True):
+        assert other.position == pytest.approx(one.position, abs=2.5e-6)  # of another touch: rounding and scatter
+
+
+def test_iso_code_shows_damaged_characters() -> None:
+    assert from_iso_code(bytes.fromhex("c3a0afd8")) == b"C /X"
+    with pytest.raises(ProtocolError, match="even parity"):
+        from_iso_code(b"C /X")
+    probe, contacts, raised = run(f"{ADDRESS}&code=iso", DprntSettings(timeout=0.3, start_timeout=0.3))
+    assert isinstance(raised, InstrumentTimeoutError)
+    assert probe.unreadable == 5
+    assert contacts == []
+
+
+@pytest.mark.parametrize("late", [2, 4])
+def test_lines_of_a_cycle_that_came_too_late_are_no_touches_of_the_next_one(late: int) -> None:
+    touches = ball_touches()
+    address = f"{ADDRESS}&fault=late&fault_at={late}&late_by=0.5"
+    with Dprnt(address, QUICK) as probe, VirtualController("sim://cframe/controller?seed=3") as control:
+        begun = control.run_program(program(touches))
+        here = world("cframe", 3)
+        blocks = [when for when, order in here.port_output if not isinstance(order, str)]
+        control.elapse(blocks[late] - here.time + 0.01)  # up to the line that is late
+        with pytest.raises(InstrumentTimeoutError, match=f"Touch {late + 1} of 5"):
+            list(probe.measure(touches))
+        control.elapse(begun["duration"] + begun["longest_lead_in"])
+        second = here.time
+        control.run_program(program(touches))
+        time.sleep(0.5)
+        control.elapse(begun["duration"] + begun["longest_lead_in"])
+        contacts = list(probe.measure(touches))
+        assert flags(contacts) == [""] * 5
+        assert all(contact.time > second for contact in contacts)
+        assert (probe.late, probe.missing) == (5 - late, 0)
 
 
 @pytest.mark.parametrize(

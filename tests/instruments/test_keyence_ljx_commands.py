@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings
 from errormotion.instruments.transports.serving import TcpServer
 
@@ -110,22 +110,46 @@ def test_a_reply_sent_twice_shifts_no_later_one(controller: Controller) -> None:
     profiler.close()
 
 
-def test_a_device_that_stays_silent_is_lost_until_it_is_opened_again(controller: Controller) -> None:
+def test_a_device_that_misses_two_requests_is_connected_again(controller: Controller) -> None:
     profiler = opened(controller)
     number = len(controller.requests)
     for i in range(2):
         controller.otherwise[number + i] = lambda reply: None
     with pytest.raises(InstrumentTimeoutError):
         profiler.counts()
-    with pytest.raises(InstrumentError, match=r"is lost \(.*expected 4 bytes.*\); close and open it again"):
-        profiler.counts()
+    assert profiler.counts().trigger == len(controller.requests) - 1
+    assert profiler.program() == (len(controller.requests) - 1) % 16
     profiler.close()
-    profiler.open()
+
+
+def test_a_device_that_stays_silent_gives_typed_errors_until_it_answers(controller: Controller) -> None:
+    profiler = opened(controller)
+    number = len(controller.requests)
+    for i in range(4):
+        controller.otherwise[number + i] = lambda reply: None
+    for _ in range(3):  # the command; another one and the start of a session; the start of the next session
+        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+            profiler.counts()
     assert profiler.counts().trigger == len(controller.requests) - 1
     profiler.close()
 
 
-def test_without_the_number_of_the_command_a_missed_reply_loses_the_device(controller: Controller) -> None:
+def test_a_reply_that_comes_after_the_next_one_is_not_taken_for_it(controller: Controller) -> None:
+    """Late for longer than the request by which the driver finds out: it is lost with its connection."""
+    profiler = opened(controller)
+    number = len(controller.requests)
+    held: list[bytes] = []
+    controller.otherwise[number] = held.append
+    controller.otherwise[number + 1] = held.append
+    with pytest.raises(InstrumentTimeoutError):
+        profiler.counts()
+    controller.otherwise[number + 2] = lambda reply: [controller.commands.send(part) for part in (*held, reply)]
+    for _ in range(3):
+        assert profiler.counts().trigger == len(controller.requests) - 1
+    profiler.close()
+
+
+def test_without_the_number_of_the_command_a_missed_reply_is_lost_with_its_connection(controller: Controller) -> None:
     controller.echo = False
     profiler = opened(controller)
     number = len(controller.requests)
@@ -133,8 +157,8 @@ def test_without_the_number_of_the_command_a_missed_reply_loses_the_device(contr
     controller.otherwise[number + 1] = lambda reply: None
     with pytest.raises(InstrumentTimeoutError):
         profiler.counts()
-    with pytest.raises(InstrumentError, match="without the number of its command"):
-        profiler.counts()
+    for _ in range(3):
+        assert profiler.counts().trigger == len(controller.requests) - 1
     profiler.close()
 
 

@@ -26,6 +26,7 @@ class TestKit(InstrumentConformance):
         LeicaEmScon,
         "sim://gantry/tracker?seed=2&result=2&station=-1.5,-1.5,0.4",
         settings={"reflector": "Cat's eye", "meteo": "manual", "timeout": 0.5, "busy_timeout": 0.3},
+        vary=simulators.in_steps("gantry", 2),
         name="gantry",
     )
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_geocom import GeoComSettings, LeicaGeoCom, air
 from errormotion.plugins.readings import Environment
 from errormotion.testing import InstrumentConformance, InstrumentSubject
@@ -24,7 +25,7 @@ class TestKit(InstrumentConformance):
         "sim://cframe/station?seed=3",
         settings={"timeout": 0.7},
         name="station",
-        repeats=True,  # a station keeps its last measurement
+        vary=simulators.in_steps(seed=3),
         dead_address="tcp://127.0.0.1:9",
     )
 

@@ -3,6 +3,7 @@
 import json
 import re
 import time
+import tracemalloc
 
 import mutants
 import pytest
@@ -14,6 +15,7 @@ from errormotion import plugins
 from errormotion.errors import ProtocolError, ReplayError
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.shdr import codec as shdr
+from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
 from errormotion.instruments.point_lds.optoncdt.commands import MOST_LINES, parse_answer
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, PATTERN, parse_line
 from errormotion.instruments.transports.recording import read_index
@@ -22,7 +24,6 @@ QUICK = 200
 HUGE = 10**400
 """A whole number beyond the range of float."""
 WITHOUT_CODEC = {
-    "confocaldt",  # not yet in the list; the kit replays its session with damaged frames
     "compensated_lds",  # reads another instrument
     "controller_probe",  # moves a controller
     "five_sensor_frame",  # several sensors
@@ -106,6 +107,20 @@ def test_an_answer_of_a_sensor_has_a_limited_number_of_lines() -> None:
     for end in (b"\n", b"->"):
         with pytest.raises(ProtocolError, match=f"more than {MOST_LINES} lines"):
             parse_answer("PRINT", end * (2 * MOST_LINES + 1))
+
+
+@pytest.mark.parametrize("text", ["s", r"\s", r"\\"])
+def test_an_unfinished_text_of_a_station_takes_no_more_memory_than_it_is_long(text: str) -> None:
+    line = b'%R1P,0,1:0,"' + (1000 // len(text) * text).encode()
+    with pytest.raises(ProtocolError, match="unfinished"):
+        geocom.reply(line)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProtocolError, match="unfinished"):
+            geocom.reply(line)
+        assert tracemalloc.get_traced_memory()[1] < 32 << 10
+    finally:
+        tracemalloc.stop()
 
 
 def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:

@@ -12,6 +12,8 @@ from errormotion.datasets.units import EDGE
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
 from errormotion.instruments.simulators import world
+from errormotion.instruments.simulators.faults import Fault, parse_fault
+from errormotion.instruments.transports import parse_address
 from errormotion.plugins import Samples
 
 SLOW = OptoSettings(rate=1500.0, timeout=10.0)
@@ -193,16 +195,36 @@ def test_silence_in_a_stream_is_a_timeout_error_after_the_samples_before_it() ->
     assert len(got) == 5
 
 
-def test_a_sensor_that_fell_silent_has_to_be_opened_again() -> None:
+def test_a_sensor_that_fell_silent_gives_timeouts_until_it_answers_again() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
     with OptoNCDT("sim://cframe/X1?seed=3&fault=silence&fault_at=5000", settings) as sensor:
         with pytest.raises(InstrumentTimeoutError):
             take(sensor, 10, block=1000)
-        with pytest.raises(InstrumentError, match="close and open it again"):
-            sensor.read()
-        sensor.close()
-        sensor.open()
+        for _ in range(2):
+            with pytest.raises(InstrumentTimeoutError):
+                sensor.read()
+        device = sensor.transport._device
+        device.fault, device._mute = Fault(), False
         assert np.isfinite(sensor.read())
+        assert np.isfinite(sensor.read())
+
+
+@pytest.mark.parametrize("wire", ["tcp", "pty"])
+@pytest.mark.parametrize("late", ["", "&late_by=0.45"])
+def test_a_sensor_whose_stop_is_confirmed_late_is_stopped_again(wire: str, late: str) -> None:
+    settings = OptoSettings(rate=1500.0, timeout=0.3, baudrate=921600)
+    with OptoNCDT(f"sim://cframe/X1?seed=3&wire={wire}", settings) as sensor:
+        sensor.read()
+        device = sensor.transport._device
+        stream = sensor.stream(block=1)
+        next(stream)
+        number = device._answers  # that of the stop
+        device.fault = parse_fault(parse_address(f"sim://cframe?fault=late&fault_at={number}{late}"), device.faults)
+        stream.close()
+        assert device._answers == number + 1
+        found = [sensor.read() for _ in range(3)]
+        assert np.isfinite(found).all()
+        assert sensor.identify().manufacturer == "Micro-Epsilon"
 
 
 def test_split_frames_change_nothing() -> None:

@@ -296,7 +296,7 @@ def test_whatever_the_sensor_answers_is_an_answer_or_an_error_of_the_project(tex
 
 
 def test_an_answer_that_is_too_long_is_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match="65536 at most"):
+    with pytest.raises(ProtocolError, match=f"{commands.LONGEST_ANSWER} at most"):
         commands.parse_answer("PRINT", b"x" * (commands.LONGEST_ANSWER + 1))
 
 

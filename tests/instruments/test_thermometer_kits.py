@@ -10,7 +10,7 @@ class TestAdam(InstrumentConformance):
 
     subject = InstrumentSubject(
         ModbusTemperature,
-        "sim://cframe/adam?seed=3&map=adam-6018&thermocouples=K",
+        "sim://cframe/adam?seed=3&noise=1&map=adam-6018&thermocouples=K",
         settings={"map": "adam-6018", "thermocouples": ("K",), "timeout": 0.7},
         name="adam",
         dead_address="modbus+tcp://127.0.0.1:9?unit=1",
@@ -22,7 +22,7 @@ class TestLogger(InstrumentConformance):
 
     subject = InstrumentSubject(
         ModbusTemperature,
-        "sim://cframe/logger?seed=3&map=logger-16&wire=pty&open=1",
+        "sim://cframe/logger?seed=3&noise=1&map=logger-16&wire=pty&open=1",
         settings={"map": "logger-16", "timeout": 0.7},
         name="logger",
         dead_address="modbus+rtu:///dev/no_such_line?unit=1",

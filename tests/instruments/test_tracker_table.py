@@ -1,5 +1,6 @@
 """Exported tables of trackers."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from errormotion.errors import InstrumentError, ReplayError
 from errormotion.instruments.laser_tracker.table_conformance import length_table
+from errormotion.instruments.laser_tracker.table_reader import MOST_LINES
 from errormotion.instruments.laser_tracker.tracker_table import TrackerTable, TrackerTableSettings
 from errormotion.testing import InstrumentConformance, InstrumentSubject
 
@@ -28,6 +30,19 @@ def refusal(address: str, **settings: object) -> str:
 
 class TestKit(InstrumentConformance):
     subject = InstrumentSubject(TrackerTable, str(length_table()), settings={"stations": ("S2", "S1", "S0")})
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\x0b", "\u2028"])
+def test_a_table_of_too_many_lines_is_refused_before_it_is_taken_apart(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "lines.csv"
+    path.write_bytes((HEAD + end + (MOST_LINES + 1) * f"]{end}").encode())
+    tracemalloc.start()
+    try:
+        message = refusal(str(path))
+        assert tracemalloc.get_traced_memory()[1] < 2 << 20
+    finally:
+        tracemalloc.stop()
+    assert f"at most {MOST_LINES} lines; found {MOST_LINES + 2}" in message
 
 
 def test_lengths_come_by_station_and_target_in_si(tmp_path: Path) -> None:

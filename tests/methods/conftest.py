@@ -2,7 +2,7 @@
 
 import pytest
 
-STATISTICAL = ("test_coverage", "test_differences")
+STATISTICAL = ("test_coverage", "test_differences", "test_sources_as_stated")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

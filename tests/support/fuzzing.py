@@ -12,9 +12,7 @@ import mutants
 from errormotion.errors import ErrormotionError
 
 SLOWEST = 10e-3
-"""Limit of one frame, s of CPU time."""
-SLOWEST_PIECE = 50e-3
-"""Limit of bytes that were lengthened: a piece as a connection delivers it, with up to some thousand frames, s."""
+"""Limit of one frame, or of one piece as a connection delivers it, with up to some thousand frames, s of CPU time."""
 REPEATS = 5
 """A frame above the limit is read again so many times: what else the process does is no time of the codec."""
 LENGTHENED = 50
@@ -25,6 +23,26 @@ OWN_MEMORY, MEMORY_PER_BYTE = 1 << 16, 64
 """Largest memory of a frame: so many bytes, and so many for each byte of the longest frame that is tried."""
 SHOWN = 5
 """Failures that are kept."""
+
+
+class Steps:
+    """Longest CPU time between two pieces of what is read, s."""
+
+    def __init__(self) -> None:
+        self.longest = self._since = 0.0
+
+    def start(self) -> None:
+        """Start at what is read next."""
+        self.longest, self._since = 0.0, time.thread_time()
+
+    def mark(self) -> None:
+        """Note that a piece was read, or the end."""
+        now = time.thread_time()
+        self.longest, self._since = max(self.longest, now - self._since), now
+
+
+STEPS = Steps()
+"""Those of the frame that is being read: codecs that take pieces mark each of them."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +63,8 @@ class Codec:
         Longest frame that the codec's module states, bytes.
     tried : int
         Length up to which frames are lengthened, bytes; longer ones are documents or files, which take their time.
+    per_byte : int
+        Bytes of memory for each byte of the longest frame that is tried.
     """
 
     device: str
@@ -53,6 +73,7 @@ class Codec:
     seeds: Callable[[], Sequence[bytes]]
     longest: int
     tried: int = 1 << 16
+    per_byte: int = MEMORY_PER_BYTE
 
     @property
     def name(self) -> str:
@@ -67,7 +88,7 @@ class Codec:
     @property
     def memory(self) -> int:
         """Largest memory while a frame is read, bytes."""
-        return OWN_MEMORY + MEMORY_PER_BYTE * self.lengthened
+        return OWN_MEMORY + self.per_byte * self.lengthened
 
 
 @dataclass
@@ -79,7 +100,7 @@ class Found:
     frames, lengthened : int
         Number of mutants, and of those as long as the longest frame.
     slowest, slowest_piece : float
-        Longest CPU time of one frame, and of one that was lengthened, s.
+        Longest CPU time of one frame, and of a piece of one that was lengthened, s.
     size, size_piece : int
         Length of these, bytes.
     memory : int
@@ -151,13 +172,9 @@ def fuzz(codec: Codec, numbers: range, *, seed: int = 1, sampled: int = SAMPLED)
 def _read(codec: Codec, data: bytes, number: int, found: Found, *, piece: bool) -> None:
     found.frames += 1
     found.lengthened += piece
-    start = time.thread_time()
-    error = _outcome(codec, data)
-    took = time.thread_time() - start
+    error, took = _timed(codec, data)
     for _ in range(REPEATS if took > SLOWEST else 0):
-        start = time.thread_time()
-        _outcome(codec, data)
-        took = min(took, time.thread_time() - start)
+        took = min(took, _timed(codec, data)[1])
     if piece and took > found.slowest_piece:
         found.slowest_piece, found.size_piece = took, len(data)
     elif not piece and took > found.slowest:
@@ -166,7 +183,7 @@ def _read(codec: Codec, data: bytes, number: int, found: Found, *, piece: bool) 
         found.errors[type(error).__name__] += 1
     elif error is not None:
         _fail(found, number, data, f"{type(error).__name__}: {str(error)[:200]}")
-    if took > (SLOWEST_PIECE if piece else SLOWEST):
+    if took > SLOWEST:
         _fail(found, number, data, f"{1e3 * took:.1f} ms for {len(data)} bytes")
 
 
@@ -181,6 +198,13 @@ def _measure(codec: Codec, data: bytes, number: int, found: Found) -> None:
     found.memory = max(found.memory, peak)
     if peak > codec.memory:
         _fail(found, number, data, f"{peak} bytes of memory for {len(data)} bytes; expected at most {codec.memory}")
+
+
+def _timed(codec: Codec, data: bytes) -> tuple[BaseException | None, float]:
+    STEPS.start()
+    error = _outcome(codec, data)
+    STEPS.mark()
+    return error, STEPS.longest
 
 
 def _outcome(codec: Codec, data: bytes) -> BaseException | None:

@@ -30,6 +30,8 @@ TOKENS = (
     *(b"%s", b"../", b"://"),
 )
 """What is inserted."""
+WINDOW = 2048
+"""Bytes among whose numbers one is chosen."""
 
 
 def count(quick: int) -> int:
@@ -110,7 +112,8 @@ def insert(data: bytes, rng: random.Random) -> bytes:
 
 def renumber(data: bytes, rng: random.Random) -> bytes:
     """Replace a number in a text with an unusual one."""
-    places = [match.span() for match in NUMBER.finditer(data)]
+    start = rng.randrange(len(data) - WINDOW) if len(data) > WINDOW else 0  # of a long text, those of a stretch
+    places = [match.span() for match in NUMBER.finditer(data, start, start + WINDOW)]
     if not places:
         return flip(data, rng)
     start, end = rng.choice(places)

@@ -18,8 +18,9 @@ from errormotion.instruments.laser_tracker import table_reader
 from errormotion.instruments.laser_tracker.leica_emscon import codec as emscon
 from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
 from errormotion.instruments.line_profiler.keyence_ljx import codec as ljx
-from errormotion.instruments.point_lds.capancdt import blocks
+from errormotion.instruments.point_lds.blocks import MAX_BLOCK_BYTES
 from errormotion.instruments.point_lds.capancdt import codec as capancdt
+from errormotion.instruments.point_lds.confocaldt import blocks as confocaldt
 from errormotion.instruments.point_lds.keyence_lk import codec as lk
 from errormotion.instruments.point_lds.optoncdt import commands
 from errormotion.instruments.point_lds.optoncdt.codec import encode_value
@@ -27,7 +28,7 @@ from errormotion.instruments.thermometer import dcon
 from errormotion.instruments.thermometer.scpi import codec as scpi
 from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, format_line
 from errormotion.instruments.transports import opc
-from errormotion.instruments.transports.base import CHUNK
+from errormotion.instruments.transports.base import CHUNK, PIECE
 from errormotion.instruments.transports.can import sdo
 from errormotion.instruments.transports.http.answer import MOST_LINE_BYTES as MOST_HEAD_LINE
 from errormotion.instruments.transports.modbus import codec as modbus
@@ -94,6 +95,21 @@ def capancdt_frames() -> list[bytes]:
         return struct.pack("<4sIIQIHHI4i", b"SAEM", 1, 2, 1, 0, 4, 4, counter, 5, 6, 7, 8)
 
     return [block(2**32 - 4) + block(0) + block(4), block(7) + block(15), block(3)]
+
+
+def confocaldt_answers() -> list[bytes]:
+    own = split(joined("confocaldt"), commands.PROMPT, most=16)
+    return [*own, *rows("confocaldt", "facts", "sensor", "rate", "reduction", "error")]
+
+
+def confocaldt_frames() -> list[bytes]:
+    def block(counter: int) -> bytes:
+        flags = confocaldt.MEASURED | confocaldt.DISTANCE_1
+        return confocaldt.HEADER.pack(b"SAEM", 1, 2, flags, 6 << 28, 4, 4, counter) + struct.pack(
+            "<4i", 5, 6, 7, 2**31 - 5
+        )
+
+    return [block(2**32 - 4) + block(0) + block(4), block(7) + block(15), *rows("confocaldt", "block", "other")]
 
 
 def lk_answers() -> list[bytes]:
@@ -248,7 +264,9 @@ CODECS: Sequence[Codec] = (
         lambda: [*split(joined("capancdt"), b"\n"), *rows("capancdt", "answer")],
         capancdt.MAX_LINE_BYTES,
     ),
-    Codec("capancdt", "blocks", readers.capancdt_blocks, capancdt_frames, blocks.MAX_BLOCK_BYTES),
+    Codec("capancdt", "blocks", readers.capancdt_blocks, capancdt_frames, MAX_BLOCK_BYTES),
+    Codec("confocaldt", "answers", readers.confocaldt_answer, confocaldt_answers, commands.LONGEST_ANSWER),
+    Codec("confocaldt", "blocks", readers.confocaldt_blocks, confocaldt_frames, MAX_BLOCK_BYTES),
     Codec("keyence_lk", "answers", readers.keyence_lk, lk_answers, lk.MAX_LINE_BYTES),
     Codec(
         *("keyence_ljx", "replies", readers.ljx_reply),
@@ -263,7 +281,9 @@ CODECS: Sequence[Codec] = (
         emscon.MAX_PACKET_BYTES,
     ),
     Codec("leica_geocom", "replies", geocom.reply, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
-    Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096),
+    Codec(
+        "tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096, per_byte=128
+    ),
     Codec(
         "dcon_temperature",
         "answers",
@@ -301,7 +321,7 @@ CODECS: Sequence[Codec] = (
     ),
     Codec(
         *("mtconnect", "documents", readers.mtconnect_document),
-        *(documents, xml.LONGEST),
+        *(documents, xml.LONGEST, PIECE),
     ),
     Codec("mtconnect", "HTTP", readers.http_answer, http_answers, MOST_HEAD_LINE),
     Codec(

@@ -11,6 +11,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from fuzzing import STEPS
 
 from errormotion.errors import ErrormotionError, InstrumentTimeoutError
 from errormotion.instruments.controller import virtual
@@ -31,9 +32,12 @@ from errormotion.instruments.laser_tracker.table_reader import read_table
 from errormotion.instruments.line_profiler.keyence_ljx import codec as ljx
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import HeightDecoder
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamDecoder as ProfileDecoder
-from errormotion.instruments.point_lds.capancdt import blocks
+from errormotion.instruments.point_lds.blocks import BlockDecoder
+from errormotion.instruments.point_lds.capancdt import blocks as capancdt_values
 from errormotion.instruments.point_lds.capancdt import codec as capancdt
-from errormotion.instruments.point_lds.capancdt.sequence import Sequence
+from errormotion.instruments.point_lds.confocaldt import blocks as confocaldt_values
+from errormotion.instruments.point_lds.confocaldt import codec as confocaldt
+from errormotion.instruments.point_lds.counted import CountedReadings
 from errormotion.instruments.point_lds.keyence_lk import codec as lk
 from errormotion.instruments.point_lds.optoncdt import codec as optoncdt
 from errormotion.instruments.point_lds.optoncdt import commands
@@ -41,8 +45,8 @@ from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
 from errormotion.instruments.thermometer import cia404, dcon
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings
 from errormotion.instruments.thermometer.scpi import codec as scpi
-from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, parse_line, text_of
-from errormotion.instruments.transports.base import Transport
+from errormotion.instruments.touch_probe.dprnt.codec import PATTERN, from_iso_code, parse_line, text_of
+from errormotion.instruments.transports.base import PIECE, Transport
 from errormotion.instruments.transports.can import pdo, sdo
 from errormotion.instruments.transports.http.answer import Head, Input, Lines, header_fields
 from errormotion.instruments.transports.modbus import codec as modbus
@@ -51,7 +55,7 @@ from errormotion.instruments.transports.recording import parts_of, read_index, r
 
 Read = Callable[[bytes], object]
 URL = "tcp://192.0.2.1:1"
-PROFILE_POINTS, MOST_BLOCKS = 16, 16
+PROFILE_POINTS, MOST_BLOCKS, MOST_READINGS = 16, 16, 35_000
 EMSCON = EmSconSettings(timeout=1e-9)
 LAYOUT = ljx.StreamLayout(1, ljx.INTENSITY, PROFILE_POINTS, 0.8e-6, 0.0, 1e-5)
 MODBUS = {
@@ -81,6 +85,7 @@ class Received(Transport):
         del self._answers[:1]
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
+        STEPS.mark()
         if not self._left or not self._left[0]:
             raise InstrumentTimeoutError(f"{self.url}: nothing more")
         data, self._left[0] = self._left[0][:max_bytes], self._left[0][max_bytes:]
@@ -105,10 +110,16 @@ def each(*calls: Callable[[], object]) -> None:
         raise last
 
 
-def halves(data: bytes) -> tuple[bytes, bytes]:
-    """Return bytes in two pieces, as a connection may split them."""
-    place = len(data) // 3
-    return data[:place], data[place:]
+def pieces(data: bytes) -> Iterator[tuple[bytes, bool]]:
+    """Yield the pieces of what a connection delivers, and whether it is the last one; at least two."""
+    start, end = 0, min(len(data) // 3, PIECE)
+    while True:
+        yield data[start:end], False
+        STEPS.mark()
+        start, end = end, end + PIECE
+        if end >= len(data):
+            yield data[start:], True
+            return
 
 
 # ---------------------------------------------------------------------- sensors
@@ -126,7 +137,7 @@ def optoncdt_answer(data: bytes) -> None:
 def optoncdt_stream(counter: bool, counter_first: bool) -> Read:
     def read(data: bytes) -> None:
         decoder = StreamDecoder(2e-3, highest=64876, counter=counter, counter_first=counter_first)
-        for piece in halves(data):
+        for piece, _ in pieces(data):
             chunk = decoder(piece)
             assert chunk.values.shape == chunk.reasons.shape
 
@@ -149,13 +160,36 @@ def capancdt_answer(data: bytes) -> None:
     )
 
 
-def capancdt_blocks(data: bytes) -> None:
-    decoder, sequence = blocks.BlockDecoder(), Sequence(1, capancdt.Channel("", "", 0.0, 1e-3))
-    first, second = halves(data)
-    for block in [*decoder.feed(first), *decoder.feed(second, last=True)]:
-        sequence.add_block(block)
-    values, codes = sequence.take(sequence.waiting)
-    assert values.shape == codes.shape
+def counted_blocks(decoder: Callable[[], BlockDecoder], readings: Callable[[], CountedReadings]) -> Read:
+    """Return what reads blocks as a stream does; of long gaps, as many readings as a block of a stream has."""
+
+    def read(data: bytes) -> None:
+        split, found = decoder(), readings()
+        for piece, last in pieces(data):
+            for block in split.feed(piece, last=last):
+                found.add(block)
+            values, codes = found.take(min(found.waiting, MOST_READINGS))
+            assert values.shape == codes.shape
+
+    return read
+
+
+capancdt_blocks = counted_blocks(
+    capancdt_values.block_decoder,
+    lambda: capancdt_values.readings_of(1, capancdt.Channel("", "", 0.0, 1e-3)),
+)
+confocaldt_blocks = counted_blocks(confocaldt_values.block_decoder, confocaldt_values.readings)
+
+
+def confocaldt_answer(data: bytes) -> None:
+    lines = commands.parse_answer(confocaldt.INFO, optoncdt.text_of(data))
+    facts = confocaldt.facts_of(lines)
+    each(
+        lambda: confocaldt.model_of(facts),
+        lambda: confocaldt.range_of(facts),
+        lambda: confocaldt.rate_of(lines),
+        lambda: confocaldt.reduction_of(lines),
+    )
 
 
 def keyence_lk(data: bytes) -> None:
@@ -179,7 +213,7 @@ def ljx_reply(data: bytes) -> None:
 
 def ljx_stream(data: bytes) -> None:
     decoder, heights = ProfileDecoder(LAYOUT), HeightDecoder(LAYOUT)
-    for piece in halves(data):
+    for piece, _ in pieces(data):
         chunk = decoder(piece)
         found = np.empty((len(chunk.values), LAYOUT.points))
         heights.heights(chunk.values, chunk.reasons, found, np.zeros(len(ljx.REASONS), dtype=np.int64))
@@ -244,6 +278,7 @@ def dcon_answer(data: bytes) -> None:
     each(
         lambda: dcon.parse_temperatures(dcon.decode(data)),
         lambda: dcon.parse_temperatures(dcon.decode(data, with_checksum=True)),
+        lambda: dcon.check_configuration(dcon.decode(data).removeprefix("!01")),
     )
 
 
@@ -266,7 +301,7 @@ def modbus_answer(framing: modbus.Framing) -> Read:
 def modbus_request(framing: modbus.Framing) -> Read:
     def read(data: bytes) -> None:
         server = ModbusServer(framing, 1, 3, {0: 125}, lambda: {0: 7})
-        for piece in halves(data):
+        for piece, _ in pieces(data):
             for answer in server.receive(piece):
                 assert len(answer) <= 260
 
@@ -364,7 +399,7 @@ def http_answer(data: bytes) -> None:
 
 def shdr_lines(data: bytes) -> None:
     lines, memory = shdr.Lines(), Memory()
-    for piece in halves(data):
+    for piece, _ in pieces(data):
         for line in lines.feed(piece):
             found = shdr.parse_line(line)
             if isinstance(found, shdr.Command):
@@ -399,6 +434,9 @@ _LINE = re.compile(PATTERN)
 
 
 def dprnt_line(data: bytes) -> None:
-    text = text_of(data)
-    if text:
-        parse_line(text, _LINE)
+    def read(line: bytes) -> None:
+        text = text_of(line)
+        if text:
+            parse_line(text, _LINE)
+
+    each(lambda: read(from_iso_code(data)), lambda: read(data))

@@ -10,7 +10,7 @@ from pydantic import ConfigDict
 from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.plugins import MethodInfo, Needs, PluginSettings
+from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.testing import MethodConformance, MethodSubject, run_checks
 from errormotion.testing.kit import run_check
 from errormotion.testing.method_checks import METHOD_CHECKS
@@ -249,6 +249,43 @@ class PlansOneFreedom(Sound):
         return self.result(planned["time"].values, values, unit, np.zeros((8, 12, 6)), np.zeros(3), CHANNELS, settings)
 
 
+class Redrawn(Sound):
+    """Draws the noise of its readings and the calibration of its sensors anew."""
+
+    calibration = CALIBRATION
+    groups = ("calibration",)
+
+    def redrawing(self, raw, settings, errors):
+        def shifted(size, shape):
+            def draw(raw, settings, generator):
+                shift = self.generator(generator).normal(0, size, shape)
+                return raw.assign(displacement=(raw["displacement"] + shift).assign_attrs(units="m")), settings
+
+            return draw
+
+        order = raw["displacement"].transpose("channel", "time")
+        each, one = order.shape, (order.shape[0], 1)
+        sources = {"noise": Redraw(shifted(settings.noise, each), own=True)}
+        sources["calibration"] = Redraw(shifted(self.calibration, one), groups=self.groups)
+        return Redrawing(raw.assign(displacement=order), settings, sources)
+
+    def generator(self, given):
+        return given
+
+
+class RollsItsOwnDice(Redrawn):
+    def generator(self, given):
+        return np.random.default_rng()
+
+
+class DrawsHalfOfItsCalibration(Redrawn):
+    calibration = CALIBRATION / 2
+
+
+class ForgetsItsCalibration(Redrawn):
+    groups = ()
+
+
 BROKEN = [
     ("info_complete", CannotSayWhatItCannotSee),
     ("settings_strict", SwallowsUnknownSettings),
@@ -258,6 +295,9 @@ BROKEN = [
     ("recovers_truth", ExaggeratesOneInstant),
     ("coverage", HidesABias),
     ("differences", ForgetsWhatTimesShare),
+    ("sources_drawn", RollsItsOwnDice),
+    ("sources_drawn", ForgetsItsCalibration),
+    ("sources_as_stated", DrawsHalfOfItsCalibration),
     ("frame_invariance", KnowsOnlyItsOwnFrame),
     ("number_format", TakesSinglePrecisionForMicrometres),
     ("units", TakesMillimetresForMetres),
@@ -276,6 +316,12 @@ def test_a_broken_method_fails_exactly_its_check(check, plugin):
     results = run_checks(replace(SOUND, plugin=plugin, seeds=20))
     failed = {result.name: result.message for result in results if not result.ok}
     assert failed.keys() == {check}
+
+
+def test_a_method_that_draws_its_sources_as_stated_passes():
+    results = {result.name: result for result in run_checks(replace(SOUND, plugin=Redrawn, seeds=20))}
+    assert [name for name, result in results.items() if not result.ok] == []
+    assert not results["sources_as_stated"].skipped
 
 
 def test_every_check_has_a_plugin_that_fails_it():

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +10,17 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.instruments.controller.virtual import VirtualController, decode_answer, encode_request
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.point_lds.keyence_lk import KeyenceLK
 from errormotion.instruments.simulators.device import SimulatedDevice
+from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
 from errormotion.instruments.transports import Address, Transport, open_transport, parse_address
+from errormotion.instruments.transports.modbus.client import ModbusLine
 from errormotion.instruments.transports.serial_line import SerialTransport
 from errormotion.plugins import Identity, InstrumentInfo, PluginSettings
-from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks
+from errormotion.testing import InstrumentConformance, InstrumentSubject, run_checks, wire_checks
+from errormotion.testing.kit import CheckFailedError
 
 ADDRESS = "sim://cframe/dial?seed=3"
 
@@ -140,6 +146,61 @@ def test_a_broken_driver_fails_exactly_its_check(check: str, plugin: type[Dial])
     subject = InstrumentSubject(plugin, ADDRESS, mutants=100 if check == "mutants" else 0)
     failed = {result.name for result in run_checks(subject) if not result.ok}
     assert failed == {check}
+
+
+class TakesAnyLine(KeyenceLK):
+    def _query(self, request: str, header: str | None = None) -> str:
+        self._synchronised = True  # whatever was missed
+        return super()._query(request, header)
+
+
+class TakesAnyNumber(VirtualController):
+    def _call(self, op: str, **arguments: object) -> object:
+        self.transport.write(encode_request(1, op, arguments))
+        answer = self.transport.read_until(b"\n", limit=1 << 16)
+        return decode_answer(answer, 1)
+
+
+class TakesAnyRegisters(ModbusTemperature):
+    def _connect(self) -> ModbusLine:
+        line = super()._connect()
+        line._await_late_answer = lambda *_: None  # type: ignore[method-assign]
+        return line
+
+
+@pytest.mark.parametrize(
+    ("sound", "broken"),
+    [
+        (KeyenceLK.conformance(), TakesAnyLine),
+        (VirtualController.conformance(), TakesAnyNumber),
+        (
+            replace(ModbusTemperature.conformance(), address="sim://cframe?seed=3&noise=1&wire=pty"),
+            TakesAnyRegisters,
+        ),
+    ],
+    ids=lambda each: getattr(each, "__name__", "sound"),
+)
+def test_a_late_answer_that_is_taken_is_seen_in_readings_that_differ(sound: InstrumentSubject, broken: type) -> None:
+    assert wire_checks.late_answers(sound).count("right readings") == 2
+    with pytest.raises(CheckFailedError, match="was taken for that to the next request"):
+        wire_checks.late_answers(replace(sound, plugin=broken))
+
+
+def test_equal_readings_can_be_made_to_differ() -> None:
+    class Still(Dial):
+        """Shows what it measures to 0.1 mm only."""
+
+        def read(self) -> float:
+            return round(super().read(), 4)
+
+    subject = InstrumentSubject(Still, ADDRESS)
+    assert wire_checks.late_answers(subject).count("equal ones, whose order is not seen: state 'vary'") == 2
+    assert wire_checks.late_answers(replace(subject, repeats=True)).count("gives a lost one again") == 2
+
+    moved: list[int] = []
+    found = wire_checks.late_answers(replace(subject, plugin=Dial, vary=moved.append))
+    assert found.count("right readings") == 2
+    assert moved[: wire_checks.READINGS] == list(range(wire_checks.READINGS))
 
 
 @pytest.mark.parametrize("wire", ["tcp", "pty"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,18 +14,20 @@ from errormotion import datasets
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.results import load
 from errormotion.compare import compare as compared
-from errormotion.compare.text import cause_text, probability, verdict
+from errormotion.compare.repeats import labels
+from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
 from errormotion.errors import DatasetError
 
 
 @dataclass(frozen=True)
 class Stated:
-    """What the command line states of the results: names, changes, origins of frames (m), the chain."""
+    """What the command line states of the results: names, changes, origins of frames (m), chain, and grouping."""
 
     names: list[str]
     changes: list[str]
     origins: dict[str, tuple[float, float, float]]
     chain: str | None
+    by: str | None = None
 
 
 def compare(
@@ -48,9 +51,10 @@ def compare(
     for path in (out, report):
         if path is not None and path.exists():
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
-    results, left_out = load(paths, _named(stated.names))
+    results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
     results = _completed(results, stated)
-    found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start)
+    groups = _groups(results, stated.by)
+    found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
     if left_out:
         found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
     if out is not None:
@@ -98,6 +102,14 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
     return found
 
 
+def _groups(results: dict[str, xr.Dataset], by: str | None) -> dict[str, str] | None:
+    """Return the group of each result; without ``by`` the repeats of a test, where there are any."""
+    if by not in (None, "test"):
+        return labels(results, str(by))
+    tests = {name: re.sub(r" \(\d+\)$", "", name) for name in results}
+    return tests if by or len(set(tests.values())) < len(tests) else None
+
+
 def text(ds: xr.Dataset) -> str:
     """Return the result for a person."""
     names = [str(name) for name in ds["dof"].values]
@@ -109,7 +121,9 @@ def text(ds: xr.Dataset) -> str:
         rows.append([str(pair), f"{share:.0f} %", f"{np.nanmax(en, initial=0.0):.2f}", *p])
     head = ["pair", "|En| <= 1", "max |En|", "p", *(f"p {name}" for name in names)]
     notes = [note for note in ds.attrs["notes"] if note]
-    return "\n".join([*verdict(ds), "", table(head, rows), *(["", *notes] if notes else [])])
+    spread = [list(row) for row in spreads(ds)]
+    more = ["", table(SPREAD_HEAD, spread)] if spread else []
+    return "\n".join([*verdict(ds), "", table(head, rows), *more, *(["", *notes] if notes else [])])
 
 
 def as_plain(ds: xr.Dataset) -> dict[str, Any]:
@@ -137,5 +151,6 @@ def as_plain(ds: xr.Dataset) -> dict[str, Any]:
         "verdict": verdict(ds),
         "misfit_p": dict(zip(map(str, ds["dataset"].values), map(float, ds["misfit_p"].values), strict=True)),
         "pairs": pairs,
+        **({"spread": [row._asdict() for row in spreads(ds)]} if "spread" in ds.variables else {}),
         "notes": [note for note in ds.attrs["notes"] if note],
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
@@ -16,12 +16,25 @@ from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.settings import read_settings
 from errormotion.cli.summary import as_printed, figure_table, notes_of
+from errormotion.cli.tolerances import end_with, lines_of, remarks
 from errormotion.datasets.merit import figures_of
 from errormotion.datasets.storage import reading
 from errormotion.errors import DatasetError, ErrormotionError
+from errormotion.tolerances.conformity import judge
+from errormotion.tolerances.table import Tolerances, from_run, load_tolerances
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from errormotion.campaign.batch import Outcome
+
+
+class Trials(NamedTuple):
+    """What ``--monte-carlo`` asks for; ``number`` is None for the adaptive procedure."""
+
+    number: int | None
+    digits: int
+    seed: int
 
 
 def identify(
@@ -32,16 +45,21 @@ def identify(
     settings_file: Path | None,
     scheduler: str | None,
     workers: int | None,
+    tolerances: Path | None,
     as_json: bool,
+    trials: Trials | None = None,
 ) -> None:
-    """Identify one raw dataset into a file, or several into a folder."""
-    several = len(raws) > 1 or scheduler or workers or is_runs_folder(raws[0])
+    """Identify one raw dataset into a file, or several into a folder, and decide on tolerances."""
+    limits = load_tolerances(tolerances) if tolerances is not None else None
+    several = len(raws) > 1 or is_runs_folder(raws[0]) or (trials is None and (scheduler or workers))
+    if several and trials is not None:
+        raise DatasetError("--monte-carlo: expected one raw dataset; evaluate several results one after another")
     if not several and out.exists():
         raise DatasetError(f"{out}: exists already, and a result is never overwritten; give another name to --out")
     method_id = method_id or _method_of(raws[0])
     settings = read_settings(plugins.get("methods", method_id).Settings, settings_file, assignments)
     if not several:
-        _identify_one(raw_of(raws[0]), method_id, settings, out, as_json)
+        _identify_one(raw_of(raws[0]), method_id, settings, out, limits, as_json, trials, scheduler, workers)
         return
     from errormotion.campaign import batch
 
@@ -52,7 +70,7 @@ def identify(
         outcomes = batch.identify_runs(
             raws, method_id, settings, out, scheduler=scheduler, workers=workers, progress=bars
         )
-    _show_outcomes(outcomes, out, scheduler, as_json)
+    _show_outcomes(outcomes, out, scheduler, limits, as_json)
 
 
 def _method_of(raw: Path) -> str:
@@ -70,12 +88,21 @@ def _method_of(raw: Path) -> str:
     return str(owner.info.id)
 
 
-def _show_outcomes(outcomes: list[Outcome], out: Path, scheduler: str, as_json: bool) -> None:
-    """Print the outcome of each run; the exit code is that of a failure if one failed."""
+def _show_outcomes(
+    outcomes: list[Outcome], out: Path, scheduler: str, limits: Tolerances | None, as_json: bool
+) -> None:
+    """Print the outcome of each run; the exit code is that of a failure if one failed, else of the tolerances."""
     failed = [outcome for outcome in outcomes if outcome.reason]
+    found = {}
+    for outcome in outcomes:
+        if limits is not None and outcome.errors is not None and not outcome.reason:
+            found[outcome.raw] = judge(datasets.load(outcome.errors), limits)
+    decisions = [each.plain() for each in found.values()]
     if as_json:
         keys = ("raw", "errors", "reason", "seconds", "stepped_over")
-        runs = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
+        runs: list[dict[str, Any]] = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
+        for outcome, run in zip(outcomes, runs, strict=True):
+            run["conformity"] = found[outcome.raw].plain() if outcome.raw in found else None
         show_json({"ok": not failed, "scheduler": scheduler, "runs": runs})
     else:
         stepped_over = sum(outcome.stepped_over for outcome in outcomes)
@@ -84,30 +111,65 @@ def _show_outcomes(outcomes: list[Outcome], out: Path, scheduler: str, as_json: 
         for outcome in failed:
             name = "" if outcome.reason.startswith(str(outcome.raw)) else f"{outcome.raw}: "
             show(f"  failed: {name}{outcome.reason}")
+        for raw, each in found.items():
+            for line in each.lines()[:1]:
+                show(f"  {raw}: {line}")
+        for line in remarks(decisions):
+            show(line)
     broken = any(outcome.traceback for outcome in failed)
     if broken:
         typer.echo(f"The tracebacks are in {log_file()}.", err=True)
     if failed:
         raise typer.Exit(INTERNAL if broken else ERROR)
+    end_with(decisions)
 
 
-def _identify_one(raw: Path, method_id: str, settings: Any, out: Path, as_json: bool) -> None:
-    method = plugins.get("methods", method_id)
-    with Bars(as_json) as bars, reading(raw), datasets.load(raw) as dataset:
-        bars.stage("identifying")
-        errors = method().identify(dataset, settings)
-    datasets.validate(errors)
+def _identify_one(
+    raw: Path,
+    method_id: str,
+    settings: Any,
+    out: Path,
+    limits: Tolerances | None,
+    as_json: bool,
+    trials: Trials | None,
+    scheduler: str | None,
+    workers: int | None,
+) -> None:
+    method, evaluation, file = plugins.get("methods", method_id), None, out
+    if trials is not None:
+        from errormotion.cli.commands import monte_carlo
+
+        file = monte_carlo.beside(out)
+    with Bars(as_json) as bars:
+        with reading(raw), datasets.load(raw) as dataset:
+            bars.stage("identifying")
+            errors = method().identify(dataset, settings)
+        datasets.validate(errors)
+        if trials is not None:
+            evaluation = monte_carlo.evaluate(
+                raw, method_id, settings, errors, out, bars, trials=trials.number, digits=trials.digits,
+                seed=trials.seed, scheduler=scheduler, workers=workers,
+            )  # fmt: skip
     datasets.save(errors, out)
     results, notes = [as_printed(figure) for figure in figures_of(errors)], notes_of(errors)
+    found = judge(errors, limits) if limits is not None else None
     if as_json:
         answer = {"errors": str(out), "component": errors.attrs["component"], "results": results, "notes": notes}
-        show_json({"ok": True, **answer})
-        return
-    show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
-    if results:
-        show(figure_table(results))
-    for note in notes:
-        show(f"  note: {note}")
+        if evaluation is not None:
+            answer |= {"monte_carlo": str(file), "verdicts": monte_carlo.summary(evaluation)}
+        show_json({"ok": True, **answer, "conformity": found.plain() if found is not None else None})
+    else:
+        show(f"{out}: errors of {errors.attrs['component']} by {method_id} {errors.attrs['method_version']}")
+        for line in lines_of(found) if found is not None else []:
+            show(line)
+        if results:
+            show(figure_table(results))
+        for note in notes:
+            show(f"  note: {note}")
+        if evaluation is not None:
+            monte_carlo.show_evaluation(evaluation, file)
+    if found is not None:
+        end_with([found.plain()])
 
 
 def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
@@ -133,10 +195,7 @@ def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
 def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) -> None:
     """Write the report of a run folder or of one file of errors, and decide on its tolerances."""
     from errormotion.campaign.folder import RunFolder
-    from errormotion.cli.tolerances import end_with, lines_of
     from errormotion.report import write_report, write_run_report
-    from errormotion.tolerances.conformity import judge
-    from errormotion.tolerances.table import from_run, load_tolerances
 
     limits = load_tolerances(tolerances) if tolerances is not None else None
     found = None
@@ -155,7 +214,7 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
     else:
         with reading(run), datasets.load(run) as errors:
             state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-            path = write_report(errors, out or run.with_suffix(".html"), run=state)
+            path = write_report([errors, *_evaluations(errors, run)], out or run.with_suffix(".html"), run=state)
             found = judge(errors, limits) if limits is not None else None
     if as_json:
         show_json({"ok": True, "report": str(path), "conformity": found.plain() if found is not None else None})
@@ -165,6 +224,17 @@ def report(run: Path, out: Path | None, tolerances: Path | None, as_json: bool) 
         show(str(path))
     if found is not None:
         end_with([found.plain()])
+
+
+def _evaluations(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
+    """Return the Monte Carlo evaluation beside a file of errors where it belongs to them."""
+    from errormotion.cli.commands.monte_carlo import EVALUATION
+
+    beside = file.with_suffix(EVALUATION)
+    if not beside.exists():
+        return []
+    evaluation = datasets.load(beside)
+    return [evaluation] if evaluation.attrs.get("errors_hash") == datasets.hash_dataset(errors) else []
 
 
 def validate(file: Path) -> list[str]:
@@ -183,7 +253,6 @@ def validate(file: Path) -> list[str]:
 def _of_toml(file: Path) -> list[str]:
     from errormotion.campaign.files import load_bench, load_campaign
     from errormotion.datasets.files.tomlfile import read_toml
-    from errormotion.tolerances.table import load_tolerances
 
     try:
         schema = str(read_toml(file).get("schema", ""))
@@ -216,6 +285,7 @@ def _mistakes(message: str, file: Path) -> list[str]:
 
 def _of_run(path: Path) -> list[str]:
     from errormotion.campaign.folder import RunFolder
+    from errormotion.datasets.files import events
 
     try:
         folder = RunFolder.open(path)
@@ -224,6 +294,7 @@ def _of_run(path: Path) -> list[str]:
     found = []
     for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
+    found += events.read(path)[1]
     if folder.finished and folder.errors is None:
         found.append(f"run.json: expected 'errors', because the run is finished; found {json.dumps(None)}")
     return found

@@ -2,66 +2,112 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.cli.commands.runs import note_lines, plain_note
 from errormotion.cli.output import show, show_json, table
-from errormotion.cli.summary import as_printed, digits_of
-from errormotion.errors import RunError
-from errormotion.plugins import FigureOfMerit
-from errormotion.record.history import Change, Value, step, trend, values_of
+from errormotion.datasets.files.tomlfile import nearest
+from errormotion.errors import DatasetError, RunError
+from errormotion.record.history import history as followed
 from errormotion.record.listing import list_runs
+from errormotion.record.text import date, field_of, sentences
+from errormotion.report.text import rounded
 
 
-def history(paths: list[Path], machine: str, figure: str, method: str | None, as_json: bool) -> None:
-    """Print a figure of a machine over time, its trend, and a step.
+def history(
+    paths: list[Path],
+    machine: str,
+    figure: str,
+    at: tuple[float, float, float] | None,
+    method: str | None,
+    test: str | None,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+) -> None:
+    """Print a figure of a machine over time, with its trend, steps and control limits, and write what was asked for.
 
     Raises
     ------
     RunError
         No run of the machine states the figure.
+    DatasetError
+        A file exists already, or cannot be written.
     """
-    found = list_runs(paths or [Path("runs")], machine=machine, method=method)
-    values = values_of((entry for _, entry in found.runs), figure)
-    if not values:
-        names = sorted({each.name for _, entry in found.runs for each in entry.figures or ()})[:20]
-        known = ", ".join(names) or "none"
-        raise RunError(f"No value of '{figure}' in {len(found.runs)} runs of '{machine}'. Figures there: {known}")
-    if len({value.unit for value in values}) > 1:
-        raise RunError(f"'{figure}' matches figures of several units; give a name that matches one")
-    slope, jump = trend(values), step(values)
+    for path in (out, report):
+        if path is not None and path.exists():
+            raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
+    runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)
+    if not runs.runs and machine.casefold() not in map(str.casefold, runs.machines):
+        raise RunError(f"--machine {machine}: no run of it; {nearest(machine, runs.machines)}")
+    found = followed(runs, machine, figure, at)
+    if out is not None:
+        datasets.save(found, out)
+    if report is not None:
+        from errormotion.record.page import write
+
+        write(found, report)
     if as_json:
-        changes = {"trend": slope and asdict(slope), "step": jump and asdict(jump)}
-        left_out = {"figures_not_read": found.waiting, "skipped": list(found.skipped)}
-        show_json({"ok": True, "values": [asdict(value) for value in values], **changes, **left_out})
+        left_out = {"figures_not_read": runs.waiting, "skipped": list(runs.skipped)}
+        notes = [plain_note(note) for note in runs.notes]
+        show_json({"ok": True, **as_plain(found), "notes_on_machine": notes, **left_out})
         return
-    rows = [
-        [_date(each.time), each.name, *_printed(each.value, each.expanded_uncertainty, each.unit)] for each in values
-    ]
-    show(table(["started (UTC)", "figure", "value", "U (k=2)", "unit"], rows))
-    show(f"trend: {_text(slope, values[0])} per year" if slope else "trend: unknown; it needs three times or more")
-    show(
-        f"step: {_text(jump, values[0])} about {_date(jump.time)}, p = {jump.p:.2g}"
-        if jump
-        else "step: none significant"
-    )
-    if found.waiting:
-        show(f"{found.waiting} runs without figures: not yet read from the error datasets; repeat the command")
-    for reason in found.skipped:
+    show(_values(found))
+    for line in [*note_lines(runs.notes), *sentences(found)]:
+        show(line)
+    for name in ("notes", "left_out"):
+        for text in filter(None, found.attrs[name]):
+            show(f"left out: {text}" if name == "left_out" else text)
+    if runs.waiting:
+        show(f"{runs.waiting} runs without figures: not yet read from the error datasets; repeat the command")
+    for reason in runs.skipped:
         show(f"could not be read: {reason}")
+    for path in (out, report):
+        if path is not None:
+            show(f"written: {path}")
 
 
-def _date(time: float) -> str:
-    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M}"
+def _values(ds: xr.Dataset) -> str:
+    factor, unit = field_of(ds)
+    rows = []
+    for k, run in enumerate(ds["run"].values):
+        value, U = rounded(
+            factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]), signed=False, digits=2
+        )
+        remarks = [word for name, word in (("outside", "outside"), ("departing", "departs alone")) if ds[name][k]]
+        shown = [value.replace("−", "-"), U, unit, ", ".join(remarks), str(run)]
+        rows.append([date(ds, float(ds["time"][k])), *shown])
+    head = ["started (UTC)", "value", "U (k=2)", "unit", "limits", "run"]
+    return f"{ds.attrs['figure']} of {ds.attrs['machine']}\n" + table(head, rows)
 
 
-def _printed(value: float, U: float, unit: str) -> list[str]:
-    printed: dict[str, Any] = as_printed(FigureOfMerit("", value, U, unit))
-    return [*digits_of(printed), printed["unit"]]
+def as_plain(ds: xr.Dataset) -> dict[str, Any]:
+    """Return a history for a program, SI."""
+    runs = ("time", "value", "expanded_uncertainty", "centre", "lower_limit", "upper_limit", "outside", "departing")
+    steps = ("time", "low", "high", "size", "half_width", "p", "event")
+    scalars = ("trend", "trend_low", "trend_high", "reproducibility", "reproducibility_of_ranges", "chi2", "chi2_p")
+    return {
+        "machine": ds.attrs["machine"],
+        "figure": ds.attrs["figure"],
+        "unit": ds.attrs["unit"],
+        "start": ds.attrs["start"],
+        "values": [
+            {"run": str(run), **{name: float(ds[name].values[k]) for name in runs}}
+            for k, run in enumerate(ds["run"].values)
+        ],
+        **{name: float(ds[name]) for name in (*scalars, "degrees")},
+        "steps": [{name: _plain(ds[f"step_{name}"].values[k]) for name in steps} for k in range(ds.sizes["step"])],
+        "shared_sources": [str(each) for each in ds["source_id"].values],
+        "summary": sentences(ds),
+        "notes": [str(note) for note in ds.attrs["notes"] if note],
+        "left_out": [str(each) for each in ds.attrs["left_out"] if each],
+    }
 
 
-def _text(change: Change, first: Value) -> str:
-    value, U, unit = _printed(change.size, change.expanded_uncertainty, first.unit)
-    return f"{value} {unit}, U = {U} {unit} (95 %)"
+def _plain(value: Any) -> Any:
+    return float(value) if np.issubdtype(np.asarray(value).dtype, np.number) else str(value)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlencode
 
 from errormotion import plugins
 from errormotion.campaign.files import load_bench
-from errormotion.cli.commands.plugins import group_of
 from errormotion.cli.output import show, show_json
+from errormotion.datasets.files.tomlfile import nearest
 from errormotion.errors import InstrumentError, PluginError
 from errormotion.instruments.simulators.virtual_world.described import NAME, describe
 from errormotion.instruments.transports import load_simulator, parse_address
@@ -39,9 +41,8 @@ def run(
     address = parse_address(_address(plugin_id, bench, machine, params | _pairs(settings)))
     device = load_simulator(simulator, address.url)(address)
     try:
-        lines = {"": device.url} | dict(getattr(device, "urls", {}))
-        _require_reachable(lines[""])
-        _print(plugin_id, address.url, lines, as_json)
+        _require_reachable(device.url)
+        _print(plugin_id, address.url, device, as_json)
         _wait()
     except KeyboardInterrupt:  # the way to end it
         pass
@@ -54,13 +55,16 @@ def _wait() -> None:
 
 
 def _simulator_of(plugin_id: str) -> str:
-    group = group_of(plugin_id)
-    if group != "instruments":
-        raise PluginError(f"'{plugin_id}' is a plugin of the group {group}; expected an instrument")
-    simulator = plugins.get(group, plugin_id).info.simulator
-    if simulator is None:
-        raise PluginError(f"The instrument '{plugin_id}' has no simulator of its own")
-    return str(simulator)
+    instruments = {each.id: each for each in plugins.available("instruments")}
+    simulated = {name: each.cls.info.simulator for name, each in instruments.items() if each.cls is not None}
+    if simulator := simulated.get(plugin_id):
+        return str(simulator)
+    choices = nearest(plugin_id, [name for name, simulator in simulated.items() if simulator])
+    if plugin_id in instruments and instruments[plugin_id].cls is None:
+        plugins.get("instruments", plugin_id)  # states why it does not load
+    if plugin_id in instruments:
+        raise PluginError(f"The instrument '{plugin_id}' has no simulator of its own. {choices}")
+    raise PluginError(f"Expected an instrument that can be simulated; found '{plugin_id}'. {choices}")
 
 
 def _pairs(settings: list[str]) -> dict[str, str]:
@@ -95,12 +99,28 @@ def _require_reachable(url: str) -> None:
         )
 
 
-def _print(plugin_id: str, address: str, lines: dict[str, str], as_json: bool) -> None:
+def _print(plugin_id: str, simulator: str, device: Any, as_json: bool) -> None:
+    lines = dict(getattr(device, "urls", {}))
+    address = _driver_address(device, lines)
     if as_json:
-        further = {name: url for name, url in lines.items() if name}
-        show_json({"ok": True, "plugin": plugin_id, "simulator": address, "url": lines[""], "lines": further})
+        where = {"address": address, "url": device.url, "lines": lines}
+        show_json({"ok": True, "plugin": plugin_id, "simulator": simulator, **where})
         sys.stdout.flush()
         return
+    show(f"{plugin_id}: {address or device.url}")
     for name, url in lines.items():
-        show(f"{name or plugin_id}: {url}")
+        show(f"{name}: {url}")
     show("Ctrl-C ends it.")
+
+
+def _driver_address(device: Any, lines: Mapping[str, str]) -> str:
+    """Return the address of the device in a bench file; empty where its lines have no common one."""
+    stated = getattr(device, "driver_url", None)
+    if stated is not None:
+        return str(stated)
+    if not lines:
+        return str(device.url)
+    found = [parse_address(url) for url in (device.url, *lines.values())]
+    if any(each.scheme != "tcp" for each in found):
+        return ""
+    return f"{device.url}?{urlencode({name: each.port for name, each in zip(lines, found[1:], strict=True)})}"

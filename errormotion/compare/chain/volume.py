@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
-from errormotion.compare.consensus import information
+from errormotion.compare.normal import Information
 from errormotion.compare.stack import Estimate
 from errormotion.datasets.reduction import influence_of
 from errormotion.errors import DatasetError
@@ -158,7 +158,7 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         J = model.jacobian(q[part], tool)
         A = np.stack([J[:, :, e] * (P[e // 6][:, [o]] if o >= 0 else 1.0) for e, o in terms], axis=2)
         A = np.concatenate([A, _whole(model, q[part], tool, turns), np.moveaxis(F[:, part], 0, 2)], axis=2)
-        W, _ = information(Estimate(name, y[part], own[part], F[:, part], ()))
+        W = Information.of(Estimate(name, y[part], own[part], F[:, part], ()), {}).W
         A, data = np.where(known[part][:, :, None], A, 0.0), np.where(known[part], y[part], 0.0)
         WA = np.einsum("tij,tjp->tip", W, A)
         N += np.einsum("tip,tiq->pq", A, WA, optimize=True)

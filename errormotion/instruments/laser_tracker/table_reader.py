@@ -52,7 +52,10 @@ AIR = ("temperature", "pressure", "humidity")
 
 LONGEST_TABLE = 1 << 24
 """Longest table, bytes."""
+MOST_LINES = 100_000
+"""Of a table: its rows take more memory than their bytes."""
 
+_ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # of a line of text
 _MOST_HINTS = 10  # columns for which a name is suggested
 _TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
@@ -109,8 +112,7 @@ def read_table(
         The file cannot be read; or all mistakes in it, with line, column, expected and found value.
     """
     with suppress(OSError):  # stated by what follows
-        if (size := path.stat().st_size) > LONGEST_TABLE:
-            raise DatasetError(f"{path}: expected a table of at most {LONGEST_TABLE} bytes; found {size}")
+        _refuse_long(path)
     _, tables = blocks(path)
     if len(tables) > 1:
         line = tables[1].head[0]
@@ -132,6 +134,15 @@ def read_table(
     mistakes.raise_any()
     _check_length(path, found.length, table.head[1][columns["length"][0]], least_length)
     return found
+
+
+def _refuse_long(path: Path) -> None:
+    if (size := path.stat().st_size) > LONGEST_TABLE:
+        raise DatasetError(f"{path}: expected a table of at most {LONGEST_TABLE} bytes; found {size}")
+    data = path.read_bytes()
+    lines = len(data) - len(data.translate(None, _ENDS)) - data.count(b"\r\n") + sum(map(data.count, _LONG_ENDS))
+    if lines > MOST_LINES:
+        raise DatasetError(f"{path}: expected a table of at most {MOST_LINES} lines; found {lines}")
 
 
 def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:

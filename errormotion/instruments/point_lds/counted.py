@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from errormotion.errors import ProtocolError
+from errormotion.instruments.point_lds.blocks import Block
 
 Array = np.ndarray[Any, Any]
 
 MODULUS = 1 << 32
 """Of the counter."""
+GARBLED, LOST = "garbled", "lost"
+"""Reasons of readings that were damaged, and that were not received."""
 
 
 class CountedReadings:
     """Collects readings in the order of their counter; gaps are lost readings.
 
+    A gap takes no memory until its readings are taken.
+
     Parameters
     ----------
-    lost, garbled : int
-        Codes of readings that were not received, and that were damaged.
+    reasons : tuple of str
+        Why a reading is NaN, by code; `GARBLED` and `LOST` are among them, code 0 is that of a valid reading.
+    scale : callable
+        Takes values as they came; returns readings, m, and the code of each.
+    column : callable
+        Takes a block; returns its values that are read.
     longest_gap : int
         Readings: a larger jump of the counter is none that was lost, but another sequence.
 
@@ -32,57 +41,67 @@ class CountedReadings:
         Readings that can be taken.
     """
 
-    def __init__(self, *, lost: int, garbled: int, longest_gap: int) -> None:
-        self._lost, self._garbled, self._longest_gap = lost, garbled, longest_gap
+    def __init__(
+        self,
+        reasons: tuple[str, ...],
+        scale: Callable[[Array], tuple[Array, Array]],
+        column: Callable[[Block], Array],
+        *,
+        longest_gap: int,
+    ) -> None:
+        self._reasons, self._scale, self._column, self._longest_gap = reasons, scale, column, longest_gap
+        self._garbled, self._lost = reasons.index(GARBLED), reasons.index(LOST)
         self._expected: int | None = None
-        self._parts: deque[tuple[Array, Array]] = deque()
+        self._parts: deque[tuple[Array | None, int, int]] = deque()  # values, number of readings, code without values
         self.waiting = 0
 
-    def add(self, counter: int, count: int, readings: Callable[[], tuple[Array, Array]] | None) -> None:
-        """Add readings that were received together.
-
-        Parameters
-        ----------
-        counter : int
-            Number of the first one.
-        count : int
-            How many they are.
-        readings : callable or None
-            Returns them, m, and the code of each; None where they were damaged.
+    def add(self, block: Block) -> None:
+        """Add the readings of a block.
 
         Raises
         ------
         ProtocolError
             The counter jumps back, or too far.
         """
-        gap = 0 if self._expected is None else (counter - self._expected) % MODULUS
+        gap = 0 if self._expected is None else (block.counter - self._expected) % MODULUS
         if gap > self._longest_gap:
             raise ProtocolError(
-                f"The counter of measured values jumps from {self._expected} to {counter}; "
+                f"The counter of measured values jumps from {self._expected} to {block.counter}; "
                 "was the controller set up by another program?"
             )
-        self._expected = (counter + count) % MODULUS
+        self._expected = (block.counter + block.count) % MODULUS
         if gap:
-            self._append(np.full(gap, np.nan), np.full(gap, self._lost, dtype=np.int8))
-        if readings is None:
-            self._append(np.full(count, np.nan), np.full(count, self._garbled, dtype=np.int8))
+            self._append(None, gap, self._lost)
+        if block.intact:
+            self._append(self._column(block), block.count, 0)
         else:
-            self._append(*readings())
+            self._append(None, block.count, self._garbled)
 
     def take(self, size: int) -> tuple[Array, Array]:
         """Return the next ``size`` readings, m, and the code of each."""
-        values, codes = np.empty(size), np.empty(size, dtype=np.int8)
+        raws, codes = np.zeros(size, dtype=np.int64), np.zeros(size, dtype=np.int8)
         filled = 0
         while filled < size:
-            head, code = self._parts.popleft()
-            used = min(len(head), size - filled)
-            values[filled : filled + used], codes[filled : filled + used] = head[:used], code[:used]
-            if used < len(head):
-                self._parts.appendleft((head[used:], code[used:]))
+            values, count, code = self._parts.popleft()
+            used = min(count, size - filled)
+            place = slice(filled, filled + used)
+            if values is None:
+                codes[place] = code
+            else:
+                raws[place] = values[:used]
+            if used < count:
+                self._parts.appendleft((None if values is None else values[used:], count - used, code))
             filled += used
         self.waiting -= size
-        return values, codes
+        readings, own = self._scale(raws)
+        missing = codes > 0
+        return np.where(missing, np.nan, readings), np.where(missing, codes, own)
 
-    def _append(self, values: Array, codes: Array) -> None:
-        self._parts.append((values, codes))
-        self.waiting += len(values)
+    def counts(self, codes: Array) -> dict[str, int]:
+        """Return why readings are NaN: reason to count."""
+        found = Counter(codes.tolist())
+        return {self._reasons[code]: found[code] for code in sorted(found) if code}
+
+    def _append(self, values: Array | None, count: int, code: int) -> None:
+        self._parts.append((values, count, code))
+        self.waiting += count

@@ -11,6 +11,7 @@ read), ``warm`` (1; 0 = the sensors were switched on just now), ``wire`` (``tcp`
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -24,6 +25,15 @@ def world(machine: str = "cframe", seed: int = 0, *, warm: bool = True) -> Virtu
     return find(machine, seed, warm=warm)
 
 
+def in_steps(machine: str = "cframe", seed: int = 0, *, step: float = 1e-4) -> Callable[[int], None]:
+    """Return what moves the X axis to its n-th step of so many m, so that readings differ from one another."""
+
+    def move(number: int) -> None:
+        world(machine, seed).move_to((step * (number + 1), 0.0, 0.0))
+
+    return move
+
+
 def reset() -> None:
     """End all worlds of this process and their threads."""
     from errormotion.instruments.simulators.virtual_world.world import reset as end_all
@@ -31,4 +41,4 @@ def reset() -> None:
     end_all()
 
 
-__all__ = ["reset", "world"]
+__all__ = ["in_steps", "reset", "world"]

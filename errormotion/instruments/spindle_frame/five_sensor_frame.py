@@ -36,7 +36,8 @@ class FiveSensorFrame:
     ----------
     address : str
         Of the frame as a whole, where the settings do not give one for each sensor: ``sim://cframe?seed=3`` stands for
-        ``sim://cframe/X1?seed=3`` and so on; ``replay://session.rec`` is a recording of all five.
+        ``sim://cframe/X1?seed=3`` and so on; ``tcp://host:4001?X2=4002&Y1=4003&Y2=4004&Z=4005`` for the ports of one
+        serial server, X1 at the first one; ``replay://session.rec`` is a recording of all five.
     settings : FrameSettings, optional
     record : Path, optional
         ``session.rec`` names the recordings of the sensors, which lie beside it: ``session.X1.rec`` and so on.
@@ -47,15 +48,15 @@ class FiveSensorFrame:
         kind="spindle_frame",
         summary="Five point sensors X1 X2 Y1 Y2 Z around a bar in the spindle, on one clock",
         status="simulated_only",
-        simulator=OptoNCDT.info.simulator,
+        simulator="errormotion.instruments.simulators.spindle_frame.five_sensors:SimulatedFrame",
     )
     Settings: ClassVar[type[FrameSettings]] = FrameSettings
     channels = CHANNELS
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; the simulated clock stands still while no reading is given."""
-        return InstrumentSubject(cls, "sim://cframe?seed=3", repeats=True)
+        """Return what the conformance kit examines."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3")
 
     def __init__(self, address: str = "", settings: FrameSettings | None = None, *, record: Path | None = None) -> None:
         self.address = address
@@ -93,9 +94,13 @@ class FiveSensorFrame:
         frame = parse_address(self.address)
         if frame.scheme == "sim":
             return {name: frame.with_path(name) for name in CHANNELS}
+        first, *others = CHANNELS
+        if frame.scheme == "tcp" and frame.params.keys() == set(others):
+            at_first = f"tcp://{frame.host}:{frame.port}"
+            return {first: at_first} | {name: frame.line(name, 0).url for name in others}
         raise InstrumentError(
             f"'{self.address}' is the address of one device; expected 'addresses' in the settings, one URL for each of "
-            + ", ".join(CHANNELS)
+            f"{', '.join(CHANNELS)}, or 'tcp://HOST:PORT?{'&'.join(f'{name}=PORT' for name in others)}'"
         )
 
     # ------------------------------------------------------------------ opening and closing

@@ -1,6 +1,6 @@
 """Thermocouple modules with the DCON protocol (ADAM-4018, ICP DAS I-7018): ASCII on RS-485 or behind a serial server.
 
-All of the protocol is from memory (m) and kept in this one file.
+Sources and assumptions: ``docs/reference/devices/dcon_temperature.md``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ MAX_LINE_BYTES = 512
 MAX_LATE_LINES = 16
 OPEN_SENSOR = 9999.0  # degC: this absolute value and more means an open or overrun input
 UNDER_RANGE = "-0000"  # the code of an ADAM for the same
-_VALUE = re.compile(r"[+-]\d+(?:\.\d+)?")
+_VALUE = re.compile(r"[+-]\d+(?:\.\d+)?| {7}")  # blanks: a disabled channel
+_CONFIGURATION = re.compile(r"([0-9A-F]{2})[0-9A-F]{2}([0-9A-F]{2})")  # type, baud rate, data format
+_FORMATS = {1: "per cent of the range", 2: "hexadecimal", 3: "ohms"}  # bits 1 and 0; 0: engineering units
+_LAST_ELECTRICAL_TYPE = 0x0D  # types up to this one are ranges of voltage and current
 
 
 # ---------------------------------------------------------------------- codec
@@ -58,8 +61,10 @@ def decode(line: bytes, *, with_checksum: bool = False) -> str:
     return body
 
 
-def parse_temperatures(text: str) -> list[float]:
-    """Return the temperatures (degC) of an answer such as ``>+025.12+026.00``; NaN for an open sensor.
+def parse_temperatures(text: str) -> list[float | None]:
+    """Return the temperatures (degC) of an answer such as ``>+025.12+026.00``.
+
+    An open sensor is NaN, a disabled channel None.
 
     Raises
     ------
@@ -69,14 +74,43 @@ def parse_temperatures(text: str) -> list[float]:
     values = _VALUE.findall(text)
     if not text.startswith(">") or not values or ">" + "".join(values) != text:
         raise ProtocolError(f"Expected temperatures such as '>+025.12+026.00'; found '{text}'")
-    return [
-        float("nan") if value == UNDER_RANGE or abs(float(value)) >= OPEN_SENSOR else float(value) for value in values
-    ]
+    return [_temperature(value) for value in values]
 
 
-def format_temperatures(temperatures: list[float]) -> str:
-    """Return the answer with these temperatures (degC), NaN as an open sensor."""
-    return ">" + "".join("+9999.9" if t != t else f"{t:+07.2f}" for t in temperatures)
+def _temperature(value: str) -> float | None:
+    if value.isspace():
+        return None
+    return float("nan") if value == UNDER_RANGE or abs(float(value)) >= OPEN_SENSOR else float(value)
+
+
+def check_configuration(text: str) -> None:
+    """Check that a module measures temperatures and states them in degC.
+
+    Parameters
+    ----------
+    text : str
+        Answer to ``$AA2`` after the address: type, baud rate and data format, two digits each.
+
+    Raises
+    ------
+    InstrumentError
+        A range of voltage or current, or another format than engineering units.
+    ProtocolError
+        No configuration.
+    """
+    found = _CONFIGURATION.fullmatch(text)
+    if found is None:
+        raise ProtocolError(f"Expected a configuration such as '100600'; found '{text}'")
+    type_code, data_format = int(found[1], 16), int(found[2], 16)
+    if type_code <= _LAST_ELECTRICAL_TYPE:
+        raise InstrumentError(
+            f"The module is set to input range {found[1]}, a voltage or current; set it to the type of the sensors"
+        )
+    if form := _FORMATS.get(data_format & 3):
+        raise InstrumentError(
+            f"The module writes {form} (data format {found[2]}); expected engineering units: set bits 1 and 0 of the "
+            "data format to 00"
+        )
 
 
 # ---------------------------------------------------------------------- driver
@@ -131,13 +165,18 @@ class DconTemperature(Thermometer):
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:
-        values = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
-        if len(values) < len(self.channels):
+        found = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
+        if len(found) < len(self.channels):
             raise ProtocolError(
-                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(values)}"
+                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(found)}"
+            )
+        readings = dict(zip(self.channels, found, strict=False))
+        if disabled := [name for name, value in readings.items() if value is None]:
+            raise ProtocolError(
+                f"The channels of {', '.join(disabled)} are disabled in the module; enable them, or name fewer channels"
             )
         return {
-            name: (value, OPEN if value != value else GOOD) for name, value in zip(self.channels, values, strict=False)
+            name: (value, OPEN if value != value else GOOD) for name, value in readings.items() if value is not None
         }
 
     @property
@@ -184,3 +223,4 @@ class DconTemperature(Thermometer):
 
     def _start_session(self) -> None:
         self.identify()
+        check_configuration(self._query(f"${self._unit}2", "!" + self._unit))

@@ -7,7 +7,7 @@ from typing import ClassVar
 from errormotion.instruments.thermometer.registers import SIZES, ModbusSettings
 from errormotion.instruments.thermometer.sensors import Thermometer
 from errormotion.instruments.transports.modbus.client import ModbusLine, open_modbus
-from errormotion.plugins import Identity, InstrumentInfo
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 
 
 class ModbusTemperature(Thermometer):
@@ -32,6 +32,11 @@ class ModbusTemperature(Thermometer):
     )
     Settings: ClassVar[type[ModbusSettings]] = ModbusSettings
     settings: ModbusSettings
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines: readings that differ from one another."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3&noise=1")
 
     @property
     def line(self) -> ModbusLine:

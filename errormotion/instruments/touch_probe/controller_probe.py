@@ -16,6 +16,7 @@ from errormotion import plugins
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.units import Length, Time, Velocity
 from errormotion.errors import InstrumentError, PluginError
+from errormotion.instruments.door import ArmedSettings
 from errormotion.instruments.touch_probe.settings import ProbeSettings, corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import (
     NO_TRIP,
@@ -26,13 +27,13 @@ from errormotion.instruments.touch_probe.touching import (
     StuckError,
     Toucher,
 )
-from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
+from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, MachineLimits, Touch
 
 _SAME = 1e-9  # m
 _ROUNDING = 1e-6  # m
 
 
-class ControllerProbeSettings(ProbeSettings):
+class ControllerProbeSettings(ArmedSettings, ProbeSettings):
     """Settings of a probe at a controller."""
 
     controller: str = Field(default="virtual_controller", description="plugin of the controller at the address")
@@ -109,6 +110,7 @@ class ControllerProbe:
         self._control: Any = None
         self._map: PretravelMap | None = None
         self._contacts = 0
+        self._limits: MachineLimits | None = None
 
     # ------------------------------------------------------------------ opening and closing
 
@@ -127,7 +129,8 @@ class ControllerProbe:
         self._map = self.settings.pretravel_map()
         try:
             cls = plugins.get("instruments", self.settings.controller)
-            settings = cls.Settings(**self.settings.controller_settings)
+            armed = {"arm": self.settings.arm} if "arm" in cls.Settings.model_fields else {}
+            settings = cls.Settings(**{**armed, **self.settings.controller_settings})
         except (PluginError, ValueError) as error:
             raise InstrumentError(f"The controller '{self.settings.controller}' of the probe: {error}") from error
         if not hasattr(cls, "probe"):
@@ -135,6 +138,8 @@ class ControllerProbe:
                 f"The controller '{self.settings.controller}' cannot probe; choose one with probing moves"
             )
         control = cls(self.address, settings, record=self._record)
+        if self._limits is not None and hasattr(control, "bound"):
+            control.bound(self._limits)
         control.open()
         self._control = control
 
@@ -191,6 +196,12 @@ class ControllerProbe:
             model=f"{whose.model} touch probe",
             details={**whose.details, "controller": self.settings.controller, "tip_radius": self.tip_radius},
         )
+
+    def bound(self, limits: MachineLimits) -> None:
+        """Hold limits for every move from now on; the controller holds them for each single order."""
+        self._limits = limits
+        if self._control is not None and hasattr(self._control, "bound"):
+            self._control.bound(limits)
 
     def configure(self, settings: ControllerProbeSettings) -> None:
         """Use other settings from now on; those of the connection hold for the next one."""

@@ -6,6 +6,7 @@ Only this package uses ``serial`` and ``socket``.
 
 * ``serial:///dev/ttyUSB0?baudrate=921600`` a serial line, 8N1
 * ``tcp://host:port`` a TCP connection; `transports.lines` opens several to one device
+* ``unix:///run/device.sock`` a Unix socket of this computer; ``unix://~/device.sock``
 * ``sim://machine/device?seed=3`` a simulated device, behind a real TCP connection or pty of its own
 * ``replay://session.rec`` a recorded session, played back strictly
 
@@ -65,6 +66,10 @@ def open_transport(
             from errormotion.instruments.transports.tcp import TcpTransport
 
             transport = TcpTransport(address, timeout=timeout)
+        case "unix":
+            from errormotion.instruments.transports.tcp import UnixTransport
+
+            transport = UnixTransport(address, timeout=timeout)
         case "serial":
             from errormotion.instruments.transports.serial_line import SerialTransport
 

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from errormotion.errors import InstrumentError
 
-BYTES = ("serial", "tcp", "sim", "replay")
+BYTES = ("serial", "tcp", "unix", "sim", "replay")
 """Schemes of a plain stream of bytes; the others are buses with frames of their own."""
 MODBUS = ("modbus+tcp", "modbus+rtu", "modbus+rtu-tcp")
 CAN = "can"
@@ -44,7 +44,7 @@ class Address:
     port : int or None
         TCP port.
     path : str
-        Device file of a serial line, file of ``replay``, device of ``sim``, channel of ``can``.
+        Device file of a serial line, file of ``unix`` and ``replay``, device of ``sim``, channel of ``can``.
     params : mapping of str to str
         Parameters after the question mark.
     """
@@ -106,6 +106,10 @@ def parse_address(url: str) -> Address:
     if scheme == "replay":  # the rest is a file name; it may contain any characters
         if not rest:
             raise InstrumentError(f"Expected the file of a recording, as in replay://FILE; found '{url}'")
+        return Address(url, scheme, path=rest)
+    if scheme == "unix":  # likewise
+        if not rest.startswith(("/", "~/")):
+            raise InstrumentError(f"Expected unix:///FOLDER/FILE or unix://~/FILE; found '{url}'")
         return Address(url, scheme, path=rest)
     try:
         parts = urlsplit(url)

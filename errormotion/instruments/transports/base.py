@@ -8,7 +8,9 @@ from abc import ABC, abstractmethod
 from errormotion.errors import InstrumentTimeoutError, ProtocolError
 
 CHUNK = 65536
-"""Largest number of bytes read at once."""
+"""Largest number of bytes read at once, as by the reader of a stream."""
+PIECE = 16384
+"""Largest number of bytes read at once unless a number is stated: a decoder is done with so many within 10 ms."""
 
 
 class Transport(ABC):
@@ -42,7 +44,7 @@ class Transport(ABC):
         """Send bytes; InstrumentError when the connection is lost."""
         self._send(data)
 
-    def read(self, max_bytes: int = CHUNK, timeout: float | None = None) -> bytes:
+    def read(self, max_bytes: int = PIECE, timeout: float | None = None) -> bytes:
         """Return between 1 and ``max_bytes`` bytes, as soon as any are available.
 
         Raises

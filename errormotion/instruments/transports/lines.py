@@ -48,6 +48,11 @@ class ManyLines(Transport):
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         return self._first.read(max_bytes, timeout)
 
+    def reopen(self) -> bool:
+        """Open another connection in place of the first line; the others stay as they are."""
+        self._rest = b""
+        return self._first.reopen()
+
     def close(self) -> None:
         """Close all lines; idempotent. The first of several errors is raised when all are closed."""
         errors: list[InstrumentError] = []

@@ -1,8 +1,9 @@
-"""A TCP connection."""
+"""A TCP connection, or one to a Unix socket."""
 
 from __future__ import annotations
 
 import socket
+from pathlib import Path
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports.address import Address
@@ -14,6 +15,8 @@ class TcpTransport(Transport):
 
     ``receive_buffer`` (bytes) limits the data that the system holds for a slow reader; default: the system's limit.
     """
+
+    _family = socket.AF_INET
 
     def __init__(self, address: Address, *, timeout: float = 1.0, receive_buffer: int | None = None) -> None:
         super().__init__(address.url, timeout)
@@ -27,14 +30,17 @@ class TcpTransport(Transport):
         self._socket = self._connected()
         return True
 
+    def _connect(self, line: socket.socket) -> None:
+        line.connect((self._host, self._port))
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
     def _connected(self) -> socket.socket:
-        line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        line = socket.socket(self._family, socket.SOCK_STREAM)
         try:
             if self._receive_buffer is not None:
                 line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._receive_buffer)
             line.settimeout(self.timeout)
-            line.connect((self._host, self._port))
-            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._connect(line)
         except TimeoutError:
             line.close()
             raise InstrumentTimeoutError(f"No device answered at {self.url} within {self.timeout:g} s") from None
@@ -78,3 +84,16 @@ class TcpTransport(Transport):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+class UnixTransport(TcpTransport):
+    """A connection to a Unix socket of this computer; the path may start with ``~``."""
+
+    _family = socket.AF_UNIX
+
+    def __init__(self, address: Address, *, timeout: float = 1.0) -> None:
+        self._path = str(Path(address.path).expanduser())
+        super().__init__(address, timeout=timeout)
+
+    def _connect(self, line: socket.socket) -> None:
+        line.connect(self._path)

@@ -37,6 +37,7 @@ class BeamDirection:
     calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
     simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")
     conformance = lazy("errormotion.methods.beam_direction.conformance:subjects")
+    redrawing = lazy("errormotion.methods.beam_direction.redrawing:redrawing")
 
     def acquire(
         self,

@@ -41,6 +41,7 @@ class CrossbeamScan:
     simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
     truth = lazy("errormotion.methods.crossbeam_scan.simulation:truth_of")
     conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
+    redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
         self,

@@ -41,6 +41,7 @@ class Multilateration:
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
     truth = lazy("errormotion.methods.multilateration.simulation:truth_of")
     conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
+    redrawing = lazy("errormotion.methods.multilateration.redrawing:redrawing")
 
     def acquire(
         self,

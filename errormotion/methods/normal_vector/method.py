@@ -43,6 +43,7 @@ class NormalVector:
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
     truth = lazy("errormotion.methods.normal_vector.simulation:truth_of")
     conformance = lazy("errormotion.methods.normal_vector.conformance:subjects")
+    redrawing = lazy("errormotion.methods.normal_vector.redrawing:redrawing")
 
     def acquire(
         self,

@@ -40,6 +40,7 @@ class SpindleDrift:
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
     truth = lazy("errormotion.methods.spindle_drift.simulation:truth_of")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
+    redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
         self,

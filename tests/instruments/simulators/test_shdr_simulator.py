@@ -2,8 +2,9 @@
 
 import re
 import socket
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from urllib.parse import urlsplit
 
 import pytest
@@ -13,6 +14,7 @@ from errormotion.instruments.simulators.controller.mtconnect.devices import Devi
 from errormotion.instruments.simulators.controller.mtconnect.machine import Condition, Series
 from errormotion.instruments.simulators.controller.mtconnect.styles import STYLES
 from errormotion.instruments.simulators.controller.shdr import SimulatedAdapter, escaped, field_text
+from errormotion.instruments.simulators.faults import parse_fault
 from errormotion.instruments.transports import parse_address
 
 TIMEOUT = 5.0
@@ -223,6 +225,31 @@ def test_faults_of_lines() -> None:
         lines = list(iter(line.next, ""))
         line.close()
         assert len(lines) == 3
+
+
+def test_a_late_line_comes_before_the_next_one_or_when_its_time_is_over() -> None:
+    with connected() as sound:
+        expected = [sound.next() for _ in range(4)]
+    for late in ("", "&late_by=0.2"):
+        with connected(f"fault=late&fault_at=2{late}") as line:
+            assert [line.next() for _ in range(4)] == expected
+    for late, comes in (("&late_by=0.3", True), ("", False)):
+        with adapter("heartbeat=5000") as device:
+            line = Line(device)
+            while device._server.connection is None or line.next() == "":
+                pass
+            time.sleep(0.2)  # what it says by itself is over
+            device.fault = parse_fault(
+                parse_address(f"sim://cframe?fault=late&fault_at={device._lines}{late}"), device.faults
+            )
+            line.socket.settimeout(1.0)
+            line.socket.sendall(b"* PING\n")
+            said = b""
+            with suppress(TimeoutError):
+                while b"PONG" not in said:
+                    said += line.socket.recv(65536)
+            assert (b"* PONG 5000" in said) == comes
+            line.close()
 
 
 def test_a_machine_that_is_off_is_unavailable() -> None:

@@ -41,8 +41,9 @@ class Nominal:
     def spindle(self, speed, time):
         self.speeds.append((time, speed))
 
-    def print(self, line, time):
-        self.lines.append(line)
+    def print(self, order, time):
+        if not isinstance(order, str):  # POPEN, PCLOS
+            self.lines.append(order.text())
 
     def clock(self, time):
         return time

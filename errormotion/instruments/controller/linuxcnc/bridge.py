@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""Connects LinuxCNC with other programs: JSON lines on a port of this computer.
+"""Connects LinuxCNC with other programs: JSON lines on a Unix socket, or on a port of this computer.
 
 LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC. This file therefore runs there, as the
 ``DISPLAY`` of an INI file or as an ``APP`` beside another display, and needs only that Python. A request is
@@ -8,8 +8,11 @@ LinuxCNC's Python module works only in the Python of the system, beside LinuxCNC
 times a second. Lengths are in m, speeds in m/s, those of spindles in 1/min, times in s since the bridge started;
 what is unknown is null. Positions are those of the machine (G53), without any offset of work or tool.
 
-Several clients can be connected. One order at a time moves the machine. An order or program ends with the connection of
-its client: if that is lost, the bridge aborts the motion. No request can end the bridge.
+The first request of a connection is ``{"id": 0, "op": "hello", "token": "...", "control": true, "client": "NAME"}``
+with the token in a file that only the user can read. A connection whose first line is anything else, or that sends a
+line that is not a request, is closed. One client (one NAME) at a time controls the machine; the others read, and may
+stop it. One order at a time moves the machine. An order or program ends with the connection of its client: if that is
+lost, the bridge aborts the motion. No request can end the bridge.
 """
 
 from __future__ import annotations
@@ -17,29 +20,50 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import hmac
 import json
 import math
 import os
+import secrets
 import signal
+import socket
+import stat
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-PORT = 5007
+PROTOCOL = 2
+FOLDER = "~/.errormotion"
+SOCKET, TOKEN = f"{FOLDER}/linuxcnc.sock", f"{FOLDER}/linuxcnc.token"
 POLL_INTERVAL = 0.01  # s between two checks of an order
 BEAT_INTERVAL = 0.2  # s
 ACCEPT_TIMEOUT = 5.0  # s for LinuxCNC to accept an order
 START_TIMEOUT = 30.0  # s for LinuxCNC to start
 REST_TIMEOUT = 0.5  # s for a machine without orders to come to rest
 CHANGE_TIMEOUT = 1.0  # s for a change of state or mode
+ATTEMPTS = 3  # to send a command that LinuxCNC may have lost or ignored
 TEXT_TIMEOUT = 0.3  # s for the text of an error to arrive
+HELLO_TIMEOUT = 5.0  # s from a connection to its first request
 POSITION_TOLERANCE = 1e-6  # m between goal and final position
-MAX_REQUEST_BYTES = 1 << 24  # of one line
-MAX_UNREAD_BYTES = 1 << 20  # of answers to one client
+MAX_CLIENTS = 64
+MAX_STRANGERS = 16  # connections without a valid first request
+MAX_REQUEST_BYTES = 1 << 16  # of one line
+MAX_PROGRAM_BYTES = 1 << 24  # of all parts
+MAX_UNREAD_BYTES = 1 << 18  # of answers to one client
+MAX_WAITING = 16  # requests of one client that wait for their turn
+LINES_AT_ONCE = 4  # of one client that are taken before the others' turn
+CLOSE_TIMEOUT = 1.0  # s for the last answer to leave
+MAX_TASKS = 16  # requests of one client that are being answered
+MAX_NAME = 64  # characters of an id or a name
+MAX_TEXT = 500  # characters of an error text
+MIN_TOKEN = 32  # characters
+MAX_FEED = 10.0  # m/s, where LinuxCNC states no limit
+MAX_SPINDLE = 1e6  # 1/min, where LinuxCNC states no limit
 AXES = "XYZ"
 MODAL_CODES = {200: "G20", 910: "G91", 930: "G93", 950: "G95"}  # modes that an order restores
 ORDER_MODES = "G21 G90 G94"  # mm, absolute, mm/min
@@ -49,21 +73,239 @@ class RefusedError(Exception):
     """LinuxCNC or the bridge refuses an order."""
 
 
-class Client:
-    """One connection."""
+def parse_request(line: bytes) -> tuple[Any, str, dict[str, Any]]:
+    """Return id, operation and arguments of a line; ValueError where it is not a request."""
+    if len(line) > MAX_REQUEST_BYTES:
+        raise ValueError("the line is too long")
+    try:
+        request = json.loads(line.decode("utf-8"), parse_constant=_no_number)
+        number, op = request.pop("id"), request.pop("op")
+    except (KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise ValueError(repr(error)) from None
+    if isinstance(number, bool) or not isinstance(number, (int, str)) or not isinstance(op, str):
+        raise ValueError("expected a number or a name as id, and a name as op")
+    if len(str(number)) > MAX_NAME or len(op) > MAX_NAME:
+        raise ValueError(f"expected id and op of at most {MAX_NAME} characters")
+    return number, op, request
 
-    def __init__(self, writer: asyncio.StreamWriter) -> None:
-        self.writer = writer
-        self.gone = False
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number")
+
+
+class Client(asyncio.Protocol):
+    """One connection.
+
+    Lines are taken apart as they arrive. A stop is carried out at once; all other requests wait for their turn, and a
+    client with too many waiting requests is not read from.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self.bridge = bridge
+        self.transport: Any = None
+        self.greeted = self.control = self.gone = False
+        self.name = ""
+        self.program: list[str] = []  # parts of a program that are here already
         self.tasks: set[asyncio.Task[None]] = set()
+        self._buffer = bytearray()
+        self._reading = False  # whether further lines are taken in a moment
+        self._waiting: deque[tuple[Any, str, dict[str, Any]]] = deque()
+        self._serving: asyncio.Task[None] | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first request, for a limited time."""
+        self.transport = transport
+        self._deadline = asyncio.get_running_loop().call_later(HELLO_TIMEOUT, self.end)
+        self.bridge.arrived(self)
+
+    def connection_lost(self, exc: Any) -> None:  # noqa: ARG002
+        """End what the client has started."""
+        self._forget()
+
+    def data_received(self, data: bytes) -> None:
+        """Take the lines apart; close at the first thing that is not a request."""
+        self._buffer += data
+        if len(self._buffer) > MAX_REQUEST_BYTES:
+            self.transport.pause_reading()
+        if not self._reading:
+            self._read()
+
+    def _read(self) -> None:
+        """Take some lines; the rest follows after what others have sent."""
+        self._reading = False
+        for _ in range(LINES_AT_ONCE):
+            if self.gone or not self._buffer or len(self._waiting) >= MAX_WAITING:
+                break
+            if self._buffer[:1] != b"{":  # HTTP, TLS, a terminal
+                self.end()
+                return
+            length = self._buffer.find(b"\n", 0, MAX_REQUEST_BYTES + 1)
+            if length < 0:
+                if len(self._buffer) > MAX_REQUEST_BYTES:
+                    self.end(f"expected a request of at most {MAX_REQUEST_BYTES} bytes")
+                break
+            line = bytes(self._buffer[:length])
+            del self._buffer[: length + 1]
+            try:
+                request = parse_request(line)
+            except ValueError:
+                self.end("expected a request in JSON")
+                return
+            self._take(*request)
+        else:
+            self._reading = True
+            asyncio.get_running_loop().call_soon(self._read)
+        if not self.gone and len(self._waiting) < MAX_WAITING and len(self._buffer) <= MAX_REQUEST_BYTES:
+            self.transport.resume_reading()
+
+    def _take(self, number: Any, op: str, arguments: dict[str, Any]) -> None:
+        if op == "hello":
+            self.bridge.greet(self, number, arguments)
+        elif not self.greeted:
+            self.end("expected 'hello' with the token first")
+        elif op in ("stop", "estop"):
+            self.bridge.begin(self, number, op, arguments)  # ahead of all waiting requests
+        else:
+            self._waiting.append((number, op, arguments))
+            if len(self._waiting) >= MAX_WAITING:
+                self.transport.pause_reading()
+            if self._serving is None:
+                self._serving = asyncio.ensure_future(self._serve())
+
+    def welcome(self) -> None:
+        """Accept the client."""
+        self.greeted = True
+        if self._deadline is not None:
+            self._deadline.cancel()
+
+    async def _serve(self) -> None:
+        """Carry out the waiting requests; all clients take turns."""
+        while self._waiting:
+            async with self.bridge.turn:
+                number, op, arguments = self._waiting.popleft()
+                done = self.bridge.begin(self, number, op, arguments)
+                await asyncio.sleep(0)  # what has arrived meanwhile is read before the next turn
+            if done is not None and op in self.bridge.in_order:
+                await asyncio.wait([done])
+            if not self._reading and not self.gone:
+                self._read()
+        self._serving = None
 
     def send(self, message: dict[str, Any]) -> None:
         """Send a line; ignored for a lost client. A client that does not read is disconnected."""
-        if self.gone or self.writer.is_closing():
+        if self.gone or self.transport.is_closing():
             return
-        self.writer.write(json.dumps(message).encode() + b"\n")
-        if self.writer.transport.get_write_buffer_size() > MAX_UNREAD_BYTES:
-            self.writer.transport.abort()
+        self.transport.write(json.dumps(message).encode() + b"\n")
+        if self.transport.get_write_buffer_size() > MAX_UNREAD_BYTES:
+            self.transport.abort()
+
+    def end(self, why: str = "") -> None:
+        """Close the connection; nothing more is read from it."""
+        if self.gone:
+            return
+        if why:
+            self.send({"id": None, "ok": False, "error": why, "time": self.bridge.time})
+        self._forget()
+        self.transport.close()
+        asyncio.get_running_loop().call_later(CLOSE_TIMEOUT, self.transport.abort)
+
+    def _forget(self) -> None:
+        self.gone = True
+        self._buffer.clear()
+        self._waiting.clear()
+        if self._deadline is not None:
+            self._deadline.cancel()
+        if self._serving is not None:
+            self._serving.cancel()
+        self.bridge.left(self)
+
+
+class Sender(asyncio.Protocol):
+    """Sends commands to LinuxCNC from a process of its own.
+
+    LinuxCNC's module waits until a command is accepted, 10 to 100 ms, and holds up the whole process. There is one
+    process for orders and one for stops, so that a stop waits for nothing. To be made before any thread or socket.
+    """
+
+    def __init__(self) -> None:
+        self._line, theirs = socket.socketpair()
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._line.close()
+            with contextlib.suppress(BaseException):
+                _obey(theirs)
+            os._exit(0)
+        theirs.close()
+        self._transport: Any = None
+        self._buffer = b""
+        self._sent: deque[asyncio.Future[int]] = deque()
+        self.when_lost: Callable[[], Any] = lambda: None
+
+    async def connect(self, when_lost: Callable[[], Any]) -> None:
+        """Connect to the process; ``when_lost`` is called when it has ended."""
+        self.when_lost = when_lost
+        await asyncio.get_running_loop().create_connection(lambda: self, sock=self._line)
+
+    def connection_made(self, transport: Any) -> None:
+        """Keep the connection."""
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        """Take the results of commands, in their order."""
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        for line in lines:
+            number, error = json.loads(line)
+            done = self._sent.popleft()
+            if done.cancelled():
+                continue
+            if error:
+                done.set_exception(RefusedError(error))
+            else:
+                done.set_result(number)
+
+    def connection_lost(self, exc: Any) -> None:  # noqa: ARG002
+        """Fail all commands under way."""
+        self._transport = None
+        while self._sent:
+            done = self._sent.popleft()
+            if not done.done():
+                done.set_exception(RefusedError(_NO_SENDER))
+        self.when_lost()
+
+    def send(self, name: str, *arguments: Any) -> asyncio.Future[int]:
+        """Send a command at once; the result is its serial number, when LinuxCNC has accepted it."""
+        done: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        done.add_done_callback(lambda each: each.cancelled() or each.exception())  # also where nobody waits for it
+        if self._transport is None:
+            done.set_exception(RefusedError(_NO_SENDER))
+        else:
+            self._sent.append(done)
+            self._transport.write(json.dumps([name, arguments]).encode() + b"\n")
+        return done
+
+
+_NO_SENDER = "the process that sends commands to LinuxCNC has ended"
+
+
+def _obey(line: socket.socket) -> None:
+    """Send the commands that arrive to LinuxCNC, until the bridge ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    command: Any = None
+    with line.makefile("rwb") as file:
+        for request in file:
+            name, arguments = json.loads(request)
+            error = ""
+            try:
+                if command is None:
+                    import linuxcnc
+
+                    command = linuxcnc.command()
+                getattr(command, name)(*arguments)
+            except Exception as found:  # noqa: BLE001 - the order fails with it
+                error = f"{type(found).__name__}: {found}"
+            file.write(json.dumps([getattr(command, "serial", 0), error]).encode() + b"\n")
+            file.flush()
 
 
 class Job:
@@ -82,31 +324,57 @@ class Bridge:
     ----------
     linuxcnc, hal : module
         LinuxCNC's two Python modules.
+    orders, stops : Sender
+        What sends commands to LinuxCNC.
     programs : Path
         Folder for the programs that clients pass on.
     pins : tuple of str
-        Prefix of the HAL pins that clients may set.
+        Prefixes of the HAL pins that clients may set.
     load : str
         HAL pin with the load of the spindle, as a fraction of the rated one; empty where there is none.
+    token : str
+        The first request of a client must have it.
     """
 
-    def __init__(self, linuxcnc: Any, hal: Any, programs: Path, pins: tuple[str, ...] = (), load: str = "") -> None:
+    def __init__(
+        self,
+        linuxcnc: Any,
+        hal: Any,
+        orders: Sender,
+        stops: Sender,
+        programs: Path,
+        pins: tuple[str, ...] = (),
+        load: str = "",
+        *,
+        token: str,
+    ) -> None:
+        if len(token) < MIN_TOKEN:
+            raise ValueError(f"expected a token of at least {MIN_TOKEN} characters")
         self.cnc, self.hal = linuxcnc, hal
-        self.stat, self.command, self.errors = linuxcnc.stat(), linuxcnc.command(), linuxcnc.error_channel()
-        self.programs, self.pins, self.load = programs, pins, load
+        self.stat, self.errors = linuxcnc.stat(), linuxcnc.error_channel()
+        self.orders, self.stops = orders, stops
+        self._serial = 0  # of the last command that LinuxCNC has accepted
+        self.programs, self.load = programs, load
+        self.pins = tuple(pin for pin in (each.strip() for each in pins) if pin)
+        self.turn = asyncio.Lock()
+        self._token = token.encode()
         self.alarms: list[str] = []
-        self.clients: set[Client] = set()
+        self.clients: dict[Client, None] = {}  # in the order of their arrival
         self.job: Job | None = None
         self.program: Job | None = None
         self.outcome: dict[str, Any] | RefusedError = {"duration": 0.0}  # of the last program
         self._written = 0
         self._stops = 0
+        self._stopping: dict[str, asyncio.Future[int]] = {}  # stops under way, which further ones join
         self._began = time.monotonic()
-        quick = (self.identify, self.state, self.stop, self.estop, self.reset, self.set_pins)
-        waits = (self.elapse, self.finish)
-        orders = (self.home, self.enable, self.move_to, self.probe, self.spindle, self.run_program)
-        self._quick, self._waits = {each.__name__ for each in quick}, {each.__name__ for each in waits}
-        self._work: dict[Any, Callable[..., Any]] = {each.__name__: each for each in (*quick, *waits, *orders)}
+        reads = (self.identify, self.state, self.elapse, self.finish, self.stop, self.estop)
+        changes = (self.reset, self.set_pins, self.program_part)
+        moves = (self.home, self.enable, self.move_to, self.probe, self.spindle, self.run_program)
+        self._work: dict[str, Callable[..., Any]] = {each.__name__: each for each in (*reads, *changes, *moves)}
+        self._waits, self._orders = {"elapse", "finish"}, {each.__name__ for each in moves}
+        self._reads = {each.__name__ for each in reads}
+        self._of_client = {"elapse", "finish", "program_part", "run_program"}
+        self.in_order = {*self._work} - self._waits - self._orders  # answered before the client's next request begins
 
     async def await_linuxcnc(self) -> None:
         """Wait until LinuxCNC has started or START_TIMEOUT has passed; until then its state is invalid."""
@@ -117,54 +385,81 @@ class Bridge:
 
     # ------------------------------------------------------------------ requests
 
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer one client until it disconnects."""
-        client = Client(writer)
-        self.clients.add(client)
-        try:
-            while line := await reader.readline():
-                await self._take(client, line)
-        except ValueError:
-            client.send(self._failure(None, f"expected a request of at most {MAX_REQUEST_BYTES} bytes"))
-        except OSError:
-            pass
-        finally:
-            client.gone = True
-            self.clients.discard(client)
-            self._end_jobs("the connection of its client is lost", client)
-            writer.close()
+    def arrived(self, client: Client) -> None:
+        """Register a connection. Of too many strangers the oldest is disconnected."""
+        strangers = [each for each in self.clients if not each.greeted]
+        if len(strangers) >= MAX_STRANGERS:
+            strangers[0].end()
+        self.clients[client] = None
 
-    async def _take(self, client: Client, line: bytes) -> None:
-        number: Any = None
-        try:
-            request = json.loads(line)
-            number, op = request.pop("id"), request.pop("op")
-            work = self._work.get(op)
-        except Exception as error:  # noqa: BLE001 - a request must not end the bridge
-            client.send(self._failure(number, f"expected a request in JSON: {error!r}"))
+    def left(self, client: Client) -> None:
+        """Forget a connection, and end its motions."""
+        if client in self.clients:
+            del self.clients[client]
+            self._end_jobs("the connection of its client is lost", client)
+
+    def greet(self, client: Client, number: Any, arguments: dict[str, Any]) -> None:
+        """Accept a client that has the token; give it control of the machine where nobody else has it."""
+        token, name = arguments.get("token"), arguments.get("client", "")
+        given = token.encode("utf-8", "replace") if isinstance(token, str) else b""
+        if not hmac.compare_digest(given, self._token):
+            client.end("the token is not that of this bridge")
             return
+        if not isinstance(name, str) or len(name) > MAX_NAME or not isinstance(arguments.get("control"), bool):
+            client.end(f"expected 'control', true or false, and a name of at most {MAX_NAME} characters as 'client'")
+            return
+        if not client.greeted and sum(each.greeted for each in self.clients) >= MAX_CLIENTS:
+            client.end(f"{MAX_CLIENTS} clients are connected already")
+            return
+        client.welcome()
+        client.name, client.control = name, False
+        holder = next((each for each in self.clients if each.control), None)
+        client.control = arguments["control"] and (holder is None or holder.name == name != "")
+        result = {
+            "protocol": PROTOCOL,
+            "control": client.control,
+            "controlled_by": None if holder is None else holder.name,
+        }
+        client.send({"id": number, "ok": True, "result": result, "time": self.time})
+
+    def begin(self, client: Client, number: Any, op: str, arguments: dict[str, Any]) -> asyncio.Task[None] | None:
+        """Begin a request; return the task that answers it, None where it is answered."""
+        work = self._work.get(op)
         if work is None:
             client.send(self._failure(number, f"unknown operation: {op}"))
-        elif op in self._quick:
-            client.send(await self._answer(number, partial(work, **request)))
-        elif op in self._waits:
-            self._in_background(client, self._wait(client, number, partial(work, client, **request)))
-        elif busy := self.job or self.program:
+        elif op not in self._reads and not client.control:
+            client.send(
+                self._failure(
+                    number, "this client only reads: another one controls the machine, or it did not ask for control"
+                )
+            )
+        elif len(client.tasks) >= MAX_TASKS:
+            client.send(self._failure(number, f"{MAX_TASKS} requests of this client are being answered; wait for one"))
+        elif op in self._orders and (busy := self.job or self.program):
             client.send(self._failure(number, f"the machine is busy: {busy.what}"))
         else:
-            self.job = Job(client, op.replace("_", " "))
-            self._in_background(client, self._order(client, number, partial(work, **request)))
+            bound = partial(work, client, **arguments) if op in self._of_client else partial(work, **arguments)
+            if op in self._orders:
+                self.job = Job(client, op.replace("_", " "))
+                return self._in_background(client, self._order(client, number, bound))
+            answer = self._wait if op in self._waits else self._reply
+            return self._in_background(client, answer(client, number, bound))
+        return None
 
-    def _in_background(self, client: Client, work: Any) -> None:
-        task = asyncio.ensure_future(work)
+    def _in_background(self, client: Client, work: Any) -> asyncio.Task[None]:
+        task: asyncio.Task[None] = asyncio.ensure_future(work)
         client.tasks.add(task)
         task.add_done_callback(client.tasks.discard)
+        return task
+
+    async def _reply(self, client: Client, number: Any, work: Callable[[], Any]) -> None:
+        client.send(await self._answer(number, work))
 
     async def _order(self, client: Client, number: Any, work: Callable[[], Any]) -> None:
         self.alarms.clear()
         answer = await self._with_beats(client, number, self._answer(number, work))
         if not answer["ok"]:
-            self._abort_motion()
+            await self._abort_motion()
         if self.program is None:
             await self._rest()
         self.job = None  # before the answer, which the next order may follow at once
@@ -212,7 +507,7 @@ class Bridge:
         while (message := self.errors.poll()) is not None:
             kind, text = message
             if kind in (self.cnc.NML_ERROR, self.cnc.OPERATOR_ERROR):
-                self.alarms.append(str(text).strip())
+                self.alarms.append(str(text).strip()[:MAX_TEXT])
                 del self.alarms[:-20]
 
     @property
@@ -292,17 +587,44 @@ class Bridge:
     # ------------------------------------------------------------------ orders
 
     async def estop(self) -> None:
-        """Press the e-stop."""
+        """Send the e-stop to LinuxCNC, which takes some 0.1 s; its state shows when it is in e-stop."""
         self._end_jobs("e-stop", None, abort=False)
-        self.command.state(self.cnc.STATE_ESTOP)
-        if not await self._becomes(lambda: self.stat.task_state == self.cnc.STATE_ESTOP):
-            raise RefusedError(f"LinuxCNC does not go into e-stop{await self._texts()}")
+        if "estop" not in self._stopping:
+            sent = self.stops.send("state", self.cnc.STATE_ESTOP)
+            self._under_way("estop", asyncio.ensure_future(self._pressed(sent)))
+
+    async def _pressed(self, sent: asyncio.Future[int]) -> int:
+        """Wait until LinuxCNC is in e-stop; a command of another process may have replaced the first one."""
+        with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
+            for _ in range(ATTEMPTS):
+                self._serial = max(self._serial, await sent)
+                if await self._becomes(lambda: self.stat.task_state == self.cnc.STATE_ESTOP):
+                    return self._serial
+                sent = self.stops.send("state", self.cnc.STATE_ESTOP)
+            self.alarms.append("LinuxCNC does not go into e-stop")
+        return self._serial
+
+    def _abort(self) -> asyncio.Future[int]:
+        """Send an abort at once, unless one is under way; return when LinuxCNC accepts it."""
+        return self._stopping.get("abort") or self._under_way("abort", self.stops.send("abort"))
+
+    def _under_way(self, what: str, stop: asyncio.Future[int]) -> asyncio.Future[int]:
+        """Register a stop, which further ones of its kind join, and for which the next order waits."""
+        self._stopping[what] = stop
+        stop.add_done_callback(lambda _: self._stopping.pop(what, None))
+        return stop
+
+    async def _stopped(self) -> None:
+        """Wait until LinuxCNC has accepted the stops under way."""
+        while self._stopping:
+            await asyncio.wait(list(self._stopping.values()))
 
     async def reset(self) -> None:
         """Release the e-stop and clear the alarms; the machine stays off."""
+        await self._stopped()
         self._look()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
-            self.command.state(self.cnc.STATE_ESTOP_RESET)
+            await self._send("state", self.cnc.STATE_ESTOP_RESET)
             if not await self._becomes(lambda: self.stat.task_state != self.cnc.STATE_ESTOP):
                 raise RefusedError(f"the e-stop cannot be released; check the buttons{await self._texts()}")
         self.alarms.clear()
@@ -310,42 +632,60 @@ class Bridge:
     async def stop(self, spindle: bool = False) -> None:
         """Abort everything; LinuxCNC's abort stops the spindle as well."""
         self._stops += 1
-        self._end_jobs("it was stopped", None)
+        self._end_jobs("it was stopped", None, abort=False)
+        accepted = self._abort()
         if spindle:
-            self.command.spindle(self.cnc.SPINDLE_OFF)
+            self.stops.send("spindle", self.cnc.SPINDLE_OFF)
+        self._serial = max(self._serial, await asyncio.shield(accepted))
         await self._settle("abort")
+        until = time.monotonic() + ACCEPT_TIMEOUT
+        while (self.job or self.program) and time.monotonic() < until:  # an order that was sent meanwhile
+            await asyncio.sleep(POLL_INTERVAL)
         await self._rest()
 
     async def enable(self) -> None:
         """Switch the machine on."""
+        await self._stopped()
         self._look()
         if self.stat.task_state == self.cnc.STATE_ESTOP:
             raise RefusedError("the machine is in e-stop; reset it first")
-        self.command.state(self.cnc.STATE_ON)
-        if not await self._becomes(lambda: self.stat.task_state == self.cnc.STATE_ON):
+        for _ in range(ATTEMPTS):  # LinuxCNC ignores the first one while its e-stop is being released
+            await self._send("state", self.cnc.STATE_ON)
+            if await self._becomes(lambda: self.stat.task_state in (self.cnc.STATE_ON, self.cnc.STATE_ESTOP)):
+                break
+            if self.job is not None and self.job.ended_by:
+                raise RefusedError(f"enable was aborted: {self.job.ended_by}")
+        if self.stat.task_state != self.cnc.STATE_ON:
             raise RefusedError(f"the machine stays off{await self._texts()}")
 
     async def home(self) -> None:
         """Home all joints; return when all are homed."""
         await self._demand(homed=False)
         await self._mode(self.cnc.MODE_MANUAL)
-        self.command.teleop_enable(0)
+        await self._send("teleop_enable", 0)
         await self._settle("joint mode")
         await self._ended(self.job)  # it may have been aborted already
-        self.command.home(-1)
+        await self._send("home", -1)
         await self._settle("homing")
         while not (self._homed() and self._idle()):
             await self._poll()
             homing = any(joint["homing"] for joint in self.stat.joint[: self.stat.joints])
             if not homing and not self._homed() and (self.alarms or self.stat.state == self.cnc.RCS_ERROR):
                 raise RefusedError(f"homing failed{await self._texts()}")
-        self.command.teleop_enable(1)
+        await self._send("teleop_enable", 1)
         await self._settle("world mode")
 
-    async def move_to(self, position: Any, feed: Any = None) -> dict[str, Any]:
-        """Move in a straight line, at a feed in m/s or in rapid; return when the machine is there."""
+    async def move_to(self, position: Any, feed: Any = None, feed_limit: Any = None) -> dict[str, Any]:
+        """Move in a straight line, at a feed in m/s or in rapid; return when the machine is there.
+
+        A rapid move that would exceed ``feed_limit``, m/s, has that feed.
+        """
         await self._demand()
-        goal, words = self._goal(position), _speed(feed)
+        goal, words = self._goal(position), "G0"
+        if feed is not None:
+            words = f"G1 {self._feed(feed)}"
+        elif feed_limit is not None and _number(feed_limit, "a feed in m/s") < self._fastest():
+            words = f"G1 {self._feed(feed_limit)}"
         began = self.time
         await self._mdi(f"G53 {words} {_axis_words(goal)}")
         await self._require_arrival(goal)
@@ -354,7 +694,7 @@ class Bridge:
     async def probe(self, target: Any, feed: Any) -> dict[str, Any]:
         """Move in a straight line until the probe trips, and return its position."""
         await self._demand()
-        goal, words = self._goal(target), _speed(feed, "G38.3")
+        goal, words = self._goal(target), f"G38.3 {self._feed(feed)}"
         if self.stat.probe_val:
             raise RefusedError("the probe is tripped before it moves")
         if math.dist(goal, self._metres(self.stat.position)) < POSITION_TOLERANCE:
@@ -370,24 +710,42 @@ class Bridge:
     async def spindle(self, speed: Any) -> None:
         """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it."""
         await self._demand(homed=False)
-        number = _number(speed, "spindle speed in 1/min")
+        number, most = _number(speed, "spindle speed in 1/min"), self._fastest_spindle(speed)
+        if abs(number) > most:
+            raise RefusedError(f"expected a spindle speed of at most {most:g} 1/min; found {number:g}")
         await self._mdi("M5" if number == 0 else f"{'M3' if number > 0 else 'M4'} S{abs(number):.3f}")
         if self.stat.state == self.cnc.RCS_ERROR:
             raise RefusedError(f"the spindle does not turn{await self._texts()}")
 
-    async def run_program(self, text: Any) -> dict[str, Any]:
-        """Run an NC program; return when it has started."""
+    async def program_part(self, client: Client, text: Any) -> None:
+        """Take a part of a long program; `run_program` has the last one. An empty part discards the earlier ones."""
+        if not isinstance(text, str):
+            raise RefusedError("expected the text of a part of a program")
+        if not text:
+            client.program.clear()
+        client.program.append(text)
+        if sum(map(len, client.program)) > MAX_PROGRAM_BYTES:
+            client.program.clear()
+            raise RefusedError(f"expected a program of at most {MAX_PROGRAM_BYTES} bytes")
+
+    async def run_program(self, client: Client, text: Any) -> dict[str, Any]:
+        """Run an NC program, after its earlier parts; return when it has started."""
+        parts = client.program.copy()
+        client.program.clear()
         await self._demand()
-        if not isinstance(text, str) or not text.strip():
+        if not isinstance(text, str):
+            raise RefusedError("expected the text of a program")
+        text = "".join([*parts, text])
+        if not text.strip():
             raise RefusedError("expected the text of a program")
         self._written += 1
         file = self.programs / f"errormotion-{self._written}.ngc"
         file.write_text(text if text.endswith("\n") else text + "\n")
         await self._mode(self.cnc.MODE_AUTO)
-        self.command.program_open(str(file))
+        await self._send("program_open", str(file))
         await self._settle("opening the program")
         await self._ended(self.job)  # it may have been aborted already
-        self.command.auto(self.cnc.AUTO_RUN, 0)
+        await self._send("auto", self.cnc.AUTO_RUN, 0)
         await self._settle("starting the program", running=True)
         assert self.job is not None
         self.program = Job(self.job.client, f"program {file.name}")
@@ -404,8 +762,10 @@ class Bridge:
             self.outcome = {"duration": self.time - began}
         except RefusedError as error:
             self.outcome = error
+            await self._abort_motion()
         except Exception as error:  # noqa: BLE001 - reported when the result is requested
             self.outcome = RefusedError(f"{type(error).__name__}: {error}")
+            await self._abort_motion()
         finally:
             await self._rest()
             self.program = None
@@ -428,17 +788,20 @@ class Bridge:
                 raise RefusedError("waiting was stopped")
             await asyncio.sleep(min(left, 0.05))
 
-    async def set_pins(self, pins: dict[str, float]) -> None:
-        """Set HAL pins whose names have the prefix `pins`."""
-        for name, value in pins.items():
-            if not name.startswith(self.pins):
+    async def set_pins(self, pins: Any) -> None:
+        """Set HAL pins whose names have a prefix of `pins`."""
+        values = {str(name): _number(value, f"a value of the pin {name}") for name, value in dict(pins).items()}
+        for name in values:
+            if not self.pins or not name.startswith(self.pins):
                 raise RefusedError(f"the pin {name} is not among those that clients may set")
-            self.hal.set_p(name, repr(float(value)))
+        for name, value in values.items():
+            self.hal.set_p(name, repr(value))
 
     # ------------------------------------------------------------------ steps of orders
 
     async def _demand(self, *, homed: bool = True) -> None:
         """Refuse unless the machine is ready for an order."""
+        await self._stopped()
         self._look()
         await self._rest(REST_TIMEOUT)
         if self.stat.task_state == self.cnc.STATE_ESTOP:
@@ -459,6 +822,26 @@ class Bridge:
                 raise RefusedError(f"{axis} travels from {low:g} to {high:g} m; found {x:g}")
         return goal
 
+    def _feed(self, feed: Any) -> str:
+        """Return the word of a feed in m/s, at most that of the INI file."""
+        speed, most = _number(feed, "a feed in m/s"), self._fastest()
+        if not 0 < speed <= most * (1 + 1e-6):
+            raise RefusedError(f"expected a feed above 0 and at most {most:g} m/s; found {feed!r}")
+        return f"F{speed * 6e4:.6f}"
+
+    def _fastest(self) -> float:
+        """Return the highest feed of the INI file, m/s."""
+        stated = float(getattr(self.stat, "max_velocity", 0.0)) * self._unit
+        return stated if 0 < stated < MAX_FEED else MAX_FEED
+
+    def _fastest_spindle(self, speed: float) -> float:
+        """Return the highest speed of the spindle in the INI file, 1/min."""
+        name = "MAX_FORWARD_VELOCITY" if speed > 0 else "MAX_REVERSE_VELOCITY"
+        with contextlib.suppress(Exception):
+            stated = abs(float(self.cnc.ini(str(self.stat.ini_filename)).find("SPINDLE_0", name)))
+            return stated if 0 < stated < MAX_SPINDLE else MAX_SPINDLE
+        return MAX_SPINDLE
+
     def _in_work_frame(self, place: list[float]) -> list[float]:
         """Return a position of the machine in the coordinates in force: G54, G92 and the tool's offset."""
         s = self.stat
@@ -470,7 +853,7 @@ class Bridge:
 
     async def _mode(self, mode: int) -> None:
         if self.stat.task_mode != mode:
-            self.command.mode(mode)
+            await self._send("mode", mode)
             await self._settle("change of mode")
             if not await self._becomes(lambda: self.stat.task_mode == mode):
                 raise RefusedError(f"LinuxCNC does not change its mode{await self._texts()}")
@@ -487,7 +870,7 @@ class Bridge:
 
     async def _line(self, line: str) -> None:
         await self._ended(self.job)  # it may have been aborted already
-        self.command.mdi(line)
+        await self._send("mdi", line)
         while not await self._ended(self.job):
             await asyncio.sleep(POLL_INTERVAL)
 
@@ -499,7 +882,7 @@ class Bridge:
         if self.stat.task_state != self.cnc.STATE_ON:
             what = "e-stop" if self.stat.task_state == self.cnc.STATE_ESTOP else "the machine was switched off"
             raise RefusedError(f"{job.what if job else 'order'} was aborted: {what}{await self._texts()}")
-        taken = self.stat.echo_serial_number >= self.command.serial and self.stat.state != self.cnc.RCS_EXEC
+        taken = self.stat.echo_serial_number >= self._serial and self.stat.state != self.cnc.RCS_EXEC
         return taken and self._idle()
 
     async def _poll(self) -> None:
@@ -512,21 +895,26 @@ class Bridge:
         while True:
             self._look()
             done = running or self.stat.state != self.cnc.RCS_EXEC
-            if self.stat.echo_serial_number >= self.command.serial and done:
+            if self.stat.echo_serial_number >= self._serial and done:
                 return
             if time.monotonic() > until:
-                self.command.abort()  # an order that is not accepted now must not be carried out later
+                self._abort()  # an order that is not accepted now must not be carried out later
                 raise RefusedError(f"LinuxCNC does not respond: {what} took more than {ACCEPT_TIMEOUT:g} s")
             await asyncio.sleep(POLL_INTERVAL / 2)
 
-    def _abort_motion(self) -> None:
-        """Abort all motion after a failed order."""
+    async def _abort_motion(self) -> None:
+        """Abort all motion after a failed order, also one that has overtaken the stop which ended it."""
+        await self._stopped()
         with contextlib.suppress(Exception):
             self._look()
-            if self._idle():
+            if self._idle() and not (self.job and self.job.ended_by):
                 return
-        with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
-            self.command.abort()
+        self._abort()
+        await self._stopped()
+
+    async def _send(self, name: str, *arguments: Any) -> None:
+        """Send a command, and wait until LinuxCNC has accepted it."""
+        self._serial = max(self._serial, await self.orders.send(name, *arguments))
 
     async def _rest(self, limit: float = ACCEPT_TIMEOUT) -> None:
         """Wait until nothing moves, at most ``limit`` s."""
@@ -565,42 +953,106 @@ class Bridge:
         for job in ended:
             job.ended_by = job.ended_by or why
         if abort and (ended or client is None):
-            with contextlib.suppress(Exception):  # LinuxCNC has ended: nothing moves
-                self.command.abort()
+            self._abort()
 
 
 def _number(value: Any, what: str, least: float = -math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < least:
-        raise RefusedError(f"expected {what}; found {value!r}")
-    return float(value)
-
-
-def _speed(feed: Any, word: str = "G1") -> str:
-    """Return the words of a feed in m/s; of a rapid move without a feed."""
-    if feed is None and word == "G1":
-        return "G0"
-    if (speed := _number(feed, "a feed in m/s")) <= 0:
-        raise RefusedError(f"expected a feed above 0 in m/s; found {feed!r}")
-    return f"{word} F{speed * 6e4:.6f}"
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:  # an integer
+        number = math.nan
+    if not math.isfinite(number) or number < least:
+        raise RefusedError(f"expected {what}; found {str(value)[:MAX_NAME]}")
+    return number
 
 
 def _axis_words(place: list[float]) -> str:
     return " ".join(f"{axis}{1e3 * x:.7f}" for axis, x in zip(AXES, place))  # noqa: B905
 
 
-async def run(bridge: Bridge, port: int, announce: Path | None, idle: float) -> None:
+# ---------------------------------------------------------------------- socket and token
+
+
+def own_folder(path: Path) -> None:
+    """Make the folder of a file, for its user only; PermissionError where others can write into it."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = path.parent.stat()
+    if found.st_uid not in (os.getuid(), 0) or found.st_mode & 0o022:
+        raise PermissionError(f"{path.parent}: expected a folder into which only its user can write; chmod 700 it")
+
+
+def own_token(path: Path) -> str:
+    """Return the token in a file that only its user can read; it is made where there is none.
+
+    Raises
+    ------
+    PermissionError
+        Others can read the file, or it belongs to another user.
+    ValueError
+        The token is too short.
+    """
+    own_folder(path)
+    if not path.exists():
+        handle, part = tempfile.mkstemp(dir=path.parent)  # mode 0600
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(secrets.token_hex(32) + "\n")
+            with contextlib.suppress(FileExistsError):  # another bridge was faster
+                os.link(part, path)
+        finally:
+            os.unlink(part)
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    with os.fdopen(handle) as file:
+        found = os.fstat(handle)
+        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+            raise PermissionError(
+                f"{path}: expected a file of this user that nobody else can read (mode 0600); remove it, and the "
+                "bridge makes another one"
+            )
+        token = file.read(4096).strip()
+    if len(token) < MIN_TOKEN:
+        raise ValueError(f"{path}: expected a token of at least {MIN_TOKEN} characters; remove the file")
+    return token
+
+
+def unix_socket(path: Path) -> socket.socket:
+    """Return a listening socket that only its user can connect to; OSError where another bridge listens there."""
+    own_folder(path)
+    if path.exists():
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise FileExistsError(f"{path}: expected the socket of a bridge, or nothing; remove the file")
+        with socket.socket(socket.AF_UNIX) as other:
+            try:
+                other.connect(str(path))
+            except OSError:
+                path.unlink()  # left by a bridge that was killed
+            else:
+                raise FileExistsError(f"{path}: another bridge listens there")
+    line = socket.socket(socket.AF_UNIX)
+    before = os.umask(0o177)
+    try:
+        line.bind(str(path))
+    finally:
+        os.umask(before)
+    return line
+
+
+async def run(make: Callable[[], Bridge], line: socket.socket, announce: Path | None, idle: float) -> None:
     """Serve until this process is ended, or no client has been connected for ``idle`` s."""
-    ended = asyncio.Event()
+    bridge, ended = make(), asyncio.Event()
+    for sender in (bridge.orders, bridge.stops):
+        await sender.connect(ended.set)  # a bridge that cannot stop the machine ends
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         loop.add_signal_handler(number, ended.set)
     await bridge.await_linuxcnc()
-    server = await asyncio.start_server(bridge.serve, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
-    port = server.sockets[0].getsockname()[1]
-    print(f"errormotion's bridge listens on 127.0.0.1:{port}", flush=True)
+    server = await loop.create_server(lambda: Client(bridge), sock=line, backlog=MAX_CLIENTS)
+    name = line.getsockname()
+    where = {"socket": name} if isinstance(name, str) else {"port": name[1]}
+    print(f"errormotion's bridge listens on {name if isinstance(name, str) else f'127.0.0.1:{name[1]}'}", flush=True)
     if announce is not None:
         part = announce.with_suffix(".part")
-        part.write_text(json.dumps({"port": port, "pid": os.getpid()}))
+        part.write_text(json.dumps({**where, "pid": os.getpid()}))
         part.rename(announce)
     last_client = time.monotonic()
     while not ended.is_set() and time.monotonic() - last_client < idle:
@@ -615,23 +1067,37 @@ def main(words: list[str]) -> int:
     """Run beside LinuxCNC."""
     parser = argparse.ArgumentParser(prog="bridge.py", description="JSON lines between LinuxCNC and errormotion")
     parser.add_argument("-ini", metavar="FILE", help="passed by LinuxCNC to its display; ignored")
-    parser.add_argument("--port", type=int, default=PORT, help="port of 127.0.0.1; 0: any free port")
-    parser.add_argument("--announce", type=Path, help="file to which port and process are written")
+    parser.add_argument("--socket", type=Path, default=Path(SOCKET), help=f"Unix socket; default {SOCKET}")
+    parser.add_argument("--port", type=int, help="port of 127.0.0.1 in place of the socket; 0: any free port")
+    parser.add_argument("--token", type=Path, default=Path(TOKEN), help=f"file with the token; default {TOKEN}")
+    parser.add_argument("--announce", type=Path, help="file to which socket or port, and process, are written")
     parser.add_argument(
         "--idle", type=float, default=math.inf, help="time without a client after which the bridge ends, s"
     )
-    parser.add_argument("--pins", default="", help="prefix of the HAL pins that clients may set")
+    parser.add_argument("--pins", default="", help="prefixes of the HAL pins that clients may set, with commas between")
     parser.add_argument("--load-pin", default="", help="HAL pin with the load of the spindle, 1 = rated")
     options = parser.parse_args(words)
+    path = options.socket.expanduser()
+    orders, stops = Sender(), Sender()
+    try:
+        token = own_token(options.token.expanduser())
+        line = unix_socket(path) if options.port is None else socket.create_server(("127.0.0.1", options.port))
+    except (OSError, ValueError) as error:
+        print(f"errormotion's bridge does not start: {error}", file=sys.stderr)
+        return 1
     import hal
     import linuxcnc
 
     component = hal.component("errormotion-bridge")  # so that LinuxCNC ends this process with the others
     component.ready()
-    pins = tuple(options.pins.split(",")) if options.pins else ()
-    with tempfile.TemporaryDirectory(prefix="errormotion-") as folder:
-        bridge = Bridge(linuxcnc, hal, Path(folder), pins, options.load_pin)
-        asyncio.run(run(bridge, options.port, options.announce, options.idle))
+    try:
+        with tempfile.TemporaryDirectory(prefix="errormotion-") as folder:
+            pins = tuple(options.pins.split(","))
+            make = partial(Bridge, linuxcnc, hal, orders, stops, Path(folder), pins, options.load_pin, token=token)
+            asyncio.run(run(make, line, options.announce, options.idle))
+    finally:
+        if options.port is None:
+            path.unlink(missing_ok=True)
     return 0
 
 

@@ -12,7 +12,10 @@ from errormotion.errors import InstrumentError, ProtocolError
 
 LINE_END = b"\n"
 LONGEST_LINE = 1 << 16
-"""Longest line of the bridge, bytes."""
+"""Longest line of the bridge, and of a request, bytes."""
+PROTOCOL = 2
+PART = 1 << 12
+"""Longest part of a program in a request, characters: at most twelve bytes each."""
 MODES = ("manual", "mdi", "automatic", "")
 
 
@@ -37,9 +40,36 @@ class Answer:
 def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
     """Return a request as bytes; InstrumentError where it holds NaN or infinity."""
     try:
-        return json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
+        request = json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
     except ValueError:
         raise InstrumentError(f"Expected finite numbers; found {dict(arguments)}") from None
+    if len(request) > LONGEST_LINE:
+        raise InstrumentError(f"Expected a request of at most {LONGEST_LINE} bytes; '{op}' has {len(request)}")
+    return request
+
+
+def parts_of(program: str) -> list[str]:
+    """Return a program in parts, each short enough for a request; at least one."""
+    return [program[k : k + PART] for k in range(0, len(program), PART)] or [""]
+
+
+def decode_welcome(result: Any) -> tuple[bool, str]:
+    """Return whether the bridge gives control of the machine, and who else has it.
+
+    Raises
+    ------
+    ProtocolError
+        Another protocol, or no answer to a first request.
+    """
+    try:
+        if result["protocol"] != PROTOCOL:
+            raise ValueError(f"protocol {result['protocol']}")
+        return _switch(result, "control"), str(result["controlled_by"] or "")[:64]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProtocolError(
+            f"Expected the bridge of LinuxCNC with protocol {PROTOCOL}; found {str(result)[:200]} ({error!r}). Copy "
+            "bridge.py of this version to the machine"
+        ) from None
 
 
 def decode(line: bytes) -> Answer | Beat:

@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 import math
+import os
+import secrets
+import stat
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSettings
+from errormotion.instruments.door import Door
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, lazy
+from errormotion.instruments.transports.recording import Recorder, RecordingTransport
+from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
+
+ESTOP_TIMEOUT = 2.0  # s
+ESTOP_INTERVAL = 0.01  # s between two looks at the state
+NAME = f"errormotion {os.getpid()} {secrets.token_hex(8)}"
+"""Name of this process at a bridge; all of its connections share the control of a machine."""
 
 
 class LinuxCNC(Driver):
     """A machine under LinuxCNC.
 
     Positions are those of the machine's own coordinates (G53) in m, independent of the offsets of work and tool.
+
+    Without ``arm`` in its settings the driver reads the state, and may stop the machine.
 
     An order is sent once. If the connection breaks or no answer arrives, an InstrumentError is raised, the bridge
     aborts the motion, and nothing is repeated; the next call connects again. `stop` may be
@@ -28,7 +42,8 @@ class LinuxCNC(Driver):
     Parameters
     ----------
     address : str
-        ``tcp://127.0.0.1:5007``, ``sim://gantry/linuxcnc?seed=3``, ``replay://file``.
+        ``unix://~/.errormotion/linuxcnc.sock``, ``tcp://127.0.0.1:5007``, ``sim://gantry/linuxcnc?seed=3``,
+        ``replay://file``.
     settings : LinuxCNCSettings, optional
     record : Path, optional
         Recording of the session. A recorded session does not connect again.
@@ -47,6 +62,7 @@ class LinuxCNC(Driver):
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
         super().__init__(address, settings, record=record)
+        self._door = Door(self.info.id, address)
         self._exchange_lock = threading.Lock()
         self._number = 0
         self._unawaited: set[int] = set()
@@ -70,8 +86,12 @@ class LinuxCNC(Driver):
             raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
 
     def configure(self, settings: LinuxCNCSettings) -> None:
-        """Use other settings from now on."""
+        """Use other settings from now on; ``arm`` and the token hold for the next connection."""
         self.settings = settings
+
+    def bound(self, limits: MachineLimits) -> None:
+        """Hold limits for every order from now on."""
+        self._door.limits = limits
 
     def read(self) -> dict[str, Any]:
         """Return the state now."""
@@ -92,7 +112,7 @@ class LinuxCNC(Driver):
 
     def reset(self) -> None:
         """Release the e-stop and clear the alarms; then `enable`."""
-        self._order("reset")
+        self._change("reset")
 
     def enable(self) -> None:
         """Switch the machine on.
@@ -102,15 +122,26 @@ class LinuxCNC(Driver):
         InstrumentError
             E-stop, or the machine stays off.
         """
-        self._order("enable")
+        self._change("enable")
 
     def estop(self) -> None:
-        """Set LinuxCNC's e-stop. It does not replace the emergency stop button."""
+        """Set LinuxCNC's e-stop; return when it is in e-stop. It does not replace the emergency stop button.
+
+        Raises
+        ------
+        InstrumentError
+            LinuxCNC is not in e-stop after ESTOP_TIMEOUT.
+        """
         self._order("estop")
+        until = time.monotonic() + ESTOP_TIMEOUT
+        while not self.state()["estop"]:
+            if time.monotonic() > until:
+                raise InstrumentError(f"{self.address}: LinuxCNC is not in e-stop after {ESTOP_TIMEOUT:g} s")
+            time.sleep(ESTOP_INTERVAL)
 
     def home(self) -> None:
         """Home all axes; return when all are homed."""
-        self._order("home")
+        self._change("home")
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
         """Move in a straight line; return when the machine is there.
@@ -133,8 +164,10 @@ class LinuxCNC(Driver):
             Not homed, off or in e-stop, out of travel; stopped, an error of LinuxCNC or a lost connection during the
             move. The message contains the text of LinuxCNC.
         """
-        goal = [float(x) for x in position]
-        return dict(self._order("move_to", position=goal, feed=None if feed is None else float(feed)))
+        goal, limit = self._door.position(position), self._door.limits.feed
+        held = {} if feed is not None or limit is None else {"feed_limit": limit}
+        feed = None if feed is None else self._door.feed(feed)
+        return dict(self._change("move_to", position=goal, feed=feed, **held))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move in a straight line until the probe trips; return when the machine rests.
@@ -160,18 +193,18 @@ class LinuxCNC(Driver):
         InstrumentError
             The probe is tripped before it moves; and what `move_to` raises.
         """
-        goal = [float(x) for x in target]
+        goal, feed = self._door.position(target, "target"), self._door.feed(feed)
         start = self.state()["commanded_position"] if self.settings.trip_delay else goal
-        touch = codec.decode_touch(self._order("probe", target=goal, feed=float(feed)))
+        touch = codec.decode_touch(self._change("probe", target=goal, feed=feed))
         length = math.dist(goal, start)
         if touch["tripped"] and length > 0:
-            back = self.settings.trip_delay * float(feed) / length
+            back = self.settings.trip_delay * feed / length
             touch["position"] = [x - back * (g - s) for x, g, s in zip(touch["position"], goal, start, strict=True)]
         return touch
 
     def spindle(self, speed: float) -> None:
         """Turn the spindle at a speed in 1/min, backwards where it is negative; 0 stops it. Returns at once."""
-        self._order("spindle", speed=float(speed))
+        self._change("spindle", speed=self._door.speed(speed))
 
     def stop(self, spindle: bool = False) -> None:
         """Abort all motion. LinuxCNC's abort stops the spindle, whatever the value of ``spindle``.
@@ -200,7 +233,12 @@ class LinuxCNC(Driver):
         dict
             ``program``, the name of its file, and ``longest_lead_in``, 0 s.
         """
-        return dict(self._order("run_program", text=str(text)))
+        *parts, last = codec.parts_of(str(text))
+        for number, part in enumerate(parts):
+            if number == 0:
+                self._change("program_part", text="")
+            self._change("program_part", text=part)
+        return dict(self._change("run_program", text=last))
 
     def finish(self) -> dict[str, Any]:
         """Wait for the end of the program.
@@ -234,6 +272,12 @@ class LinuxCNC(Driver):
     def _may_reconnect(self) -> bool:
         return self._record is None and not self.address.startswith("replay://")
 
+    def _change(self, op: str, **arguments: Any) -> Any:
+        """Send an order that moves or changes the machine."""
+        words = ", ".join(f"{name} {value}" for name, value in arguments.items())
+        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}".strip()[:200])
+        return self._order(op, **arguments)
+
     def _order(self, op: str, **arguments: Any) -> Any:
         """Send a request, once, and wait for its answer."""
         with self._exchange_lock:
@@ -265,6 +309,8 @@ class LinuxCNC(Driver):
                 raise InstrumentTimeoutError(
                     f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
                 ) from None
+            if message.number is None and not getattr(message, "ok", True):
+                raise InstrumentError(f"{self.address}: the bridge ends the connection: {message.error}; {_WHERE}")
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
                 continue
@@ -293,14 +339,74 @@ class LinuxCNC(Driver):
         return self._transport
 
     def _connect(self) -> Transport:
-        return open_transport(
-            self.address,
-            simulator=self.info.simulator,
-            recorder=self._record,
-            timeout=self.settings.timeout,
-        )
+        """Connect and send the first request, which no recording contains."""
+        line = open_transport(self.address, simulator=self.info.simulator, timeout=self.settings.timeout)
+        try:
+            if not self.address.startswith("replay://"):
+                self._greet(line)
+            if self._record is None:
+                return line
+            recorder = self._record if isinstance(self._record, Recorder) else Recorder(self._record, self.address)
+        except BaseException:
+            line.close()
+            raise
+        return RecordingTransport(line, recorder)
+
+    def _greet(self, line: Transport) -> None:
+        token = "" if line.simulated else read_token(self.settings.token_file, self.address)
+        hello = {"token": token, "control": self.settings.arm, "client": NAME}
+        line.write(codec.encode_request(0, "hello", hello))
+        answer = self._await(line, 0)
+        if not answer.ok and "unknown operation" in answer.error:
+            raise InstrumentError(
+                f"{self.address}: the bridge is of an earlier version, which anybody can use; copy bridge.py of this "
+                "version to the machine"
+            )
+        if not answer.ok:
+            raise InstrumentError(f"{self.address} refuses the connection: {answer.error}; {_WHERE}")
+        control, other = codec.decode_welcome(answer.result)
+        if self.settings.arm and not control:
+            raise InstrumentError(
+                f"{self.address}: another client controls the machine ({other}); end it, or only read (arm = false)"
+            )
 
     def _start_session(self) -> None:
         self._number, self._lost = 0, False
         self._unawaited.clear()
         self.identify()
+
+
+_WHERE = (
+    "the bridge writes its token to ~/.errormotion/linuxcnc.token of the user who runs it. Copy that file to this "
+    "user, with mode 0600, and name it as 'token_file'"
+)
+
+
+def read_token(path: Path, address: str) -> str:
+    """Return the token in a file that only the user can read.
+
+    Raises
+    ------
+    InstrumentError
+        No such file, others can read it, or it has no token.
+    """
+    path = path.expanduser()
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        with os.fdopen(handle, encoding="ascii", errors="replace") as file:
+            found = os.fstat(handle)
+            owned = os.geteuid() in (0, found.st_uid)
+            if not (stat.S_ISREG(found.st_mode) and owned) or found.st_mode & 0o077:
+                raise InstrumentError(
+                    f"{address}: expected a token in {path} that only this user can read; found the mode "
+                    f"{stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}. Use 'chmod 600 {path}', and a new "
+                    "token if others have seen it"
+                )
+            token = file.read(4096).strip()
+    except OSError as error:
+        raise InstrumentError(
+            f"{address}: expected the token of the bridge in {path}; found none ({error.strerror}); {_WHERE}"
+        ) from None
+    if not token:
+        raise InstrumentError(f"{address}: expected the token of the bridge in {path}; the file is empty; {_WHERE}")
+    return token

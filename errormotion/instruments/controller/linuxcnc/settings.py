@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.plugins import PluginSettings
+from errormotion.instruments.door import ArmedSettings
 
 
-class LinuxCNCSettings(PluginSettings):
+class LinuxCNCSettings(ArmedSettings):
     """Settings of ``linuxcnc``."""
 
+    token_file: Path = Field(
+        default=Path("~/.errormotion/linuxcnc.token"),
+        description="file with the token of the bridge, readable by its user only",
+    )
     timeout: Time = Field(default=3.0, description="time limit without data from the bridge, also during motion", gt=0)
     trip_delay: Time = Field(
         default=0.0,

@@ -80,7 +80,7 @@ class Shdr(Driver):
     def conformance(cls) -> InstrumentSubject:
         """Return what the conformance kit examines."""
         return InstrumentSubject(
-            cls, "sim://cframe/shdr?style=vmc", settings={"timeout": 0.7}, harmless=("split", "alarm")
+            cls, "sim://cframe/shdr?style=vmc", settings={"timeout": 0.7}, harmless=("split", "alarm", "late")
         )
 
     def __init__(self, address: str, settings: ShdrSettings | None = None, *, record: Path | None = None) -> None:

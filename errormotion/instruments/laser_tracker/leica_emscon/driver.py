@@ -7,13 +7,14 @@ from contextlib import nullcontext, suppress
 from typing import Any, ClassVar
 
 from errormotion.errors import InstrumentError
+from errormotion.instruments import simulators
 from errormotion.instruments.laser_tracker.leica_emscon import codec, configuration, results, statuses
 from errormotion.instruments.laser_tracker.leica_emscon.link import Event, RefusedError
 from errormotion.instruments.laser_tracker.leica_emscon.session import EmSconSession
 from errormotion.instruments.laser_tracker.leica_emscon.settings import EmSconSettings
 from errormotion.instruments.laser_tracker.leica_emscon.streaming import points
 from errormotion.instruments.laser_tracker.leica_emscon.targets import BeamBrokenError, Reflector, polar
-from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 from errormotion.plugins.readings import Environment, Measurement
 
 MEASURING_TIMEOUT_FACTOR = 20.0
@@ -44,6 +45,11 @@ class LeicaEmScon(EmSconSession):
         status="peer_verified",
         simulator="errormotion.instruments.simulators.laser_tracker.leica_emscon:SimulatedEmScon",
     )
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines; a tracker whose reflector rests gives a lost reading once more."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     # ------------------------------------------------------------------ identity and state
 

@@ -20,7 +20,7 @@ _NUMBER = re.compile(r"[+-]?\d{1,40}(?:\.\d{0,40})?(?:[eE][+-]?\d{1,3})?", re.AS
 _WHOLE = re.compile(r"[+-]?\d{1,18}", re.ASCII)
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}", re.ASCII)
 _BYTE = re.compile(r"'([0-9a-fA-F]{2})'", re.ASCII)
-_FIELD = re.compile(r'"(?:[^"\\]|\\.)*"|[^,"]*', re.DOTALL)
+_FIELD = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[^,"]*', re.DOTALL)  # possessive: without a stack of places
 _ESCAPE = re.compile(r"\\(?:[xX]([0-9a-fA-F]{2})|(.))", re.DOTALL)
 
 

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import ClassVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.instruments import simulators
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.laser_tracker.leica_geocom import air, codec, codes
 from errormotion.instruments.laser_tracker.leica_geocom.settings import GeoComSettings
@@ -56,8 +57,8 @@ class LeicaGeoCom(Driver):
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
-        """Return what the conformance kit examines; a station keeps its last measurement and gives it once more."""
-        return InstrumentSubject(cls, "sim://cframe?seed=3", repeats=True)
+        """Return what the conformance kit examines; a station whose reflector rests gives a lost reading once more."""
+        return InstrumentSubject(cls, "sim://cframe?seed=3", vary=simulators.in_steps(seed=3))
 
     _transaction = 0
     _clear = True  # whether unfinished requests may lie in the station's buffer

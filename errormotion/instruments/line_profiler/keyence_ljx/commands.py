@@ -23,7 +23,8 @@ class CommandLine:
     Unread bytes are discarded ahead of a request, as the maker's client does. A reply names its command, so that a late
     reply is not taken for the reply to a later request. After a timeout the
     next exchange is preceded by a reading request of another opcode; once its reply has arrived, no earlier reply is
-    outstanding. A device that does not name the command, or does not answer this request either, is lost.
+    outstanding. Where the device does not name the command, or does not answer this request either, the connection is
+    lost, and another one is needed.
 
     Parameters
     ----------
@@ -52,6 +53,12 @@ class CommandLine:
         """Whether the last request was answered."""
         return self.lost is None and not self._unanswered
 
+    def usable(self) -> bool:
+        """Whether replies can be assigned to requests, where necessary after a request that shows it."""
+        if self.lost is None and self._unanswered:
+            self._synchronise()
+        return self.lost is None
+
     def command(self, opcode: int, arguments: bytes = b"") -> Reply:
         """Send a request and return the reply.
 
@@ -64,10 +71,8 @@ class CommandLine:
         ProtocolError
             The bytes are not a reply to this request.
         """
-        if self.lost is None and self._unanswered:
-            self._synchronise()
-        if self.lost is not None:
-            raise InstrumentError(f"The connection to {self._name} is lost ({self.lost}); close and open it again")
+        if not self.usable():
+            raise InstrumentError(f"The connection to {self._name} is lost ({self.lost}); end the stream")
         reply = self._exchange(opcode, arguments)
         if reply.code:
             raise codec.refusal(opcode, reply.code)

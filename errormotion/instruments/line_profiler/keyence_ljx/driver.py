@@ -163,16 +163,31 @@ class KeyenceLJX(Driver):
     def command(self, opcode: int, arguments: bytes = b"") -> Reply:
         """Send a request and return the reply; works while profiles are streaming.
 
+        Where replies can no longer be assigned to requests, both connections are opened again first, unless profiles
+        are streaming, and the session is started as by `open`.
+
         Raises
         ------
         InstrumentError
-            The profiler refuses, or the connection is lost: replies can no longer be assigned to requests.
+            The profiler refuses, or the connection is lost.
         InstrumentTimeoutError
             It does not answer. A reply that comes later is skipped.
         ProtocolError
             The bytes are not a reply.
         """
+        if self._reader is None and not self._line().usable():
+            self._reconnect()
         return self._line().command(opcode, arguments)
+
+    def _reconnect(self) -> None:
+        lines: ManyLines = self.transport  # type: ignore[assignment]
+        lines.reopen()
+        lines.line(STREAM).reopen()
+        try:
+            self._start_session()
+        except InstrumentError as error:
+            self._line().lost = error  # the next command tries again
+            raise
 
     def _line(self) -> CommandLine:
         if self._commands is None:
@@ -318,7 +333,7 @@ class KeyenceLJX(Driver):
         return parts, skipped
 
     def _stop(self) -> None:
-        """Stop the stream and its thread; a profiler that does not confirm this must be opened again."""
+        """Stop the stream and its thread; where the profiler does not confirm this, the next command reconnects."""
         from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamEndedError
 
         reader, self._reader = self._reader, None

@@ -36,7 +36,7 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
 )
 from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
 from errormotion.instruments.transports import Transport, open_transport, parse_address
-from errormotion.plugins import Identity, InstrumentInfo, Samples
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 BLOCK_SECONDS = 0.5
 MAX_LATE_LINES = 16
@@ -74,6 +74,12 @@ class KeyenceLK(Driver):
     no_value: str = ""
     _synchronised = False
     _streaming = False
+
+    @classmethod
+    def conformance(cls) -> InstrumentSubject:
+        """Return what the conformance kit examines: readings that differ from one another."""
+        readings = ",".join(f"{0.1 * number - 1.5:.1f}" for number in range(30))
+        return InstrumentSubject(cls, f"sim://cframe?seed=3&readings={readings}")
 
     @property
     def rate(self) -> float:

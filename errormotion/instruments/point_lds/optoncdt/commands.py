@@ -16,9 +16,9 @@ from errormotion.errors import InstrumentError, ProtocolError
 
 PROMPT = b"->"
 LINE_END = b"\r\n"
-LONGEST_ANSWER = 1 << 16
+LONGEST_ANSWER = 1 << 15
 """Bytes of text; HELP and PRINT, the longest, list some hundred lines."""
-MOST_LINES = 4096
+MOST_LINES = 2048
 """Lines of an answer."""
 
 DONE = "ok"

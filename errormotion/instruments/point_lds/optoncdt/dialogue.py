@@ -101,6 +101,10 @@ class Dialogue:
                 return
         raise _no_marker()
 
+    def recover(self) -> None:
+        """Use the line again after it was lost; late answers are discarded ahead of the next command."""
+        self.lost, self._unanswered = None, True
+
     def _answer(self, line: Transport, text: str) -> bytes:
         line.write(text.encode("ascii") + LINE_END)
         return text_of(line.read_until(PROMPT, limit=MAX_BUFFERED_BYTES, timeout=self.timeout))

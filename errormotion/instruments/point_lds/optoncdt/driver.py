@@ -167,6 +167,9 @@ class OptoNCDT(Driver):
     def command(self, text: str) -> list[str]:
         """Send a command and return the lines of the answer; works while data are streaming.
 
+        After a stream whose stop was not confirmed, the connection is opened again first, where there is one, and the
+        sensor is stopped and set up again.
+
         Raises
         ------
         InstrumentError
@@ -174,7 +177,19 @@ class OptoNCDT(Driver):
         InstrumentTimeoutError
             It does not answer. The next command resynchronises first: a late answer is not taken for another one.
         """
+        if self._open_dialogue.lost is not None and self._reader is None:
+            self._recover()
         return self._open_dialogue.command(text)
+
+    def _recover(self) -> None:
+        self.transport.reopen()
+        self._dialogue.recover()
+        try:
+            self.command("OUTPUT NONE")
+            self.configure(self.settings)
+        except InstrumentError as error:
+            self._dialogue.lost = error  # the next command tries again
+            raise
 
     @property
     def _open_dialogue(self) -> Dialogue:
@@ -280,8 +295,7 @@ class OptoNCDT(Driver):
     def stop(self, timeout: float | None = None) -> None:
         """Stop the stream and its thread; idempotent.
 
-        A sensor that does not confirm the stop within ``timeout`` s must be opened again; the next
-        command raises the error.
+        Where the sensor does not confirm the stop within ``timeout`` s, the next command stops and sets it up again.
         """
         reader, self._reader = self._reader, None
         if reader is None:

@@ -56,7 +56,8 @@ class Control:
 
     def _started(self, address: Address) -> LinuxCNCProcess:
         machine, linger = self.world.machine, address.number("linger", LINGER)
-        arguments = f"--port 0 --announce {{folder}}/bridge.json --idle {max(linger, LEAST_IDLE):g} --pins {PINS}"
+        own = "--socket {folder}/bridge.sock --token {folder}/token --announce {folder}/bridge.json"
+        arguments = f"{own} --idle {max(linger, LEAST_IDLE):g} --pins {PINS}"
         ini = ini_text(
             self.world.name,
             machine.travel,
@@ -177,6 +178,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
         self._requests: dict[Any, str] = {}
         self._closed = False
         self._own_error = ""  # error of the simulator's own requests
+        self._controls = False  # whether the driver may move the machine
         super().__init__(address, line_end=b"\n", default_name="linuxcnc")
         self._linger = address.number("linger", LINGER)
         try:
@@ -185,11 +187,16 @@ class SimulatedLinuxCNC(SimulatedDevice):
             super().close()
             raise
         try:
-            self._bridge: Transport = open_transport(
-                f"tcp://127.0.0.1:{self._control.process.port}", timeout=ANSWER_TIMEOUT
-            )
-            if self._control.users == 1 and self._control.ready:
-                self._make_ready()
+            self._bridge: Transport = open_transport(f"unix://{self._control.process.socket}", timeout=ANSWER_TIMEOUT)
+            try:
+                ready = self._control.users == 1 and self._control.ready
+                self._wait_for("hello", **self._greeting(ready, OWN))
+                if ready:
+                    self._make_ready()
+                    self._wait_for("hello", **self._greeting(False, OWN))
+            except BaseException:
+                self._bridge.close()
+                raise
         except BaseException:
             self._control.leave(self._linger)
             super().close()
@@ -223,6 +230,8 @@ class SimulatedLinuxCNC(SimulatedDevice):
             except (ValueError, KeyError, TypeError):
                 self._forward_line(line + b"\n")  # the bridge states what is wrong with it
                 continue
+            if op == "hello":  # a simulated machine has no secret
+                request |= self._greeting(request.get("control"), request.get("client"))
             self._requests[number] = op
             if op in ("elapse", "move_to", "probe", "run_program"):
                 self._ask_state(partial(self._prepared, request))
@@ -254,6 +263,8 @@ class SimulatedLinuxCNC(SimulatedDevice):
             self._send({"id": request["id"], "ok": True, "result": None})
 
     def _set_balls(self, op: str, start: list[float], request: Mapping[str, Any]) -> None:
+        if not self._controls:
+            return
         if op == "probe":
             self.world.tool = "probe"  # it comes by itself when it is needed
         try:
@@ -269,6 +280,9 @@ class SimulatedLinuxCNC(SimulatedDevice):
     def _forward_line(self, line: bytes) -> None:
         with suppress(InstrumentError):  # the other thread notices, and hangs up
             self._bridge.write(line)
+
+    def _greeting(self, control: Any, client: Any) -> Message:
+        return {"token": self._control.process.token, "control": control, "client": client}
 
     # ------------------------------------------------------------------ from the bridge
 
@@ -319,6 +333,12 @@ class SimulatedLinuxCNC(SimulatedDevice):
                 then(state)
             elif not message["ok"]:
                 self._own_error = str(message["error"])
+            return
+        if self._requests.get(number) == "hello":
+            self._controls = bool(result and result["control"])
+            self._requests.pop(number)
+            with self._server.lock:  # no answer that faults count
+                self._server.send(json.dumps(message).encode() + b"\n")
             return
         if self._own_error:
             message = {"id": number, "ok": False, "error": f"error of the simulated probe: {self._own_error}"}

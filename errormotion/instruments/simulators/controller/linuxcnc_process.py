@@ -112,7 +112,8 @@ class LinuxCNCProcess:
             os.close(lock)  # its processes hold it now
         atexit.register(self.end)
         try:
-            self.port, self._bridge = self._await()
+            self.socket, self._bridge = self._await()
+            self.token = (self.folder / "token").read_text().strip()
         except BaseException:
             self.end()
             raise
@@ -168,7 +169,7 @@ class LinuxCNCProcess:
                 extra_groups=[] if user else None,
             )
 
-    def _await(self) -> tuple[int, int]:
+    def _await(self) -> tuple[Path, int]:
         until = time.monotonic() + START_TIMEOUT
         file = self.folder / "bridge.json"
         while not file.exists():
@@ -178,7 +179,7 @@ class LinuxCNCProcess:
                 raise InstrumentError(f"LinuxCNC {why}; the end of its log:\n{log[-2000:]}")
             time.sleep(0.02)
         announced = json.loads(file.read_text())
-        return int(announced["port"]), int(announced["pid"])
+        return Path(announced["socket"]), int(announced["pid"])
 
     # ------------------------------------------------------------------ end
 

@@ -18,11 +18,12 @@ Parameters of the address beside those of every simulated device:
 * ``assets=1``: a cutting tool in several lines
 
 Beyond the menu of `faults`: ``alarm`` (a fault condition), ``unavailable`` (the machine is off). ``fault_at`` counts
-lines.
+lines, those of ``late`` too.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -76,7 +77,7 @@ class SimulatedAdapter:
         Unknown style, times, offset or fault.
     """
 
-    faults = ("silence", "split", "garbage", "drop", "disconnect", "alarm", "unavailable")
+    faults = ("silence", "split", "garbage", "drop", "disconnect", "late", "alarm", "unavailable")
 
     def __init__(self, address: Address) -> None:
         self.fault = parse_fault(address, self.faults)
@@ -95,6 +96,8 @@ class SimulatedAdapter:
         self._lines = 0
         self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last one
         self._received = b""
+        self._held: tuple[object, bytes] | None = None  # the connection and the line that is late
+        self._releasing: threading.Timer | None = None
         self._ended = threading.Event()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         self.world.attach(self, address.number("pace", 0.0) or None)
@@ -118,6 +121,9 @@ class SimulatedAdapter:
     def close(self) -> None:
         """End the adapter; with the last device of its world the world ends."""
         self._ended.set()
+        if self._releasing is not None:
+            self._releasing.cancel()
+            self._releasing.join()
         self._server.close()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -188,9 +194,28 @@ class SimulatedAdapter:
         data = line.encode() + b"\n"
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
+        if fault.kind == "late" and number == fault.at:
+            self._hold(data)
+            return
         with self._server.lock:
+            self._release()
             for piece in fault.pieces(data):
                 self._server.send(piece)
+
+    def _hold(self, data: bytes) -> None:
+        """Hold a line back; see `simulators.faults`."""
+        self._held = self._server.connection, data
+        if math.isfinite(self.fault.delay):
+            self._releasing = threading.Timer(self.fault.delay, self._release)
+            self._releasing.daemon = True
+            self._releasing.start()
+
+    def _release(self) -> None:
+        """Send the line that was held back, if its connection is still open."""
+        with self._server.lock:
+            held, self._held = self._held, None
+            if held is not None and held[0] is self._server.connection:
+                self._server.send(held[1])
 
     def _on_connection(self) -> None:
         """Forget an unfinished line of the previous connection."""

@@ -58,6 +58,13 @@ class SimulatedModbus(SimulatedDevice):
             self.close()
             raise
 
+    @property
+    def driver_url(self) -> str:
+        """Address of the device in a bench file."""
+        scheme, _, place = self.url.partition("://")
+        kind = "rtu" if scheme == "serial" else "tcp" if self._framing == "tcp" else "rtu-tcp"
+        return f"modbus+{kind}://{place}?unit={self._unit}"
+
     def reply(self, data: bytes) -> None:
         """Send an answer, damaged where that is due."""
         if self.fault.hits("checksum", self._answers):

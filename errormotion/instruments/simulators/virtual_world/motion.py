@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from errormotion.errors import ErrormotionError, InstrumentError
 from errormotion.instruments.simulators.virtual_world.clock import SampleClock
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret, title
+from errormotion.instruments.simulators.virtual_world.printing import Block, Order
 from errormotion.twin import Event, StepProgram
 from errormotion.twin.paths import Path
 
@@ -49,8 +50,8 @@ class Motion(SampleClock):
         Whether the emergency stop is pressed.
     stuck : {"open", "closed"} or None
         A fault of the probe: it never trips, or always.
-    printed : list of (float, str)
-        Lines of NC programs with the times at which they are printed, s.
+    port_output : list of (float, Order)
+        What NC programs send to the printer port, with the times, s.
     """
 
     seed: int
@@ -66,7 +67,7 @@ class Motion(SampleClock):
         self.alarms: list[str] = []
         self.estop = False
         self.stuck: Literal["open", "closed"] | None = None
-        self.printed: list[tuple[float, str]] = []
+        self.port_output: list[tuple[float, Order]] = []
         self._programs = 0
         self._program_events: list[Event] = []
         self._warm_up: float | None = None  # time at which it started
@@ -109,7 +110,7 @@ class Motion(SampleClock):
                 raise
             self.motion, self.path = None, path.beginning(begin)
             self.program, self._program_events = title(text), actions.events
-            self.printed += actions.printed
+            self.port_output += actions.port_output
             if self._warm_up is None:
                 self._warm_up = self.path.warm_up()
             return self.path
@@ -193,7 +194,7 @@ class Motion(SampleClock):
             elif now < self.path.end:
                 self.path = self.path.cut(now)
                 self.machine.forget(self._program_events, now)
-                self.printed = [each for each in self.printed if each[0] <= now]  # the same objects, see the printer
+                self.port_output = [each for each in self.port_output if each[0] <= now]  # the same objects
                 if self._warm_up is not None and self._warm_up > now:
                     self._warm_up = None
             self.program = ""
@@ -294,6 +295,11 @@ class Motion(SampleClock):
         place = max(int(np.searchsorted(self.motion.arrivals, time, side="right")) - 1, 0)
         return np.asarray(self.motion.places[place])
 
+    @property
+    def printed(self) -> list[tuple[float, str]]:
+        """Lines of NC programs, without leading blanks, with the times at which they are printed, s."""
+        return [(time, order.text("fanuc", "none")) for time, order in self.port_output if isinstance(order, Block)]
+
     def feed(self) -> float:
         """Return how fast the axes move now, m/s; NaN while the sphere is stepped."""
         return float("nan") if self.stepping else self.path.feed(self.time)
@@ -317,7 +323,7 @@ class ProgramActions:
         self._world, self._begin = world, begin
         self._tool = world.tool
         self.events: list[Event] = []
-        self.printed: list[tuple[float, str]] = []
+        self.port_output: list[tuple[float, Order]] = []
 
     def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
         """Refuse a move on which the probe would run into a ball."""
@@ -339,9 +345,9 @@ class ProgramActions:
         if speed and self._world.tool == "probe":
             self._world.tool = "bar"
 
-    def print(self, line: str, time: float) -> None:
-        """Print a line at a time of the program."""
-        self.printed.append((self._begin + time, line))
+    def print(self, order: Order, time: float) -> None:
+        """Open or close the printer port, or send a block, at a time of the program."""
+        self.port_output.append((self._begin + time, order))
 
     def clock(self, time: float) -> float:
         """Return the world's time, s."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from errormotion.errors import ErrormotionError, InstrumentError
+from errormotion.instruments.simulators.virtual_world.printing import Order, parse_block
 from errormotion.twin.paths import Path
 
 UNDERSTOOD = (
@@ -32,7 +33,6 @@ _WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only thing there is, in units, po
 _ROUNDING = 1e-9  # m
 
 _PRINT = re.compile(r"(?:N\d+\s*)?DPRNT\s*\[(.*)\]")
-_PRINTED = re.compile(r"#(\d+)\s*\[\s*\d(\d)\s*\]")
 _PORT = re.compile(r"(?:N\d+\s*)?(POPEN|PCLOS)")
 _SKIPPED = {"5061": 0, "5062": 1, "5063": 2}  # where the last skip move has ended
 _CLOCK = "3001"  # of the control, milliseconds
@@ -52,8 +52,8 @@ class Peripherals(Protocol):
     def spindle(self, speed: float, time: float) -> None:
         """Turn the spindle, 1/min."""
 
-    def print(self, line: str, time: float) -> None:
-        """Send a line."""
+    def print(self, order: Order, time: float) -> None:
+        """Open or close the printer port, or send a block."""
 
     def clock(self, time: float) -> float:
         """Return what the control's clock shows, s."""
@@ -95,7 +95,9 @@ def interpret(
         try:
             if printed := _PRINT.fullmatch(plain):
                 control.print(printed[1])
-            elif not _PORT.fullmatch(plain):
+            elif port := _PORT.fullmatch(plain):
+                control.switch_port("POPEN" if port[1] == "POPEN" else "PCLOS")
+            else:
                 control.obey(_words(plain))
         except ErrormotionError as error:
             raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}") from None
@@ -170,20 +172,25 @@ class _Control:
             self._advance(values, skipping="G31" in codes)
 
     def print(self, template: str) -> None:
-        """Print a line: positions of the last skip move (mm), the clock (ms), a star as a space, the rest unchanged."""
+        """Print a block, with positions of the last skip move (mm) and the clock (ms)."""
         printer = self._needed("a printer")
 
-        def value(found: re.Match[str]) -> str:
-            if found[1] == _CLOCK:
-                return f"{printer.clock(self._times[-1]) * MILLI:.{int(found[2])}f}"
-            if found[1] not in _SKIPPED:
-                known = ", ".join(f"#{variable}" for variable in (*_SKIPPED, _CLOCK))
-                raise InstrumentError(f"#{found[1]} is not understood; printed are {known}")
+        def value(variable: str) -> float:
+            if variable == _CLOCK:
+                return float(round(printer.clock(self._times[-1]) * MILLI))  # counts milliseconds
+            if variable not in _SKIPPED:
+                known = ", ".join(f"#{each}" for each in (*_SKIPPED, _CLOCK))
+                raise InstrumentError(f"#{variable} is not understood; printed are {known}")
             if self._skipped is None:
                 raise InstrumentError("no skip move, G31, has ended yet")
-            return f"{self._skipped[_SKIPPED[found[1]]] * MM:.{int(found[2])}f}"
+            return float(self._skipped[_SKIPPED[variable]]) * MM
 
-        printer.print(_PRINTED.sub(value, template).replace("*", " "), self._times[-1])
+        printer.print(parse_block(template, value), self._times[-1])
+
+    def switch_port(self, order: Literal["POPEN", "PCLOS"]) -> None:
+        """Open or close the printer port, if there is one."""
+        if self._peripherals is not None:
+            self._peripherals.print(order, self._times[-1])
 
     def _needed(self, what: str) -> Peripherals:
         if self._peripherals is None:

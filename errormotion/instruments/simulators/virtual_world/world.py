@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -147,7 +148,7 @@ class VirtualWorld(Motion):
         """Set the clock, with the axes at rest and nothing in progress."""
         self._set_clock(time)
         self.motion, self.path, self.program, self._warm_up = None, Path.resting(place), "", None
-        self.printed, self._program_events = [], []
+        self.port_output, self._program_events = [], []
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
@@ -286,6 +287,15 @@ def world(name: str = "cframe", seed: int = 0, *, warm: bool = True) -> VirtualW
         if key not in _worlds:
             _worlds[key] = VirtualWorld(name, int(seed), warm=warm)
         return _worlds[key]
+
+
+def let_time_pass(name: str, seed: int, seconds: float, *, warm: bool = True) -> None:
+    """Let time pass in the world of a machine and seed, where there is one and nothing streams in it."""
+    with _lock:
+        found = _worlds.get((name, seed, warm))
+    if found is not None:
+        with suppress(InstrumentError):  # its samples are its clock
+            found.elapse(seconds)
 
 
 def reset() -> None:

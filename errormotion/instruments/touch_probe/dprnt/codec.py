@@ -1,7 +1,8 @@
 """Lines that macros of FANUC controls print with DPRNT, one for each touch.
 
 ``DPRNT[N12*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]`` prints ``N12 X   12.345 Y -  3.210 Z  100.000 T   45210``:
-mm, and milliseconds. Leading zeros are blanks or omitted, the sign precedes the blanks (from memory).
+mm, and milliseconds. Leading zeros are blanks or omitted; the sign precedes the blanks (FANUC, from memory) or the
+digits.
 """
 
 from __future__ import annotations
@@ -36,6 +37,19 @@ class Line:
     position: tuple[float, float, float]
     number: int | None = None
     time: float = math.nan
+
+
+def from_iso_code(raw: bytes) -> bytes:
+    """Return characters of ISO code, whose eighth bit makes the number of ones even, as ASCII.
+
+    Raises
+    ------
+    ProtocolError
+        A character with an odd number of ones.
+    """
+    if any(code.bit_count() & 1 for code in raw):
+        raise ProtocolError(f"Expected characters with even parity (ISO code); found {raw[:60]!r}")
+    return bytes(code & 0x7F for code in raw)
 
 
 def text_of(raw: bytes) -> str:

@@ -12,15 +12,19 @@ from typing import Any, ClassVar
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.driver import Driver
-from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, parse_line, text_of
+from errormotion.instruments.touch_probe.dprnt.codec import LONGEST_LINE, Line, from_iso_code, parse_line, text_of
 from errormotion.instruments.touch_probe.dprnt.matching import REPEATED, contact_of, touch_of
 from errormotion.instruments.touch_probe.dprnt.settings import DprntSettings
 from errormotion.instruments.touch_probe.settings import corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import NOT_MADE, NOWHERE
 from errormotion.instruments.transports import Transport, open_transport
+from errormotion.instruments.transports.quiet import discard_input
 from errormotion.plugins import Contact, Identity, InstrumentInfo, InstrumentSubject, Touch
 
-_LINE_ENDS = {"lf": b"\n", "cr": b"\r"}
+_LINE_ENDS = {
+    "ascii": {"lf": b"\n", "cr": b"\r"},
+    "iso": {"lf": b"\n", "cr": b"\x8d"},  # with even parity
+}
 _LENGTHS = {"mm": 1e-3, "in": 25.4e-3}
 _TIMES = {"ms": 1e-3, "s": 1.0}
 
@@ -42,8 +46,9 @@ class Dprnt(Driver):
     ----------
     last : Contact or None
         The last one.
-    unreadable, repeated, missing : int
-        Number of unreadable lines, lines printed twice, and touches without a line since the driver was made.
+    unreadable, repeated, missing, late : int
+        Number of unreadable lines, lines printed twice, touches without a line, and lines of a cycle that had ended in
+        an error, since the driver was made.
     """
 
     info: ClassVar[InstrumentInfo] = InstrumentInfo(
@@ -64,11 +69,12 @@ class Dprnt(Driver):
     def __init__(self, address: str, settings: DprntSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
         self.last: Contact | None = None
-        self.unreadable = self.repeated = self.missing = 0
+        self.unreadable = self.repeated = self.missing = self.late = 0
         self._contacts = 0
         self._map: PretravelMap | None = None
         self._before: Line | None = None  # the last line
         self._ahead: Line | None = None  # the first line of the next cycle, where one has come
+        self._unfinished_from = 0  # touch at which the last cycle ended in an error; else 0
 
     @property
     def tip_radius(self) -> float:
@@ -101,7 +107,7 @@ class Dprnt(Driver):
         self.settings = settings
 
     def read(self) -> dict[str, Any]:
-        """Return counts so far: ``contacts``, ``unreadable``, ``repeated``, ``missing``, and the last ``contact``.
+        """Return ``contacts``, ``unreadable``, ``repeated``, ``missing``, ``late`` so far, and the last ``contact``.
 
         The contact is X, Y, Z in m, NaN without one, with its ``time`` and ``flag``. Only `measure` reads lines.
         """
@@ -111,6 +117,7 @@ class Dprnt(Driver):
             "unreadable": self.unreadable,
             "repeated": self.repeated,
             "missing": self.missing,
+            "late": self.late,
             "contact": list(self.last.position if self.last else NOWHERE),
             "time": self.last.time if self.last else float("nan"),
             "flag": self.last.flag if self.last else "",
@@ -120,7 +127,8 @@ class Dprnt(Driver):
         """Yield the printed contact of each touch, in order, while the machine's program makes them.
 
         A touch whose line is missing, as later lines show, is ``not made``. Repeated and unreadable lines are
-        ignored and counted. Where the lines of the next cycle start, the rest of this one is missing.
+        ignored and counted. Where the lines of the next cycle start, the rest of this one is missing. After a cycle
+        that ended in an error, its remaining lines are ignored and counted as late, until an earlier touch is printed.
 
         Raises
         ------
@@ -141,10 +149,16 @@ class Dprnt(Driver):
                 line = self._next(self.settings.timeout if due else self.settings.start_timeout, unreadable)
                 index = touch_of(line, touches, due, self._before, self.settings.first_number, self.settings.margin)
             except InstrumentError as error:
+                self._unfinished_from = max(due, self._unfinished_from)
                 raise type(error)(f"{where}: {error}") from error
             if index == REPEATED:
                 self.repeated += 1
                 continue
+            if 0 < self._unfinished_from <= index:
+                self.late += 1
+                self._before = line
+                continue
+            self._unfinished_from = 0
             if index < due:
                 self._ahead, index = line, len(touches)
             else:
@@ -165,12 +179,12 @@ class Dprnt(Driver):
             return line
         end = time.monotonic() + timeout
         pattern = re.compile(self.settings.pattern)
+        code = self.settings.code
+        line_end = _LINE_ENDS[code][self.settings.line_end]
         while True:
             try:
-                raw = self.transport.read_until(
-                    _LINE_ENDS[self.settings.line_end], limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0)
-                )
-                text = text_of(raw)
+                raw = self.transport.read_until(line_end, limit=LONGEST_LINE, timeout=max(end - time.monotonic(), 0.0))
+                text = text_of(from_iso_code(raw) if code == "iso" else raw)
                 if text:
                     units = _LENGTHS[self.settings.length_unit], _TIMES[self.settings.time_unit]
                     return parse_line(text, pattern, length=units[0], time=units[1])
@@ -204,3 +218,7 @@ class Dprnt(Driver):
     def _start_session(self) -> None:
         self._map = self.settings.pretravel_map()
         self._before = self._ahead = None
+        self._unfinished_from = 0
+
+    def _end_session(self) -> None:
+        discard_input(self.transport)  # what PCLOS sends after the last line: a recording is read to its end

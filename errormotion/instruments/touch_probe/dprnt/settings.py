@@ -34,6 +34,9 @@ class DprntSettings(ProbeSettings):
     line_end: Literal["lf", "cr"] = Field(
         default="lf", description="last character of a line: line feed (FANUC), or carriage return (Haas)"
     )
+    code: Literal["ascii", "iso"] = Field(
+        default="ascii", description="characters: ASCII, or ISO code, with even parity in the eighth bit"
+    )
     baudrate: int = Field(default=4800, description="of a serial line", gt=0)
     control: str = Field(default="FANUC", description="name of the control, for the record")
 

@@ -7,7 +7,7 @@
 
 The frames are own code (`modbus.codec`) over the byte transports, so that a session can be recorded and played
 back, and faults can be distinguished. `pymodbus`, whose client owns its socket and waits without a time limit after a
-wrong checksum, is used for the simulated device and in tests.
+wrong checksum, is used in tests only.
 """
 
 from __future__ import annotations

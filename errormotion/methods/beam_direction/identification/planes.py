@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,35 +53,10 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
         Data that do not determine the beam; the message names the plane.
     """
     notes: list[str] = []
-    data = read(raw, settings, notes)
-    fits = [
-        fit_plane_readings(d, s, data.noise, data.speckle, data.speckle_length, settings.robust, name)
-        for name, d, s in zip(data.names, data.distance, data.stage, strict=True)
-    ]
-    factor = _noise_factor(data, fits, settings, notes)
-    planes = Planes(
-        data.names,
-        np.array([fit.gradient for fit in fits]),
-        np.array([fit.offset for fit in fits]),
-        np.array([fit.covariance for fit in fits]) * factor**2,
-    )
-    middle = float(raw["mid_range"]) if "mid_range" in raw else 0.0
-    plain = uncompensated(planes, data.nominal_direction, settings.layout.scale_uncertainty, middle)
-    sensor = sensor_of(raw, settings)
-    if sensor is None:
-        converged = plain
-        notes.append("No inclination compensation: the readings are not corrected for the inclination error.")
-    else:
-        notes += sensor.notes
-        converged = converge(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
-    corrected = _corrected(data, converged, sensor, settings, notes)
-    origin = locate(converged.direction, converged.planes.offsets, converged.planes.covariances, data.points,
-                    data.point_uncertainty)  # fmt: skip
-    found = propagate(converged, origin, data.point_uncertainty)
-    found_covariance = found.covariance * _closure_factor(data, converged, found, notes) ** 2
-    _note_roots(converged, data, notes)
-    _note_origin(data, origin, notes)
-
+    beam = determine(raw, settings, notes)
+    data, fits, factor, sensor = beam.data, beam.fits, beam.factor, beam.sensor
+    converged, plain, origin, found = beam.converged, beam.plain, beam.origin, beam.found
+    found_covariance = found.covariance * beam.closure_factor**2
     influence = found.influence
     total = found_covariance + influence.T @ influence
     p0, u0 = data.nominal_origin, data.nominal_direction
@@ -91,7 +67,7 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     by_source = np.nan_to_num(influence) @ chart.T
     steps = ["gradients by generalised least squares", "maximum likelihood of the direction"]
     steps += [f"inclination compensation, {converged.iterations} iterations"] if sensor is not None else []
-    extras = _extras(data, fits, converged, plain, found, total, corrected, factor, p, settings.beam)
+    extras = _extras(data, fits, converged, plain, found, total, beam.corrected, factor, p, settings.beam)
     if "bar_distance" in raw:
         if not np.isfinite(p).all():
             notes.append(
@@ -128,6 +104,72 @@ def identify_beam(raw: xr.Dataset, settings: Settings, method: str, version: str
     return ds.assign_attrs(notes=notes or [""])
 
 
+@dataclass(frozen=True)
+class Determined:
+    """A beam from readings on planes, and what it was determined from.
+
+    Attributes
+    ----------
+    data, fits : Readings, list of PlaneFit
+    factor : float
+        Of the stated noise.
+    sensor : Sensor or None
+        None without compensation.
+    converged, plain : Converged
+        With and without compensation.
+    corrected : ndarray (plane, reading)
+        Compensated readings, m.
+    origin : Origin or None
+    found : Propagated
+    closure_factor : float
+        Of the uncertainties, where planes contradict one another.
+    """
+
+    data: Readings
+    fits: list[PlaneFit]
+    factor: float
+    sensor: Sensor | None
+    converged: Converged
+    plain: Converged
+    corrected: Array
+    origin: Origin | None
+    found: Propagated
+    closure_factor: float
+
+
+def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determined:
+    """Return the beam; ``notes`` are extended. See `identify_beam` for the errors raised."""
+    data = read(raw, settings, notes)
+    fits = [
+        fit_plane_readings(d, s, data.noise, data.speckle, data.speckle_length, settings.robust, name)
+        for name, d, s in zip(data.names, data.distance, data.stage, strict=True)
+    ]
+    factor = _noise_factor(data, fits, settings, notes)
+    planes = Planes(
+        data.names,
+        np.array([fit.gradient for fit in fits]),
+        np.array([fit.offset for fit in fits]),
+        np.array([fit.covariance for fit in fits]) * factor**2,
+    )
+    middle = float(raw["mid_range"]) if "mid_range" in raw else 0.0
+    plain = uncompensated(planes, data.nominal_direction, settings.layout.scale_uncertainty, middle)
+    sensor = sensor_of(raw, settings)
+    if sensor is None:
+        converged = plain
+        notes.append("No inclination compensation: the readings are not corrected for the inclination error.")
+    else:
+        notes += sensor.notes
+        converged = converge(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
+    corrected = _corrected(data, converged, sensor, settings, notes)
+    origin = locate(converged.direction, converged.planes.offsets, converged.planes.covariances, data.points,
+                    data.point_uncertainty)  # fmt: skip
+    found = propagate(converged, origin, data.point_uncertainty)
+    closure_factor = _closure_factor(data, converged, found, notes)
+    _note_roots(converged, data, notes)
+    _note_origin(data, origin, notes)
+    return Determined(data, fits, factor, sensor, converged, plain, corrected, origin, found, closure_factor)
+
+
 def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     """Return the sensor for the compensation; None without compensation.
 
@@ -140,7 +182,8 @@ def sensor_of(raw: xr.Dataset, settings: Settings) -> Sensor | None:
     """
     if settings.compensation is None:
         return None
-    calibration = InclinationCalibration.find(settings.compensation)
+    given = getattr(settings, "calibration", None)  # drawn anew
+    calibration = InclinationCalibration.find(settings.compensation) if given is None else given
     if "triangulation_normal" not in raw:
         raise MethodError(
             "The inclination compensation needs triangulation_normal(direction) in the raw dataset: the normal of the "

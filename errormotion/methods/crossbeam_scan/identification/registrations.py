@@ -68,7 +68,7 @@ class Registrations:
     reason : ndarray of str, (cycle, artefact)
         Why there is no registration; empty where there is one.
     quality : dict of str to ndarray, (cycle, artefact)
-        residual_rms, noise_found, jitter_z, jitter_y (m), condition, points_used.
+        residual_rms, noise_found, jitter_z, jitter_y (m), condition, points_used, variance_factor.
     time : ndarray, (cycle, artefact)
         Of each scan, s.
     maps : list of Maps or None
@@ -106,7 +106,7 @@ class Maps:
     after: dict[int, Array] = field(default_factory=dict)
 
 
-QUALITY = ("residual_rms", "noise_found", "jitter_z", "jitter_y", "condition", "points_used")
+QUALITY = ("residual_rms", "noise_found", "jitter_z", "jitter_y", "condition", "points_used", "variance_factor")
 
 
 def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, settings: Settings) -> Registrations:
@@ -239,6 +239,7 @@ def _store_quality(result: Registration, warm: BlockMap, quality: dict[str, Arra
         "jitter_y": result.line_jitter[1],
         "condition": result.condition,
         "points_used": result.points,
+        "variance_factor": result.variance_factor,
     }
     for name, value in values.items():
         quality[name][cycle, k] = value

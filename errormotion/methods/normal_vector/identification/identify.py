@@ -52,17 +52,7 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
     notes: list[str] = []
     data = read(raw, settings, notes)
     stated = bool(np.isfinite(data.noise))
-    if stated:
-        data = replace(data, seen=replace(data.seen, weight=data.seen.weight / data.noise**2))
-    motion = _motion(data, settings)
-    cleaned = clean(
-        data.seen,
-        motion,
-        interpolate=settings.interpolate and data.timed,
-        stated=stated,
-        robust=settings.robust,
-        smallest_move=settings.smallest_move,
-    )
+    data, motion, cleaned = fitted(data, settings)
     factor = _noise_factor(cleaned.fit, stated, settings, notes)
     notes += _exclusions(cleaned, data)
     best = _rigid_estimate(cleaned, motion, factor, len(data.seen.cycle_time))
@@ -101,6 +91,23 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
         reference_interval=(float(time[0]), float(time[0])),
     )
     return ds.assign_attrs(notes=notes or [""], tool_axes=data.tool_axes)
+
+
+def fitted(data: Readings, settings: Settings) -> tuple[Readings, Motion, Cleaned]:
+    """Return the readings with their weights, the model of the motion, and its fit without outliers."""
+    stated = bool(np.isfinite(data.noise))
+    if stated:
+        data = replace(data, seen=replace(data.seen, weight=data.seen.weight / data.noise**2))
+    motion = _motion(data, settings)
+    cleaned = clean(
+        data.seen,
+        motion,
+        interpolate=settings.interpolate and data.timed,
+        stated=stated,
+        robust=settings.robust,
+        smallest_move=settings.smallest_move,
+    )
+    return data, motion, cleaned
 
 
 def _motion(data: Readings, settings: Settings) -> Motion:

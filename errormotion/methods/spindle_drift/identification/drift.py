@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+UNSEEN = "rotation about the spindle axis"
+"""Group of the influence of what the method does not see."""
 _UNSEEN_KNOTS = 8
 
 
@@ -129,8 +131,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     if np.linalg.norm(unseen) > 0:
         rows = _unseen(unseen, averages.time, reference)
         influence = np.concatenate([influence, rows])
-        group = "rotation about the spindle axis"
-        names += [(f"{group}, part {k + 1}", group) for k in range(len(rows))]
+        names += [(f"{UNSEEN}, part {k + 1}", UNSEEN) for k in range(len(rows))]
     for note in notes:
         log.warning(note)
     ds = build_errors(
@@ -246,7 +247,7 @@ def _bar(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Bar:
             f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights at "
             "least 1 mm apart."
         )
-    return Bar(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
+    return Bar(*beams_of(raw, settings, notes), float(raw["bar_radius"]), levels)
 
 
 def _fit(mean: Array, bar: Bar) -> State:
@@ -254,7 +255,7 @@ def _fit(mean: Array, bar: Bar) -> State:
     return State(mean, q, *end_point(q, mean[4], bar.origin[4], bar.direction[4], bar.levels))
 
 
-def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
+def beams_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
     """Return origins, directions (5, 3), covariance (5, 6, 6) and the budget's name for it."""
     nominal = settings.beams == "nominal"
     if nominal and "nominal_origin" not in raw:

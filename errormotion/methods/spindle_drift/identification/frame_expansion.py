@@ -116,9 +116,14 @@ def smoothing_sources(warming: FrameWarming, time: Array, length: float, referen
     modelled by knots at this distance (at most ``_MOST_KNOTS``), each one draw, with weights whose squares add up to
     one. The changes are relative to the reference state.
     """
-    knots = int(np.clip(np.ceil(np.ptp(time) / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
-    effects = hats(time, knots) * np.nan_to_num(warming.uncertainty)
+    effects = temperature_knots(warming, time, length)
     return list(effects - effects[:, reference].mean(axis=1, keepdims=True))
+
+
+def temperature_knots(warming: FrameWarming, time: Array, length: float) -> Array:
+    """Return the uncertainty (knot, instant) of the smoothed temperature, K: each knot is one draw."""
+    knots = int(np.clip(np.ceil(np.ptp(time) / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
+    return np.asarray(hats(time, knots) * np.nan_to_num(warming.uncertainty))
 
 
 def hats(time: Array, knots: int) -> Array:

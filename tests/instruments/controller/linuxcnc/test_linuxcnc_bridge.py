@@ -2,6 +2,9 @@
 
 import asyncio
 import json
+import os
+import signal
+import warnings
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,8 +13,10 @@ from typing import Any
 import pytest
 
 from errormotion.instruments.controller.linuxcnc import bridge as module
-from errormotion.instruments.controller.linuxcnc.bridge import Bridge
+from errormotion.instruments.controller.linuxcnc.bridge import Bridge, Client
 
+TOKEN = "0123456789abcdef" * 4
+HELLO = {"id": 0, "op": "hello", "token": TOKEN, "control": True, "client": "one"}
 AXIS = {"min_position_limit": -100.0, "max_position_limit": 100.0}
 
 
@@ -115,6 +120,29 @@ class FakeLinuxCNC:
         self.texts.append((self.OPERATOR_ERROR, text))
 
 
+class Inline:
+    """Sends commands without a process of its own."""
+
+    def __init__(self, fake: FakeLinuxCNC) -> None:
+        self.fake = fake
+
+    def send(self, name: str, *arguments: Any) -> asyncio.Future[int]:
+        done: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        try:
+            getattr(self.fake, name)(*arguments)
+        except Exception as error:  # noqa: BLE001 - as the process does
+            done.set_exception(module.RefusedError(f"{type(error).__name__}: {error}"))
+            done.exception()
+        else:
+            done.set_result(self.fake.serial)
+        return done
+
+
+def made(fake: FakeLinuxCNC, folder: Path, pins: tuple[str, ...] = ("ball",), hal: Any = None) -> Bridge:
+    sender: Any = Inline(fake)
+    return Bridge(fake, hal or FakeHAL(), sender, sender, folder, pins, "load", token=TOKEN)
+
+
 class FakeHAL:
     def __init__(self) -> None:
         self.pins: dict[str, float] = {}
@@ -132,12 +160,21 @@ class FakeHAL:
 class Wire:
     """A client's end: what the bridge writes, line by line."""
 
-    def __init__(self, bridge: Bridge) -> None:
-        self.reader = asyncio.StreamReader(limit=module.MAX_REQUEST_BYTES)
+    def __init__(self, bridge: Bridge, *, greets: bool = True, **hello: Any) -> None:
         self.answers: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self.beats = 0
-        self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0, abort=lambda: None)
-        self.task = asyncio.ensure_future(bridge.serve(self.reader, self))  # type: ignore[arg-type]
+        self.closed = False
+        self.bridge = bridge
+        self.client = Client(bridge)
+        self.client.connection_made(self)
+        if greets:
+            self.feed(json.dumps({**HELLO, **hello}).encode() + b"\n")
+            self.welcome = self.answers.get_nowait()
+
+    def feed(self, data: bytes) -> None:
+        """Have bytes arrive at the bridge."""
+        if not self.closed:
+            self.client.data_received(data)
 
     def write(self, data: bytes) -> None:
         message = json.loads(data)
@@ -146,14 +183,25 @@ class Wire:
         else:
             self.answers.put_nowait(message)
 
-    def is_closing(self) -> bool:
-        return False
+    def get_write_buffer_size(self) -> int:
+        return 0
 
-    def close(self) -> None:
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def pause_reading(self) -> None:
         pass
 
+    def resume_reading(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+    abort = close
+
     def send(self, op: Any, **arguments: Any) -> None:
-        self.reader.feed_data(json.dumps({"id": 7, "op": op, **arguments}).encode() + b"\n")
+        self.feed(json.dumps({"id": 7, "op": op, **arguments}).encode() + b"\n")
 
     async def ask(self, op: Any, **arguments: Any) -> Any:
         """Return the result, or the text of the refusal."""
@@ -163,8 +211,10 @@ class Wire:
         return answer["result"] if answer["ok"] else answer["error"]
 
     async def disconnect(self) -> None:
-        self.reader.feed_eof()
-        await self.task
+        self.close()
+        self.client.connection_lost(None)
+        while self.bridge.job or self.bridge.program:
+            await asyncio.sleep(0.001)
 
 
 Test = Callable[[Wire, FakeLinuxCNC, Bridge], Coroutine[Any, Any, None]]
@@ -180,10 +230,12 @@ def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Test], No
     def run(test: Test) -> None:
         async def session() -> None:
             fake = FakeLinuxCNC()
-            bridge = Bridge(fake, FakeHAL(), tmp_path, ("ball",), "load")
+            bridge = made(fake, tmp_path)
             wire = Wire(bridge)
             await test(wire, fake, bridge)
             await wire.disconnect()
+            for client in list(bridge.clients):
+                client.connection_lost(None)
             assert not bridge.clients
 
         asyncio.run(session())
@@ -200,27 +252,243 @@ def moving_to(fake: FakeLinuxCNC, place: tuple[float, ...]) -> Callable[[str], N
 
 @pytest.mark.parametrize(
     "line",
-    [b"hello", b"\xff\xfe", b"[]", b"{}", b'{"id": 1}', b'{"id": 1, "op": []}', b"null", b"[" * 100000, b"7", b""],
+    [
+        b"hello",
+        b"\xff\xfe",
+        b"[]",
+        b"{}",
+        b'{"id": 1}',
+        b'{"id": 1, "op": []}',
+        b"null",
+        b"[" * 60000,
+        b'{"a":' * 10000,
+        b"7",
+        b"",
+        b'{"id": 1, "op": "move_to", "position": [0, 0, NaN]}',
+        b'{"id": 1, "op": "elapse", "seconds": Infinity}',
+        b'{"id": true, "op": "state"}',
+        b'{"id": "' + b"x" * 65 + b'", "op": "state"}',
+        b"POST / HTTP/1.1",
+    ],
 )
-def test_nothing_that_comes_in_ends_it(play: Callable[[Test], None], line: bytes) -> None:
+def test_the_first_line_that_is_no_request_ends_the_connection_and_not_the_bridge(
+    play: Callable[[Test], None], line: bytes
+) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        wire.reader.feed_data(line + b"\n")
-        assert "expected a request in JSON" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
+        other = Wire(bridge)
+        other.feed(line + b"\n" + b'{"id": 1, "op": "enable"}\n')
+        await asyncio.sleep(0.05)
+        assert other.closed
+        assert other.client not in bridge.clients
+        assert not fake.lines
         assert (await wire.ask("state"))["enabled"] is True
 
     play(test)
 
 
-def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_REQUEST_BYTES", 1000)
-
+@pytest.mark.parametrize("data", [b"G", b"POST / HT", b"\x16\x03\x01", b"OPTIONS * HTTP/1.1\r\n", b"\n"])
+def test_what_looks_like_another_protocol_is_not_waited_for(play: Callable[[Test], None], data: bytes) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        wire.reader.feed_data(b"x" * 5000)
-        await wire.task
-        assert "1000 bytes" in wire.answers.get_nowait()["error"]
-        assert not bridge.clients
+        browser = Wire(bridge, greets=False)
+        browser.feed(data)
+        assert browser.closed
+        assert browser.answers.empty()
 
     play(test)
+
+
+def test_a_web_page_moves_nothing(play: Callable[[Test], None]) -> None:
+    """A POST with requests as its body, as any page in a browser of this computer can send it."""
+    body = b"".join(json.dumps({"id": 1, "op": op}).encode() + b"\n" for op in ("reset", "enable", "home"))
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1:5007\r\nContent-Type: text/plain\r\n\r\n"
+
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        browser = Wire(bridge, greets=False)
+        browser.feed(head + json.dumps(HELLO).encode() + b"\n" + body)
+        await asyncio.sleep(0.05)
+        assert browser.closed
+        assert not fake.lines
+
+    play(test)
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        {"id": 1, "op": "state"},
+        {"id": 1, "op": "estop"},
+        {**HELLO, "token": TOKEN[:-1]},
+        {**HELLO, "token": ""},
+        {**HELLO, "token": None},
+        {**HELLO, "token": "\ud800" * 64},
+        {**HELLO, "control": 1},
+        {**HELLO, "client": "x" * 65},
+        {"id": 0, "op": "hello"},
+    ],
+)
+def test_without_the_token_nothing_is_answered(play: Callable[[Test], None], first: dict[str, Any]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        stranger = Wire(bridge, greets=False)
+        stranger.feed(json.dumps(first).encode() + b'\n{"id": 2, "op": "enable"}\n')
+        await asyncio.sleep(0.05)
+        assert stranger.closed
+        assert stranger.answers.get_nowait()["ok"] is False
+        assert stranger.answers.empty()
+        assert not fake.lines
+
+    play(test)
+
+
+def test_a_stranger_has_little_time(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "HELLO_TIMEOUT", 0.05)
+
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        stranger = Wire(bridge, greets=False)
+        stranger.feed(b'{"id": 1')
+        await asyncio.sleep(0.3)
+        assert stranger.closed
+
+    play(test)
+
+
+def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        other = Wire(bridge)
+        for _ in range(9):
+            other.feed(b"{" + b"x" * 8191)
+        assert other.closed
+        assert "65536 bytes" in other.answers.get_nowait()["error"]
+
+    play(test)
+
+
+def test_the_65th_client_is_refused_and_strangers_take_no_place(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        strangers = [Wire(bridge, greets=False) for _ in range(100)]
+        assert sum(not each.closed for each in strangers) == module.MAX_STRANGERS
+        clients = [Wire(bridge) for _ in range(module.MAX_CLIENTS)]
+        assert [each.closed for each in clients] == [False] * (module.MAX_CLIENTS - 1) + [True]
+        assert "64 clients" in clients[-1].welcome["error"]
+        assert (await clients[0].ask("state"))["enabled"]
+        for each in (*clients, *strangers):
+            each.client.connection_lost(None)
+
+    play(test)
+
+
+# ---------------------------------------------------------------------- control
+
+
+def test_one_client_controls_and_the_others_read_and_stop(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        other = Wire(bridge, client="two")
+        assert wire.welcome["result"]["control"] is True
+        assert other.welcome["result"] == {"protocol": 2, "control": False, "controlled_by": "one"}
+        for op in sorted(bridge._work.keys() - {"identify", "state", "elapse", "finish", "stop", "estop"}):
+            assert "only reads" in await other.ask(op)
+        assert not fake.lines
+        assert (await other.ask("state"))["enabled"]
+        assert await other.ask("stop") is None
+        assert await other.ask("estop") is None
+        assert fake.values.task_state == fake.STATE_ESTOP
+        await wire.disconnect()
+        assert Wire(bridge, client="two").welcome["result"]["control"] is True
+
+    play(test)
+
+
+def test_a_program_has_several_connections_with_its_control(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        assert Wire(bridge).welcome["result"]["control"] is True
+        assert Wire(bridge, control=False).welcome["result"]["control"] is False
+        nameless = Wire(bridge, client="")
+        assert nameless.welcome["result"]["control"] is False
+
+    play(test)
+
+
+def test_who_did_not_ask_for_control_only_reads(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        await wire.disconnect()
+        reader = Wire(bridge, control=False)
+        assert "only reads" in await reader.ask("enable")
+        assert not fake.lines
+
+    play(test)
+
+
+def test_a_number_beyond_a_float_is_refused(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        wire.feed(b'{"id": 7, "op": "move_to", "position": [0, 0, 1e400]}\n')
+        assert "expected a coordinate" in (await wire.answers.get())["error"]
+
+    play(test)
+
+
+# ---------------------------------------------------------------------- floods
+
+
+class Flood(Wire):
+    """A client that sends requests without end, as fast as the bridge reads them."""
+
+    paused = False
+
+    def pause_reading(self) -> None:
+        self.paused = True
+
+    def resume_reading(self) -> None:
+        if self.paused:
+            self.paused = False
+            asyncio.get_running_loop().call_soon(self.refill)
+
+    def refill(self) -> None:
+        """Send as much as one read of a socket takes."""
+        if not (self.paused or self.closed):
+            self.feed(self.data)
+
+    data = b'{"id": 7, "op": "state"}\n' * 10000
+
+
+@pytest.mark.parametrize("op", ["state", "fly", "set_pins"])
+def test_an_estop_waits_for_a_few_requests_of_others_only(play: Callable[[Test], None], op: str) -> None:
+    """Counted, not timed: how many requests are answered between an e-stop and its answer."""
+
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        floods = [Flood(bridge, control=False) for _ in range(module.MAX_CLIENTS - 1)]
+        for each in floods:
+            each.data = Flood.data.replace(b"state", op.encode())
+            each.refill()
+        for _ in range(200):
+            await asyncio.sleep(0)
+        before = sum(each.answers.qsize() for each in floods)
+        assert before > 50
+        await wire.ask("estop")
+        assert fake.values.task_state == fake.STATE_ESTOP
+        assert sum(each.answers.qsize() for each in floods) - before < 20
+        for each in floods:
+            await each.disconnect()
+
+    play(test)
+
+
+def test_a_flood_of_stops_is_one_stop(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        sent: list[str] = []
+        under_way: asyncio.Future[int] = asyncio.get_running_loop().create_future()  # LinuxCNC takes its time
+        bridge.stops = SimpleNamespace(send=lambda name, *_: (sent.append(name), under_way)[1])  # type: ignore[assignment]
+        flood = Flood(bridge, control=False)
+        flood.data = Flood.data.replace(b"state", b"stop")
+        flood.refill()
+        for _ in range(200):
+            await asyncio.sleep(0)
+        assert sent == ["abort"]
+        under_way.set_result(0)
+        await flood.disconnect()
+
+    play(test)
+
+
+# ---------------------------------------------------------------------- orders
 
 
 @pytest.mark.parametrize(
@@ -236,6 +504,15 @@ def test_a_request_without_end_is_hung_up_on(play: Callable[[Test], None], monke
         ("move_to", {"position": [0, 0, 0], "feed": -1}, "feed above 0"),
         ("probe", {"target": [0, 0, 0], "feed": 0.1}, "is at the target"),
         ("probe", {"target": [0, 0, 0.01], "feed": None}, "expected a feed"),
+        ("move_to", {"position": [0, 0, 0], "feed": 1e308}, "at most 10 m/s"),
+        ("move_to", {"position": [0, 0, 0], "feed": 10**400}, "expected a feed"),
+        ("move_to", {"position": [0, 0, 10**400]}, "expected a coordinate"),
+        ("move_to", {"position": [0, 0, 0], "feed_limit": 0}, "feed above 0"),
+        ("probe", {"target": [0, 0, 0.01], "feed": 1e305}, "at most 10 m/s"),
+        ("spindle", {"speed": 1e308}, "at most 1e+06"),
+        ("spindle", {"speed": 10**400}, "expected spindle speed"),
+        ("set_pins", {"pins": {"ball0.x": 10**400}}, "expected a value of the pin"),
+        ("set_pins", {"pins": {"ball0.x": None}}, "expected a value of the pin"),
         ("spindle", {"speed": "fast"}, "expected spindle speed"),
         ("run_program", {"text": 5}, "expected the text"),
         ("elapse", {"seconds": -1}, "expected a time"),
@@ -411,7 +688,7 @@ def test_an_order_beats_until_it_ends_and_others_wait_their_turn(play: Callable[
         assert await other.ask("stop") is None
         assert "aborted: it was stopped" in (await asyncio.wait_for(wire.answers.get(), 10))["error"]
         assert wire.beats >= 1
-        assert fake.lines.count("abort") == 1
+        assert "abort" in fake.lines
         await other.disconnect()
 
     play(test)
@@ -484,3 +761,153 @@ def test_an_error_of_linuxcncs_own_module_is_an_answer(play: Callable[[Test], No
         assert (await wire.ask("state"))["enabled"]
 
     play(test)
+
+
+@pytest.mark.parametrize("stated", ["", ",", "ball,", ",,ball", " , "])
+def test_an_empty_prefix_allows_no_pin(tmp_path: Path, stated: str) -> None:
+    async def test() -> None:
+        hal = FakeHAL()
+        bridge = made(FakeLinuxCNC(), tmp_path, tuple(stated.split(",")), hal)
+        assert "not among those" in await Wire(bridge).ask("set_pins", pins={"spindle.0.speed-in": 1.0})
+        assert not hal.pins
+
+    asyncio.run(test())
+
+
+def test_no_pin_is_set_where_one_is_refused(play: Callable[[Test], None]) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        assert "not among those" in await wire.ask("set_pins", pins={"ball0.x": 1.0, "motion.enable": 1.0})
+        assert not bridge.hal.pins
+
+    play(test)
+
+
+def test_a_long_program_comes_in_parts(play: Callable[[Test], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        texts: list[str] = []
+        fake.on_run = lambda: texts.append(Path(fake.values.file).read_text())
+        await wire.ask("program_part", text="forgotten\n")
+        for part in ("", "G1 X1\n", "G1 X2\n"):
+            assert await wire.ask("program_part", text=part) is None
+        await wire.ask("run_program", text="M2")
+        await wire.ask("finish")
+        assert texts == ["G1 X1\nG1 X2\nM2\n"]
+        monkeypatch.setattr(module, "MAX_PROGRAM_BYTES", 10)
+        assert "at most 10 bytes" in await wire.ask("program_part", text="x" * 11)
+        assert wire.client.program == []
+
+    play(test)
+
+
+@pytest.mark.parametrize(
+    ("limit", "line"),
+    [(None, "G53 G0 "), (0.2, "G53 G0 "), (0.01, "G53 G1 F600.000000 ")],
+)
+def test_a_rapid_move_keeps_the_limit_of_the_feed(play: Callable[[Test], None], limit: float | None, line: str) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        fake.values.max_velocity = 100.0  # mm/s
+        fake.on_mdi = moving_to(fake, (0.0, 0.0, 100.0))
+        await wire.ask("move_to", position=[0, 0, 0.1], feed_limit=limit)
+        assert fake.lines[-1].startswith(line)
+        assert "at most 0.1 m/s" in await wire.ask("move_to", position=[0, 0, 0.1], feed=0.11)
+
+    play(test)
+
+
+# ---------------------------------------------------------------------- token and socket
+
+
+def test_the_token_is_made_once_and_only_its_user_can_read_it(tmp_path: Path) -> None:
+    path = tmp_path / "own" / "token"
+    token = module.own_token(path)
+    assert len(token) == 64
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+    assert module.own_token(path) == token
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644])
+def test_a_token_that_others_can_read_is_refused(tmp_path: Path, mode: int) -> None:
+    path = tmp_path / "own" / "token"
+    module.own_token(path)
+    path.chmod(mode)
+    with pytest.raises(PermissionError, match="nobody else can read"):
+        module.own_token(path)
+
+
+def test_a_folder_that_others_can_write_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o777)
+    with pytest.raises(PermissionError, match="only its user can write"):
+        module.own_token(tmp_path / "token")
+    with pytest.raises(PermissionError, match="only its user can write"):
+        module.unix_socket(tmp_path / "socket")
+
+
+def test_a_token_behind_a_link_or_too_short_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "own" / "token"
+    module.own_token(path)
+    link = path.with_name("link")
+    link.symlink_to(path)
+    with pytest.raises(OSError, match="symbolic links"):
+        module.own_token(link)
+    path.write_text("short\n")
+    with pytest.raises(ValueError, match="at least 32"):
+        module.own_token(path)
+
+
+def test_the_socket_is_its_users_and_one_bridge_listens(tmp_path: Path) -> None:
+    path = tmp_path / "own" / "socket"
+    with module.unix_socket(path) as line:
+        assert path.stat().st_mode & 0o777 == 0o600
+        line.listen()
+        with pytest.raises(FileExistsError, match="another bridge"):
+            module.unix_socket(path)
+    module.unix_socket(path).close()  # left by one that was killed
+    path.unlink()
+    path.write_text("no socket")
+    with pytest.raises(FileExistsError, match="remove the file"):
+        module.unix_socket(path)
+
+
+# ---------------------------------------------------------------------- sending in processes of their own
+
+
+def test_commands_are_sent_by_another_process_and_a_lost_one_ends_the_bridge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "linuxcnc.py").write_text(
+        "import time\n"
+        "class command:\n"
+        "    serial = 0\n"
+        "    def mdi(self, line):\n"
+        "        time.sleep(0.3)  # as LinuxCNC's module, which holds up its process\n"
+        "        self.serial += 1\n"
+        "    def abort(self):\n"
+        "        raise OSError('no LinuxCNC')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+
+    async def test() -> None:
+        lost = asyncio.Event()
+        await sender.connect(lost.set)
+        slow, after = sender.send("mdi", "G0 X0"), sender.send("abort")
+        await asyncio.sleep(0.05)
+        assert not slow.done()  # and this loop went on meanwhile
+        assert await slow == 1
+        with pytest.raises(module.RefusedError, match="no LinuxCNC"):
+            await after
+        os.kill(sender.pid, signal.SIGKILL)
+        with pytest.raises(module.RefusedError, match="has ended"):
+            await sender.send("mdi", "G0 X0")
+        await asyncio.wait_for(lost.wait(), 10)
+        with pytest.raises(module.RefusedError, match="has ended"):
+            await sender.send("mdi", "G0 X0")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # other tests' threads, which the child does not use
+        sender = module.Sender()
+    try:
+        asyncio.run(test())
+    finally:
+        os.waitpid(sender.pid, 0)

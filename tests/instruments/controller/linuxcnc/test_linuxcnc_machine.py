@@ -4,6 +4,7 @@ A computer has room for one LinuxCNC. It is started once, lingers from test to t
 is why the kit and the touch probe try this driver here, and not beside all others.
 """
 
+import importlib.util
 import math
 import threading
 import time
@@ -19,12 +20,14 @@ from errormotion.instruments.controller.linuxcnc import LinuxCNC, LinuxCNCSettin
 from errormotion.instruments.simulators import world
 from errormotion.instruments.simulators.controller import linuxcnc, linuxcnc_process
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
-from errormotion.plugins import Touch
+from errormotion.plugins import MachineLimits, Touch
 from errormotion.testing.instrument_checks import INSTRUMENT_CHECKS
 from errormotion.testing.kit import run_check
 from errormotion.testing.run import subjects_of
 
 ADDRESS = "sim://cframe/linuxcnc?seed=3&linger=30"
+ARMED = LinuxCNCSettings(arm=True)
+STOP_BENCHMARK = Path(__file__).parents[4] / "benchmarks" / "linuxcnc_stop.py"
 CYCLE = 1e-3  # s, of the servo thread
 TOUCH_FEED = 0.03 / 60  # m/s
 FAST = 0.3  # m/s
@@ -43,7 +46,7 @@ def ended() -> Iterator[None]:
 
 @pytest.fixture
 def machine() -> Iterator[LinuxCNC]:
-    with LinuxCNC(ADDRESS) as driver:
+    with LinuxCNC(ADDRESS, ARMED) as driver:
         yield driver
 
 
@@ -113,8 +116,9 @@ def test_turns_the_spindle_which_heats_the_twin(machine: LinuxCNC) -> None:
     [
         ([0.4, 0.0, 0.1], None, "X travels from -0.305"),
         ([0.0, 0.0, -0.1], 0.01, "Z travels from"),
-        ([0.0, 0.0, 0.1], 0.0, "feed above 0"),
-        ([0.0, 0.0], None, "expected a position X, Y, Z"),
+        ([0.0, 0.0, 0.1], 0.0, "finite feed above 0"),
+        ([0.0, 0.0, 0.1], 1.0, "feed above 0 and at most"),
+        ([0.0, 0.0], None, "finite numbers X, Y, Z"),
         ([0.0, 0.0, math.nan], None, "finite"),
     ],
 )
@@ -150,7 +154,7 @@ def test_a_touch_is_where_the_twin_trips_and_at_most_a_cycle_of_travel_behind(ma
 
 def test_a_sideways_touch_and_the_setting_that_puts_it_back() -> None:
     feed, delay = 0.005, 0.5 * CYCLE  # the mean of 0 to 1 cycle
-    with LinuxCNC(ADDRESS, LinuxCNCSettings(trip_delay=delay)) as machine:
+    with LinuxCNC(ADDRESS, LinuxCNCSettings(arm=True, trip_delay=delay)) as machine:
         x, y, z = above(0, 0.0)
         machine.move_to([x, y, z + 0.05])
         machine.move_to([x - 0.05, y + 0.002, z + 0.05])
@@ -221,7 +225,7 @@ def test_running_into_a_ball_stops_the_machine(machine: LinuxCNC) -> None:
 
 def test_an_e_stop_ends_a_move_and_has_to_be_released(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
-    with LinuxCNC(ADDRESS) as other:
+    with LinuxCNC(ADDRESS, ARMED) as other:
         stopper = threading.Thread(target=lambda: (wait_until_moving(other), other.estop()))
         stopper.start()
         with pytest.raises(InstrumentError, match="move to was aborted: e-stop"):
@@ -243,7 +247,7 @@ def test_an_e_stop_ends_a_move_and_has_to_be_released(machine: LinuxCNC) -> None
 
 def test_stop_from_another_thread_ends_a_move(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
-    with LinuxCNC(ADDRESS) as other:
+    with LinuxCNC(ADDRESS, ARMED) as other:
         stopper = threading.Thread(target=lambda: (wait_until_moving(other), machine.stop()))
         stopper.start()
         with pytest.raises(InstrumentError, match="aborted: it was stopped"):
@@ -258,7 +262,7 @@ def test_stop_from_another_thread_ends_a_move(machine: LinuxCNC) -> None:
 def test_a_second_client_reads_but_does_not_interfere(machine: LinuxCNC) -> None:
     machine.move_to(HERE)
     refused = []
-    with LinuxCNC(ADDRESS) as other:
+    with LinuxCNC(ADDRESS, ARMED) as other:
 
         def interfere() -> None:
             wait_until_moving(other)
@@ -275,8 +279,59 @@ def test_a_second_client_reads_but_does_not_interfere(machine: LinuxCNC) -> None
     assert "the machine is busy: move to" in refused[0]
 
 
+def test_without_arm_it_reads_and_may_stop_the_machine(machine: LinuxCNC) -> None:
+    machine.move_to(HERE)
+    with LinuxCNC(ADDRESS) as reader:
+        stopper = threading.Thread(target=lambda: (wait_until_moving(reader), reader.stop()))
+        stopper.start()
+        with pytest.raises(InstrumentError, match="aborted: it was stopped"):
+            machine.move_to(THERE, 0.05)
+        stopper.join()
+        with pytest.raises(InstrumentError, match=r"only reads.*home.*arm = true"):
+            reader.home()
+        answer = reader._order  # past the driver's own check: the bridge refuses as well
+        with pytest.raises(InstrumentError, match="this client only reads"):
+            answer("move_to", position=THERE, feed=None)
+
+
+def test_the_limits_of_the_bench_hold_for_each_order(machine: LinuxCNC) -> None:
+    machine.move_to(HERE)
+    machine.bound(MachineLimits({"X": (HERE[0] - 1e-3, HERE[0] + 1e-3)}, feed=0.01, spindle_speed=100.0))
+    for order in (
+        lambda: machine.move_to(THERE),
+        lambda: machine.probe(THERE, 0.001),
+        lambda: machine.move_to(HERE, 0.02),
+        lambda: machine.spindle(-101.0),
+        lambda: machine.spindle(math.inf),
+    ):
+        with pytest.raises(InstrumentError, match=r"limit|finite"):
+            order()
+    assert machine.state()["position"] == pytest.approx(HERE, abs=1e-9)
+    near = [HERE[0] + 1e-3, *HERE[1:]]
+    assert machine.move_to(near)["duration"] > 1e-3 / 0.01  # a rapid move keeps the limit of the feed
+
+
+def test_an_estop_is_answered_while_others_flood(machine: LinuxCNC) -> None:
+    """`benchmarks/linuxcnc_stop.py` measures it; here the quickest of a few, on a computer with other work to do."""
+    spec = importlib.util.spec_from_file_location("linuxcnc_stop", STOP_BENCHMARK)
+    assert spec is not None
+    assert spec.loader is not None
+    benchmark = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(benchmark)
+    (control,) = [each for each in linuxcnc._controls.values() if each.process.running]
+    where = control.process.socket, control.process.token
+    with benchmark.flooded(*where, 20):
+        found = benchmark.stop_times(*where, 20)
+    deadline = time.monotonic() + 10
+    while not machine.state()["estop"]:
+        assert time.monotonic() < deadline
+    machine.reset()
+    machine.enable()
+    assert min(found) < benchmark.LIMIT
+
+
 def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
-    with LinuxCNC(ADDRESS) as witness, LinuxCNC(f"{ADDRESS}&fault=disconnect&fault_at=2") as machine:
+    with LinuxCNC(ADDRESS, ARMED) as witness, LinuxCNC(f"{ADDRESS}&fault=disconnect&fault_at=2", ARMED) as machine:
         witness.move_to(HERE)
         machine.state()  # after identity and state the wire breaks at the next answer, that of the stop
         ordered = threading.Thread(target=lambda: (wait_until_moving(witness), witness.stop()))
@@ -291,9 +346,9 @@ def test_a_lost_connection_stops_the_move_which_is_not_repeated() -> None:
 
 
 def test_who_hangs_up_in_a_move_ends_it() -> None:
-    with LinuxCNC(ADDRESS) as witness:
+    with LinuxCNC(ADDRESS, ARMED) as witness:
         witness.move_to(HERE)
-        machine = LinuxCNC(ADDRESS)
+        machine = LinuxCNC(ADDRESS, ARMED)
         machine.open()
 
         def move() -> None:
@@ -405,9 +460,9 @@ def test_a_session_is_replayed(machine: LinuxCNC, tmp_path: Path) -> None:
     def session(driver: LinuxCNC) -> list[object]:
         return [driver.move_to(HERE), driver.probe(THERE, 0.2), driver.state()["position"]]
 
-    with LinuxCNC(ADDRESS, record=tmp_path / "session.rec") as driver:
+    with LinuxCNC(ADDRESS, ARMED, record=tmp_path / "session.rec") as driver:
         seen = session(driver)
-    with LinuxCNC(f"replay://{tmp_path / 'session.rec'}") as driver:
+    with LinuxCNC(f"replay://{tmp_path / 'session.rec'}", ARMED) as driver:
         assert session(driver) == seen
 
 
@@ -422,7 +477,9 @@ def test_passes_the_kit(check: object) -> None:
 
 
 def test_a_ball_is_touched_through_linuxcnc() -> None:
-    settings = ControllerProbeSettings(controller="linuxcnc", repeats=2, touch_feed=TOUCH_FEED, clearance=18e-3)
+    settings = ControllerProbeSettings(
+        arm=True, controller="linuxcnc", repeats=2, touch_feed=TOUCH_FEED, clearance=18e-3
+    )
     with ControllerProbe(ADDRESS, settings) as probe:
         here = world("cframe", 3)
         centre = here.machine.balls.nominal[0]
@@ -449,7 +506,7 @@ def test_another_machine_is_refused_while_one_runs(machine: LinuxCNC) -> None:
 
 
 def test_an_ini_file_in_inches_switched_on_and_homed_by_hand_and_nothing_left_behind() -> None:
-    with LinuxCNC("sim://cframe/linuxcnc?seed=3&unit=inch&ready=0&linger=0") as machine:
+    with LinuxCNC("sim://cframe/linuxcnc?seed=3&unit=inch&ready=0&linger=0", ARMED) as machine:
         (control,) = [each for each in linuxcnc._controls.values() if each.process.running]
         folder = control.process.folder
         assert folder.exists()

@@ -88,6 +88,11 @@ class SimulatedAgent:
             raise
         self.url = self._server.url
 
+    @property
+    def driver_url(self) -> str:
+        """Address of the agent in a bench file."""
+        return f"http://{self.url.partition('://')[2]}/"
+
     def close(self) -> None:
         """End the agent; with the last device of its world the world ends."""
         self._server.close()

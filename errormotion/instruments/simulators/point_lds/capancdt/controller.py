@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
 from errormotion.instruments.simulators.point_lds.capancdt.commands import (
     CHANNELS,
@@ -26,8 +25,8 @@ from errormotion.instruments.simulators.point_lds.capancdt.frames import (
     raw_values,
     with_functions,
 )
+from errormotion.instruments.simulators.point_lds.data_port import BeamStream, DataPortDevice
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import TcpServer
 
 Array = np.ndarray[Any, Any]
 
@@ -45,7 +44,7 @@ FIRST_COUNT = 100_000
 """Counter of the first value: the controller has been on for a while."""
 
 
-class SimulatedCapaNCDT(SimulatedDevice):
+class SimulatedCapaNCDT(DataPortDevice):
     """A controller; the device's name is the beam of its first sensor, X1 X2 Y1 Y2 or Z.
 
     While a target is set in the world, all its sensors ride on the stage and look at that. A beam that the machine does
@@ -57,16 +56,10 @@ class SimulatedCapaNCDT(SimulatedDevice):
     (commands of an earlier user without ``$``, joined by semicolons: ``left=TRG1;AVT3;AVN8``), ``time_limit`` (s, 10),
     ``password`` (empty), ``frames`` (of a block at most, 256), ``greeting`` (line that a client of the commands gets).
 
-    Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (FFFFFF),
-    ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
-    counts answers.
+    ``out_of_range`` gives FFFFFF.
     """
 
-    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
-    drops_answers = False
-
     def __init__(self, address: Address) -> None:
-        self._mute = False
         self._timer: threading.Timer | None = None
         self._streams: tuple[_Channel, ...] = ()
         self._once = 0  # single frames that are due
@@ -75,16 +68,7 @@ class SimulatedCapaNCDT(SimulatedDevice):
         self._values: Array = np.zeros(CHANNELS, dtype=np.int64)
         self._averaging = Averaging(0, 2)
         super().__init__(address, line_end=LINE_END, default_name="X1", every=1000)
-        self._mute = self.fault.kind == "silence" and self.fault.from_the_start
-        try:
-            self._set_up(address)
-            self._data = TcpServer(f"{self.name}-data", _ignore, self._data_connected)
-        except (InstrumentError, ValueError) as error:
-            super().close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
-        self._data.start()
-        self.urls = {"data": self._data.url}
-        self.port = int(self._data.url.rsplit(":", 1)[1])
+        self._open_data_port(address, self._set_up, self._data_connected)
 
     def _set_up(self, address: Address) -> None:
         beams = address.params.get("beams", self.name).split(",")
@@ -266,24 +250,17 @@ class SimulatedCapaNCDT(SimulatedDevice):
             each.taken, each.ended = taken, True
 
     def _deliver(self, frames: Array) -> None:
-        fault, first = self.fault, self._sent
+        first = self._sent
         numbers = first + np.arange(len(frames))
-        active = numbers >= fault.at
-        if fault.kind == "out_of_range":
-            frames[active & ((fault.length == 0) | (numbers < fault.at + fault.length))] = FULL_SCALE
-        if fault.kind in ("silence", "disconnect"):
-            frames = frames[~active]
+        frames[self._beyond_range(numbers)] = FULL_SCALE
+        frames = frames[self._sent_frames(numbers)]
         values, channels = with_functions(self._averaging(frames), tuple(self.sensors), self.settings)
         if len(values):
             self._values[[channel - 1 for channel in channels]] = values[-1]
-        heard = all(self._data.send(piece) for piece in fault.pieces(self._bytes(values, channels, first)))
+        more = self._transmit(self._bytes(values, channels, first), numbers)
         self._sent += len(numbers)
-        if fault.kind == "disconnect" and active.any():
-            self._data.disconnect()
-            heard = False
-        self._mute = self._mute or (fault.kind == "silence" and bool(active.any()))
         for each in self._streams:
-            each.ended = each.ended or not heard or self._mute
+            each.ended = each.ended or not more
 
     def _bytes(self, values: Array, channels: tuple[int, ...], first: int) -> bytes:
         """Return values as blocks, with the faults of the content; each gap starts a new block."""
@@ -299,23 +276,16 @@ class SimulatedCapaNCDT(SimulatedDevice):
         return data
 
 
-class _Channel:
-    """The stream of one channel: a `Stream` of the virtual world.
+class _Channel(BeamStream):
+    """The samples of one channel.
 
     ``pending`` is shared by those that start together.
     """
 
-    sync = "NONE"
-
     def __init__(
         self, controller: SimulatedCapaNCDT, pending: list[Array], sensor: Sensor, rate: float, *, last: bool
     ) -> None:
-        self.channel = sensor.beam
-        self.measuring_range = sensor.range * 1e-6
-        self.rate = rate
-        self.start = self.position = 0
-        self.taken: int | None = None
-        self.ended = False
+        super().__init__(sensor.beam, rate, sensor.range * 1e-6)
         self._controller = controller
         self._pending = pending
         self._last = last
@@ -327,7 +297,3 @@ class _Channel:
             complete = self._pending[:]
             self._pending.clear()
             self._controller.pass_on(self, complete)
-
-
-def _ignore(data: bytes) -> None:
-    """Nothing is received on the data port."""

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.faults import stray_bytes
 from errormotion.instruments.simulators.point_lds.confocaldt.commands import COMMANDS, ERRORS, MODELS
 from errormotion.instruments.simulators.point_lds.confocaldt.values import (
@@ -22,9 +21,9 @@ from errormotion.instruments.simulators.point_lds.confocaldt.values import (
     raw_values,
     states,
 )
+from errormotion.instruments.simulators.point_lds.data_port import BeamStream, DataPortDevice
 from errormotion.instruments.simulators.point_lds.optoncdt.grammar import Command, RefusalError, split
 from errormotion.instruments.transports import Address
-from errormotion.instruments.transports.serving import TcpServer
 
 Array = np.ndarray[Any, Any]
 
@@ -46,7 +45,7 @@ _NEUTRAL = frozenset({"ECHO", "STDUSER", "IPCONFIG", "DARKCORRTHRES"})
 """Settings that leave running values as they are."""
 
 
-class SimulatedConfocal(SimulatedDevice):
+class SimulatedConfocal(DataPortDevice):
     """A controller with one sensor; the device's name is its beam.
 
     The line ``data`` (in ``urls``) has the values, from the moment on at which OUTPUT is ETHERNET, MEASTRANSFER is
@@ -57,16 +56,10 @@ class SimulatedConfocal(SimulatedDevice):
     user, joined by semicolons: ``left=OUTADD_ETH STATE;ECHO OFF``), ``frames`` (of a block at most), ``header``
     (``bytes`` or ``frames``: which size comes first).
 
-    Faults from the menu: ``silence``, ``split``, ``garbage`` (stray bytes between blocks), ``out_of_range`` (no peak),
-    ``drop`` (frames are missing, as the counter shows), ``disconnect`` (of the data port): they count frames; ``late``
-    counts answers.
+    ``out_of_range`` gives no peak.
     """
 
-    faults = ("silence", "split", "garbage", "out_of_range", "drop", "disconnect", "late")
-    drops_answers = False
-
     def __init__(self, address: Address) -> None:
-        self._mute = False
         self._stream: _Values | None = None
         self._counter = FIRST_COUNT
         self._seconds = 0.0
@@ -74,16 +67,7 @@ class SimulatedConfocal(SimulatedDevice):
         self._low, self._high = np.inf, -np.inf
         self._reference: float | None = None
         super().__init__(address, line_end=b"\n", default_name="X1", every=1000)
-        self._mute = self.fault.kind == "silence" and self.fault.from_the_start
-        try:
-            self._set_up(address)
-            self._data = TcpServer(f"{self.name}-data", _ignore, self._data_connected)
-        except (InstrumentError, ValueError) as error:
-            super().close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
-        self._data.start()
-        self.urls = {"data": self._data.url}
-        self.port = int(self._data.url.rsplit(":", 1)[1])
+        self._open_data_port(address, self._set_up, self._data_connected)
 
     def _set_up(self, address: Address) -> None:
         self.model_name = address.params.get("model", "IFC2451")
@@ -313,24 +297,17 @@ class SimulatedConfocal(SimulatedDevice):
                 self._deliver(stream, distances.astype(float))
 
     def _deliver(self, stream: _Values, distances: Array) -> None:
-        fault, first = self.fault, stream.sent
+        first = stream.sent
         numbers = first + np.arange(len(distances))
-        active = numbers >= fault.at
-        if fault.kind == "out_of_range":
-            distances[active & ((fault.length == 0) | (numbers < fault.at + fault.length))] = np.nan
+        distances[self._beyond_range(numbers)] = np.nan
         frames, names = self._framed(self._averaging(distances))
-        lost = np.array([fault.hits("drop", int(number)) for number in numbers], dtype=bool)
-        if fault.kind in ("silence", "disconnect"):
-            frames, lost = frames[~active], lost[~active]
-        heard = all(self._data.send(piece) for piece in fault.pieces(self._bytes(frames, names, lost, first)))
+        lost = np.array([self.fault.hits("drop", int(number)) for number in numbers], dtype=bool)
+        kept = self._sent_frames(numbers)
+        more = self._transmit(self._bytes(frames[kept], names, lost[kept], first), numbers)
         stream.sent += len(numbers)
         self._counter += len(numbers)
         self._seconds += len(numbers) / stream.rate
-        if fault.kind == "disconnect" and active.any():
-            self._data.disconnect()
-            heard = False
-        self._mute = self._mute or (fault.kind == "silence" and bool(active.any()))
-        stream.ended = stream.ended or not heard or self._mute
+        stream.ended = stream.ended or not more
 
     def _framed(self, distances: Array) -> tuple[Array, tuple[str, ...]]:
         """Return the frames of distances, shape (frame, value), and the names of their values."""
@@ -397,18 +374,12 @@ class SimulatedConfocal(SimulatedDevice):
         return data
 
 
-class _Values:
-    """The values of the sensor: a `Stream` of the virtual world."""
-
-    sync = "NONE"
+class _Values(BeamStream):
+    """The values of the sensor."""
 
     def __init__(self, controller: SimulatedConfocal, channel: str, rate: float, measuring_range: float) -> None:
-        self.channel = channel
-        self.measuring_range = measuring_range
-        self.rate = rate
-        self.start = self.position = self.sent = 0
-        self.taken: int | None = None
-        self.ended = False
+        super().__init__(channel, rate, measuring_range)
+        self.sent = 0
         self._controller = controller
 
     def push(self, distances: Array) -> None:
@@ -420,7 +391,3 @@ def _nanometres(lengths: Array) -> Array:
     return np.where(np.isfinite(lengths), np.rint(np.nan_to_num(lengths, posinf=0, neginf=0) * 1e9), NO_PEAK).astype(
         np.int64
     )
-
-
-def _ignore(data: bytes) -> None:
-    """Nothing is received on the data port."""

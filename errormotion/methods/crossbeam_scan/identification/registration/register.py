@@ -129,6 +129,7 @@ def register(
         line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
         condition=free.condition, loose=free.loose, iterations=found.steps,
         extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,
+        variance_factor=found.noise.k,
     )  # fmt: skip
 
 

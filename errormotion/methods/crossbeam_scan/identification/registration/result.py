@@ -75,6 +75,7 @@ class Registration:
     extra: Array
     joint_covariance: Array
     cold_share: float
+    variance_factor: float = 1.0
 
     @property
     def twist(self) -> Array:

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure as Drawing
 
-from errormotion.compare.text import cause_text, probability, verdict
-from errormotion.report.canvas import COLOURS, GREEN, WIDTH, curve, draw
+from errormotion.compare.report.picture import abscissa, common, field, height, paint
+from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
+from errormotion.report.canvas import WIDTH, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
 from errormotion.report.write import write_page
-
-PANEL = 1.9
-"""Height of a panel, inches."""
 
 
 def write(comparison: xr.Dataset, out: Path) -> Path:
@@ -35,8 +32,9 @@ def part(ds: xr.Dataset, key: str) -> Part:
         _key_figures(ds),
         lines,
         [
-            Section("curves", "Errors on common ground", [_curves(ds, key)] if _common(ds) else [_values(ds)]),
+            Section("curves", "Errors on common ground", [_curves(ds, key)] if common(ds) else [_values(ds)]),
             Section("pairs", "Pairs", pairs),
+            *_repeats(ds),
             Section(
                 "ground", "Common ground", [Text(_ground(ds)), *[Text(note) for note in ds.attrs["notes"] if note]]
             ),
@@ -56,67 +54,13 @@ def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
     ]
 
 
-def _common(ds: xr.Dataset) -> str:
-    dims = [str(dim) for dim in ds["consensus"].dims if dim != "dof"]
-    return dims[0] if dims else ""
-
-
-def _abscissa(ds: xr.Dataset) -> tuple[np.ndarray, str, bool]:
-    dim = _common(ds)
-    if dim == "time":
-        return np.asarray(ds["time"].values) / 60.0, "time / min", True
-    for name in ("x", "y", "z"):
-        if dim == "position" and name in ds.coords and ds[name].dims == (dim,):
-            return np.asarray(ds[name].values) * 1e3, f"{name.upper()} / mm", True
-    return np.arange(ds.sizes[dim]), f"{dim} number", False
-
-
 def _curves(ds: xr.Dataset, key: str) -> Figure:
-    x, label, joined = _abscissa(ds)
-    names = [str(name) for name in ds["dof"].values]
-    u = 2 * np.sqrt(np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1))
-    values, en = ds["value"].values, ds["en"].values
-
-    def paint(drawing: Drawing) -> None:
-        panels = drawing.subplots(len(names) + 1, 1, sharex=True, gridspec_kw={"hspace": 0.12})
-        drawing.subplots_adjust(left=0.1, right=0.82, top=0.985, bottom=0.06)
-        for k, (axes, name) in enumerate(zip(panels, names, strict=False)):
-            factor, unit = _field(name)
-            for i, dataset in enumerate(ds["dataset"].values):
-                colour = COLOURS[i % len(COLOURS)]
-                if joined:
-                    curve(axes, x, factor * values[i, :, k], factor * u[i, :, k], colour=colour)
-                else:
-                    shift = 0.12 * (i - (len(values) - 1) / 2)
-                    axes.errorbar(
-                        x + shift,
-                        factor * values[i, :, k],
-                        yerr=factor * u[i, :, k],
-                        fmt="o",
-                        ms=2.5,
-                        lw=0.8,
-                        color=colour,
-                    )
-                if k == 0:
-                    axes.plot([], [], color=colour, label=str(dataset))
-            axes.set_ylabel(f"{name} / {unit}")
-        panels[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-        last = panels[-1]
-        last.axhspan(-1, 1, color=GREEN, alpha=0.12, linewidth=0)
-        for j in range(en.shape[0]):
-            worst = np.nanmax(np.abs(np.nan_to_num(en[j])), axis=1)
-            last.plot(x, worst, color=COLOURS[(j + len(values)) % len(COLOURS)], lw=1, label=str(ds["pair"].values[j]))
-        last.set_ylim(0, max(1.5, float(np.nanmax(np.abs(en), initial=0.0)) * 1.08))
-        last.set_ylabel("largest |En|")
-        last.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
-        last.set_xlabel(label)
-
-    svg = draw(paint, f"{key}-compare", PANEL * (len(names) + 1), WIDTH)
+    svg = draw(lambda figure: paint(figure, ds), f"{key}-compare", height(ds), WIDTH)
     return Figure(
         svg,
-        "Errors of each dataset with expanded uncertainty (k = 2), and the largest normalised error |En| of each pair; "
-        "the datasets agree where it is below 1 (green).",
-        "Curves of all datasets over " + label,
+        "Left: errors of each dataset with expanded uncertainty (k = 2). Right: normalised error En of each pair; the "
+        "datasets agree where it is between -1 and 1 (green).",
+        f"Curves of all datasets over {abscissa(ds)[1]}, and their normalised errors",
     )
 
 
@@ -124,7 +68,7 @@ def _values(ds: xr.Dataset) -> Table:
     rows: list[Sequence[Cell | str]] = []
     u = 2 * np.sqrt(np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1))
     for k, name in enumerate(str(each) for each in ds["dof"].values):
-        factor, unit = _field(name)
+        factor, unit = field(name)
         for i, dataset in enumerate(ds["dataset"].values):
             rows.append(
                 [name, str(dataset), f"{factor * ds['value'].values[i, k]:.3f}", f"{factor * u[i, k]:.3f}", unit]
@@ -167,6 +111,23 @@ def _cause_blocks(ds: xr.Dataset) -> list[Block]:
     return found
 
 
+def _repeats(ds: xr.Dataset) -> list[Section]:
+    """Return the section of repeatability and reproducibility; none without groups."""
+    rows: list[Sequence[Cell | str]] = [list(row) for row in spreads(ds)]
+    if not rows:
+        return []
+    groups: dict[str, list[str]] = {}
+    for name, group in zip(ds["dataset"].values, ds["group"].values, strict=True):
+        groups.setdefault(str(group), []).append(str(name))
+    text = "Groups: " + "; ".join(f"{group} ({', '.join(names)})" for group, names in groups.items()) + "."
+    caption = (
+        "Standard deviations over all points. Found: from the differences of the datasets. Stated: what their "
+        "uncertainties let expect. p: probability of a larger spread if these are right. Shared by all: uncertainty of "
+        "sources that all groups have in common, which no repeat shows."
+    )
+    return [Section("repeats", "Repeatability and reproducibility", [Text(text), Table(caption, SPREAD_HEAD, rows)])]
+
+
 def _ground(ds: xr.Dataset) -> str:
     point = ", ".join(f"{1e3 * float(each):g}" for each in np.atleast_1d(ds.attrs["functional_point"]))
     text = (
@@ -178,10 +139,6 @@ def _ground(ds: xr.Dataset) -> str:
             f" All errors are changes since {float(ds.attrs['since']):g} s after {ds.attrs.get('start') or 'time 0'}."
         )
     return text
-
-
-def _field(freedom: str) -> tuple[float, str]:
-    return (1e6, "um") if freedom in ("EX", "EY", "EZ") else (648000 / np.pi, "arcsec")
 
 
 def chapters(source: Any) -> list[Part]:

@@ -1,0 +1,20 @@
+"""Comparisons: rates of agreeing methods, planted mistakes, interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from validation.comparisons import left_out, planted, rates
+from validation.comparisons.pool import Pool
+
+TITLE = "Comparison"
+SEEDS = 200
+
+
+def section(seeds: int, workers: int = 1, cache: Path | None = None) -> Iterator[str]:
+    """Yield the lines of the section."""
+    pool = Pool(workers, cache)
+    yield from ("### Datasets that agree", "", *rates.section(seeds, pool), "")
+    yield from ("### Planted mistakes", "", *planted.section(max(seeds // 2, 1), pool), "")
+    yield from ("### Instants that were left out", "", *left_out.section(max(seeds // 4, 1), pool))

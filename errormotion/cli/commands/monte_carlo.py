@@ -1,0 +1,95 @@
+"""``errormotion identify --monte-carlo``: the uncertainty of one result by the Monte Carlo method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from errormotion import datasets
+from errormotion.cli.output import show, table
+from errormotion.cli.progress import Bars
+from errormotion.errors import DatasetError, MethodError
+from errormotion.montecarlo.result import lines
+
+EVALUATION = ".monte_carlo.nc"
+"""Ending of the file of an evaluation, beside that of the errors."""
+
+
+def trials_of(text: str) -> int | None:
+    """Return the number of trials, None for ``auto``."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError as error:
+        raise MethodError(f"--monte-carlo: expected 'auto' or a number of trials; found '{text}'") from error
+
+
+def beside(out: Path) -> Path:
+    """Return the file of the evaluation of a result; MethodError where it exists."""
+    file = out.with_suffix(EVALUATION)
+    if file.exists():
+        raise DatasetError(f"{file}: exists already, and a result is never overwritten; give another name to --out")
+    return file
+
+
+def evaluate(
+    raw: Path,
+    method_id: str,
+    settings: Any,
+    errors: xr.Dataset,
+    out: Path,
+    bars: Bars,
+    *,
+    trials: int | None,
+    digits: int,
+    seed: int,
+    scheduler: str | None,
+    workers: int | None,
+) -> xr.Dataset:
+    """Evaluate a result; its trials are kept in a folder beside ``out`` while the evaluation is in work."""
+    from errormotion import montecarlo
+
+    folder = out.with_suffix(".trials")
+    try:
+        found = montecarlo.evaluate(
+            raw, method_id, settings, errors, folder, trials=trials, digits=digits, seed=seed,
+            scheduler=scheduler or "threads", workers=workers, progress=bars,
+        )  # fmt: skip
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(f"The trials are kept in {folder}; repeat the command to continue.") from error
+    datasets.save(found, beside(out))
+    return found
+
+
+def summary(found: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the verdicts for ``--json``, SI."""
+    return [
+        {
+            "freedom": line.name,
+            "verdict": line.word,
+            "linear_uncertainty": line.linear_uncertainty,
+            "uncertainty": line.uncertainty,
+            "difference": line.distance,
+            "tolerance": line.tolerance,
+            "place": line.place,
+        }
+        for line in lines(found)
+    ]
+
+
+def show_evaluation(found: xr.Dataset, file: Path) -> None:
+    """Print what the evaluation says of each freedom."""
+    from errormotion.montecarlo.report import texts
+
+    percent = 100 * float(found.attrs["probability"])
+    show(
+        f"{file}: Monte Carlo (JCGM 101), {int(found.attrs['trials'])} trials, seed {int(found.attrs['seed'])}, "
+        f"{percent:g} % intervals"
+    )
+    show(table(*texts(found)))
+    for note in found.attrs["notes"]:
+        if note:
+            show(f"  note: {note}")

@@ -1,0 +1,227 @@
+"""Normal equations of a consensus: each dataset is reduced to its information once, whichever datasets are combined.
+
+The covariance of a dataset is ``D + F F'``. Its sources are nuisance parameters z with variance 1 beside the errors x:
+
+    x-x: W = D^-1        x-z: W F        z-z: 1 + F' W F        right-hand sides: W y, F' W y
+
+They are summed over the datasets. W is block diagonal. The normal matrix of x is inverted by points, and what remains
+are the sources: memory and time are linear in the points. Where the datasets have more sources than values (many short
+datasets), the sources that only one dataset has are eliminated first, and what remains are the values and the shared
+sources.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+
+from errormotion.arrays import Array, filled
+from errormotion.compare.stack import Estimate
+
+FLOOR = 1e-9
+"""Variance of its own that every known value gets at least, as a share of its total variance."""
+MOST_VALUES = 6000
+"""Number of values (points by freedoms) up to which a matrix of all of them is formed: 300 MB."""
+CONVERGED = 1e-10
+"""Residual at which the conjugate gradients of the datasets left out end, relative to the right-hand side."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Errors with their covariance ``own`` (n, d, d) plus ``influence`` (k, n, d), and the sum of squares."""
+
+    value: Array
+    own: Array
+    influence: Array
+    seen: NDArray[np.bool_]
+    square: float
+
+
+@dataclass(frozen=True)
+class Information:
+    """What one dataset says: ``W`` (n, d, d), sources ``F`` (n, d, s) in the columns ``place``, values (n, d)."""
+
+    W: Array
+    F: Array
+    WF: Array
+    inner: Array  # F' W F
+    place: NDArray[np.intp]
+    y: Array
+    Wy: Array
+    known: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, each: Estimate, keys: dict[str, int]) -> Information:
+        """Reduce an estimate; a value without any variance is exact by definition, and says nothing."""
+        total = filled(each.variance())
+        known = each.known & (total > 0)
+        own = filled(each.own) + FLOOR * total[:, :, None] * np.eye(total.shape[1])
+        W = _inverse(own, known)
+        F = np.where(known[..., None], filled(np.moveaxis(each.influence, 0, -1)), 0.0)
+        WF = np.matmul(W, F)
+        y = np.where(known, filled(each.value), 0.0)
+        place = np.array([keys[key] for key in each.source], dtype=np.intp)
+        s = F.shape[-1]
+        n = F.shape[0] * F.shape[1]  # -1 is undefined where there is no source
+        inner = F.reshape(n, s).T @ WF.reshape(n, s)
+        return cls(W, F, WF, inner, place, y, np.matmul(W, y[..., None])[..., 0], known)
+
+    @property
+    def square(self) -> float:
+        """Weighted square of the values."""
+        return float((self.y * self.Wy).sum())
+
+
+def solve(parts: Sequence[Information], sources: int) -> Solution:
+    """Return the generalised least squares of some datasets, by elimination of the values."""
+    n, d = parts[0].y.shape
+    A, right = np.zeros((n, d, d)), np.zeros((n, d))
+    B, M, moved = np.zeros((n, d, sources)), np.eye(sources), np.zeros(sources)
+    for each in parts:
+        A += each.W
+        right += each.Wy
+        B[..., each.place] += each.WF
+        M[np.ix_(each.place, each.place)] += each.inner
+        moved[each.place] += each.F.reshape(n * d, -1).T @ each.Wy.ravel()
+    seen = np.diagonal(A, axis1=1, axis2=2) > 0
+    own = _inverse(A, seen)
+    AB = np.matmul(own, B)
+    inner = M - B.reshape(n * d, -1).T @ AB.reshape(n * d, -1)
+    root = np.linalg.cholesky((inner + inner.T) / 2)
+    plain = np.matmul(own, right[..., None])[..., 0]
+    # z = inner^-1 (F' W y - B' plain)
+    gradient = moved - B.reshape(n * d, -1).T @ plain.ravel()
+    half = np.linalg.inv(root)
+    z = half.T @ (half @ gradient)
+    influence = np.moveaxis((AB.reshape(n * d, -1) @ half.T).reshape(n, d, -1), -1, 0)
+    square = sum(each.square for each in parts) - float((right * plain).sum()) - float(gradient @ z)
+    return Solution(plain - AB @ z, own, influence, seen, square)
+
+
+def short(parts: Sequence[Information], sources: int) -> bool:
+    """Whether `Reduced` is quicker: many datasets of few values; its memory grows with the square of the values."""
+    m, size = len(parts), parts[0].y.size
+    rounds = 10  # of the conjugate gradients
+    by_sources = m * sources**2 * size * 2
+    by_values = size**3 / 3 + sources * size**2 + rounds * m * size**2 * 4
+    return m > 2 and size <= MOST_VALUES and by_values < by_sources
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Datasets whose own sources are eliminated: values and shared sources remain, (n d + g)."""
+
+    W: Array  # (m, n, d, d)
+    U: Array  # (m, n d, p): the information of a dataset is W - U U'
+    S: Array  # (m, n d, g): shared sources
+    y: Array  # (m, n d)
+    factor: Array  # (n d + g, n d + g): Cholesky factor of the normal matrix, lower
+    x: Array  # (n d + g,)
+    seen: NDArray[np.bool_]  # (n, d)
+    square: float
+
+    @classmethod
+    def of(cls, parts: Sequence[Information], sources: int) -> Reduced:
+        """Reduce the datasets and solve for all of them."""
+        n, d = parts[0].y.shape
+        count = np.bincount(np.concatenate([each.place for each in parts]), minlength=sources)
+        common = np.flatnonzero(count > 1)
+        own = [count[each.place] == 1 for each in parts]
+        U = np.zeros((len(parts), n * d, max(int(mask.sum()) for mask in own)))
+        S = np.zeros((len(parts), n * d, len(common)))
+        for i, (each, mask) in enumerate(zip(parts, own, strict=True)):
+            k = int(mask.sum())
+            root = np.linalg.cholesky(np.eye(k) + each.inner[np.ix_(mask, mask)])
+            U[i, :, :k] = each.WF[..., mask].reshape(n * d, k) @ np.linalg.inv(root).T
+            S[i][:, np.searchsorted(common, each.place[~mask])] = each.F[..., ~mask].reshape(n * d, -1)
+        W, y = np.array([each.W for each in parts]), np.array([each.y.ravel() for each in parts])
+        size = n * d
+        flat = np.swapaxes(U, 0, 1).reshape(size, -1)
+        N = np.zeros((size + len(common),) * 2)
+        N[:size, :size] = -flat @ flat.T
+        blocks = N[:size, :size].reshape(n, d, n, d)
+        blocks[np.arange(n), :, np.arange(n), :] += W.sum(axis=0)
+        seen = np.diagonal(W.sum(axis=0), axis1=1, axis2=2) > 0
+        unseen = np.flatnonzero(~seen.ravel())
+        N[unseen, unseen] = 1.0
+        WS = np.stack([_applied(W, U, S[..., k]) for k in range(len(common))], axis=-1) if len(common) else S
+        N[:size, size:] = WS.sum(axis=0)
+        N[size:, :size] = N[:size, size:].T
+        N[size:, size:] = np.eye(len(common)) + np.tensordot(S, WS, axes=((0, 1), (0, 1)))
+        factor = cholesky(N, lower=True, overwrite_a=True)
+        Wy = _applied(W, U, y)
+        right = np.concatenate([Wy.sum(axis=0), np.tensordot(S, Wy, axes=((0, 1), (0, 1)))])
+        x = cho_solve((factor, True), right)
+        return cls(W, U, S, y, factor, x, seen, float((y * Wy).sum() - right @ x))
+
+    def solution(self) -> Solution:
+        """Return the result as a low rank covariance of the values alone."""
+        n, d = self.seen.shape
+        rows = solve_triangular(self.factor, np.eye(len(self.x))[:, : n * d], lower=True)
+        influence = rows.reshape(-1, n, d)
+        influence[:, ~self.seen] = 0.0
+        return Solution(self.x[: n * d].reshape(n, d), np.zeros((n, d, d)), influence, self.seen, self.square)
+
+    def falls(self) -> Array:
+        """Return by how much the sum of squares falls without each dataset, (m,).
+
+        With the residuals r and the information V of a dataset, ``T = (1, S)`` and the normal matrix N of all, the fall
+        is ``r' V r + w' (N - T' V T)^-1 w`` with ``w = T' V r``. The systems are solved together by conjugate gradients
+        with N as the preconditioner: it differs from each matrix by the share of one dataset.
+        """
+        residual = self._values(np.broadcast_to(self.x, (len(self.y), len(self.x)))) - self.y
+        weighted = _applied(self.W, self.U, residual)
+        w = self._gradient(weighted)
+        t, r = np.zeros_like(w), w.copy()
+        p = z = cho_solve((self.factor, True), r.T).T
+        rz = (r * z).sum(axis=1)
+        first = rz.copy()
+        for _ in range(2 * len(self.x)):
+            active = rz > CONVERGED**2 * first
+            if not active.any():
+                break
+            Np = self._product(p)
+            step = np.where(active, rz / np.where(active, (p * Np).sum(axis=1), 1.0), 0.0)[:, None]
+            t, r = t + step * p, r - step * Np
+            z = cho_solve((self.factor, True), r.T).T
+            last, rz = rz, (r * z).sum(axis=1)
+            p = z + np.where(active, rz / np.where(active, last, 1.0), 0.0)[:, None] * p
+        found: Array = (residual * weighted).sum(axis=1) + (w * t).sum(axis=1)
+        return found
+
+    def _values(self, x: Array) -> Array:
+        """Return what each dataset should state for parameters (m, n d + g)."""
+        size = self.y.shape[1]
+        found: Array = x[:, :size] + np.matmul(self.S, x[:, size:, None])[..., 0]
+        return found
+
+    def _gradient(self, weighted: Array) -> Array:
+        return np.concatenate([weighted, np.matmul(np.swapaxes(self.S, 1, 2), weighted[..., None])[..., 0]], axis=1)
+
+    def _product(self, p: Array) -> Array:
+        """Return the normal matrix without each dataset times its row of (m, n d + g)."""
+        whole = (self.factor @ (self.factor.T @ p.T)).T
+        return whole - self._gradient(_applied(self.W, self.U, self._values(p)))
+
+
+def _applied(W: Array, U: Array, v: Array) -> Array:
+    """Return ``(W - U U') v`` of each dataset, (m, n d)."""
+    m, n, d = W.shape[:3]
+    blocks = np.matmul(W, v.reshape(m, n, d, 1)).reshape(m, n * d)
+    inner = np.matmul(v[:, None, :], U)  # (m, 1, p)
+    found: Array = blocks - np.matmul(U, np.swapaxes(inner, 1, 2))[..., 0]
+    return found
+
+
+def _inverse(matrices: Array, kept: NDArray[np.bool_]) -> Array:
+    """Return the inverses (n, d, d) over the kept rows and columns, 0 elsewhere."""
+    both = kept[:, :, None] & kept[:, None, :]
+    scale = np.sqrt(np.where(kept, np.diagonal(matrices, axis1=1, axis2=2), 1.0))
+    outer = scale[:, :, None] * scale[:, None, :]
+    whole = np.where(both, matrices / outer, np.eye(matrices.shape[1]))
+    found: Array = np.where(both, np.linalg.inv(whole) / outer, 0.0)
+    return found

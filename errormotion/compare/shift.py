@@ -1,0 +1,139 @@
+"""A shift in time between two datasets: its effect from the smooth course of one of them, and its size.
+
+With the course E(t) of the first dataset the second one, whose clock is late by s, states E(t - s), and the difference
+of the changes since the first common instant is ``E(t) - E(t - s)`` less the same at this instant. The course is a
+smoothing spline over all instants of a dataset, also those before and after the common ones; its residuals are as large
+as the noise. Beyond the record it is constant. The effect is not linear in s: sizes are tried, and the best one is
+refined by Gauss and Newton.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import BSpline, splrep
+
+from errormotion.arrays import Array, products
+from errormotion.compare.low_rank import Whitener
+from errormotion.datasets.reduction import influence_of
+from errormotion.kinematics.iso import DOF
+
+SMALLEST = 1.0
+"""Smallest shift that is tried, s."""
+TRIES = 16
+"""Shifts of each sign that are tried, up to a quarter of the common time."""
+REFINEMENTS = 12
+
+
+class Shift(NamedTuple):
+    """Shift of the second dataset with its standard uncertainty, s, and the fall of the sum of squares."""
+
+    value: float
+    standard_uncertainty: float
+    gain: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """Smooth errors of one dataset over the common time axis, one curve for each freedom.
+
+    Attributes
+    ----------
+    curves : tuple of BSpline
+    first, last : float
+        Of the record, s.
+    instants : int
+        Number of values that it was made of.
+    """
+
+    curves: tuple[BSpline, ...]
+    first: float
+    last: float
+    instants: int
+
+    def __call__(self, time: Array) -> Array:
+        """Return the errors at instants, (n, d)."""
+        inside = np.clip(time, self.first, self.last)
+        return np.stack([np.asarray(curve(inside), dtype=float) for curve in self.curves], axis=-1)
+
+    def effect(self, time: Array, shift: float, sign: float) -> Array:
+        """Return the difference of changes that a shift of the second dataset makes; sign -1: of its own course."""
+        found = sign * (self(time) - self(time - sign * shift))
+        changed: Array = found - found[0]
+        return changed
+
+
+def smooth(time: Array, values: Array, u: Array) -> Course | None:
+    """Return the smooth course of values (n, d) with standard uncertainties (n, d); None where too few are known."""
+    curves = []
+    for y, sigma in zip(values.T, u.T, strict=True):
+        known = np.isfinite(y) & np.isfinite(sigma)
+        if known.sum() < 4:
+            return None
+        least = max(float(sigma[known].max()), 1e-6 * float(np.ptp(y[known])), np.finfo(float).tiny)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a curve that is less smooth than asked for serves as well
+            weights = 1 / np.maximum(sigma[known], 1e-3 * least)
+            t, c, k = splrep(time[known], y[known], w=weights, s=float(known.sum()))
+        curves.append(BSpline(t, c, k, extrapolate=True))
+    return Course(tuple(curves), float(time[0]), float(time[-1]), len(time))
+
+
+def course_of(ds: xr.Dataset, freedoms: Sequence[str]) -> Course | None:
+    """Return the course of a dataset over time."""
+    columns = [DOF.index(name) for name in freedoms]
+    own = np.asarray(ds["covariance"].values, dtype=float) - products(influence_of(ds))
+    u = np.sqrt(np.maximum(np.diagonal(own, axis1=1, axis2=2), 0.0))
+    values = np.stack([ds[name].values for name in freedoms], axis=-1)
+    return smooth(np.asarray(ds["time"].values, dtype=float), values, u[:, columns])
+
+
+def fitted(course: Course, sign: float, time: Array, difference: Array, white: Whitener) -> Shift | None:
+    """Return the shift that explains a difference (n, d) best; None where the course does not change.
+
+    Parameters
+    ----------
+    course : Course
+    sign : float
+        1: the course is that of the first dataset of the pair; -1: of the second.
+    time : ndarray, (n,)
+        s.
+    difference : ndarray, (n, d)
+        First less second dataset; NaN where unknown.
+    white : Whitener
+        Of its covariance.
+    """
+    known = np.isfinite(difference)
+
+    def effect(shift: float) -> Array:
+        return np.where(known, course.effect(time, shift, sign), 0.0)
+
+    sizes = np.geomspace(SMALLEST, max(float(np.ptp(time)) / 4, 2 * SMALLEST), TRIES)
+    tries = np.concatenate([-sizes[::-1], sizes])
+    squares = [white.square(difference - effect(shift)) for shift in tries]
+    best = int(np.argmin(squares))
+    shift, least = float(tries[best]), squares[best]
+    information = 0.0
+    for _ in range(REFINEMENTS):
+        step = max(SMALLEST, 0.02 * abs(shift))
+        slope = (effect(shift + step) - effect(shift - step)) / (2 * step)
+        both = np.stack([slope, difference - effect(shift)])
+        normal = white.product(both, both)
+        information = float(normal[0, 0])
+        if not information > 0:
+            return None
+        move = float(normal[0, 1]) / information
+        while abs(move) > 0.01 / np.sqrt(information):
+            square = white.square(difference - effect(shift + move))
+            if square < least:
+                break
+            move /= 2
+        else:
+            break
+        shift, least = shift + move, square
+    return Shift(shift, float(1 / np.sqrt(information)), white.square(difference) - least)

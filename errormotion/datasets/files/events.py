@@ -1,0 +1,181 @@
+"""Notes of people on a run or on a machine: ``events.jsonl``, one JSON object on each line, only ever appended to."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime, timedelta
+from io import BufferedRandom
+from pathlib import Path
+from typing import Any
+
+from errormotion.errors import RunError
+
+FILE = "events.jsonl"
+LARGEST_FILE = 1 << 20
+"""Bytes of a file of notes; it is read to this size, and takes no note beyond."""
+LONGEST_TEXT = 1000
+"""Characters of a note."""
+LONGEST_NAME = 100
+"""Characters of the name of an author or a machine."""
+CLOCK_ERROR = timedelta(days=1)
+"""How far in the future the time of an event may be."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One note.
+
+    Attributes
+    ----------
+    text : str
+        Printable, one line.
+    noted : str
+        When the note was made, ISO 8601 in UTC.
+    at : str
+        When it happened, ISO 8601 in UTC; empty: at the time of the run.
+    by : str
+        Who noted it; empty if unknown.
+    machine : str
+        The machine; empty for the machine of the run.
+    """
+
+    text: str
+    noted: str
+    at: str = ""
+    by: str = ""
+    machine: str = ""
+
+
+def event(text: str, *, by: str = "", at: datetime | None = None, machine: str = "") -> Event:
+    """Return a note that was made now.
+
+    Parameters
+    ----------
+    text, by, machine : str
+        See `Event`.
+    at : datetime, optional
+        When it happened; without a time zone it is UTC.
+
+    Raises
+    ------
+    RunError
+        A text that is empty, too long, or not printable on one line; a time in the future.
+    """
+    now = datetime.now(UTC)
+    made = Event(text.strip(), _iso(now), "", by.strip(), machine.strip())
+    if at is not None:
+        at = at.replace(tzinfo=UTC) if at.tzinfo is None else at.astimezone(UTC)
+        if at > now + CLOCK_ERROR:
+            raise RunError(f"time of the event: expected a time in the past; found {_iso(at)}")
+        made = Event(made.text, made.noted, _iso(at), made.by, made.machine)
+    if wrong := _mistake(asdict(made)):
+        raise RunError(wrong)
+    return made
+
+
+def append(folder: Path, made: Event) -> Path:
+    """Append a note to the file of a folder, and return the file.
+
+    Raises
+    ------
+    RunError
+        The file cannot be written, or is full.
+    """
+    file = folder / FILE
+    line = json.dumps({key: value for key, value in asdict(made).items() if value}, ensure_ascii=False) + "\n"
+    data = line.encode()
+    try:
+        with file.open("ab+") as stream, _locked(stream):
+            size = stream.seek(0, os.SEEK_END)
+            if size + len(data) + 1 > LARGEST_FILE:
+                raise RunError(f"{file}: holds {size} bytes; it takes no more than {LARGEST_FILE}")
+            if size:
+                stream.seek(-1, os.SEEK_END)
+                if stream.read(1) != b"\n":  # a line that was never completed stays by itself
+                    data = b"\n" + data
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        raise RunError(f"{file}: the note cannot be written: {error.strerror}") from error
+    return file
+
+
+def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
+    """Return the notes of a folder in their order, and a sentence for each line that is no note."""
+    file = folder / FILE
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(LARGEST_FILE + 1)
+    except FileNotFoundError:
+        return (), ()
+    except OSError as error:
+        return (), (f"{file}: cannot be read: {error.strerror}",)
+    if len(data) > LARGEST_FILE:
+        return (), (f"{file}: expected at most {LARGEST_FILE} bytes; it is larger",)
+    found, wrong = list[Event](), list[str]()
+    for number, line in enumerate(data.decode(errors="replace").split("\n"), 1):
+        if not line.strip():
+            continue
+        made = from_plain(line)
+        if isinstance(made, Event):
+            found.append(made)
+        else:
+            wrong.append(f"{file}, line {number}: {made}")
+    return tuple(found), tuple(wrong)
+
+
+def from_plain(line: Any) -> Event | str:
+    """Return the note of a line or of a JSON object, or what is wrong with it."""
+    if isinstance(line, str):
+        try:
+            line = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            return f"is not valid JSON ({error})"
+    if not isinstance(line, dict):
+        return f"expected an object; found {type(line).__name__}"
+    known = {each.name: line.get(each.name, "") for each in fields(Event)}
+    return _mistake(known) or Event(**known)
+
+
+def _mistake(values: dict[str, Any]) -> str:
+    """Return what is wrong with the fields of a note; empty for nothing."""
+    for name, value in values.items():
+        longest = LONGEST_TEXT if name == "text" else LONGEST_NAME
+        if not isinstance(value, str) or len(value) > longest or not value.isprintable():
+            return f"{name}: expected one line of at most {longest} printable characters"
+    if not values["text"]:
+        return "text: expected at least one character; found none"
+    for name in ("noted", "at"):
+        if (values[name] or name == "noted") and instant(values[name]) is None:
+            return f"{name}: expected a time such as 2026-03-31T08:00:00+00:00; found '{values[name]}'"
+    return ""
+
+
+def instant(text: str) -> datetime | None:
+    """Return a time in UTC; None for a text that is none. Without a time zone it is UTC."""
+    try:
+        time = datetime.fromisoformat(text)
+        return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _iso(time: datetime) -> str:
+    return time.isoformat(timespec="seconds")
+
+
+@contextmanager
+def _locked(stream: BufferedRandom) -> Iterator[None]:
+    """Hold other processes off a file; the lock ends when it is closed."""
+    try:
+        import fcntl
+    except ImportError:  # Windows: no lock
+        yield
+        return
+    fcntl.flock(stream, fcntl.LOCK_EX)
+    yield

@@ -1,0 +1,106 @@
+"""The last check of an order before it reaches a machine: armed, finite, within the limits of the bench."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+
+from pydantic import Field
+
+from errormotion.errors import InstrumentError
+from errormotion.plugins import MachineLimits, PluginSettings
+
+_ROUNDING = 1e-9
+"""Tolerance of positions, m, and share of feeds and speeds."""
+
+log = logging.getLogger(__name__)
+
+
+class ArmedSettings(PluginSettings):
+    """Settings of an instrument that can move or change a machine."""
+
+    arm: bool = Field(
+        default=False, description="whether the driver may move and change the machine; without it, it only reads"
+    )
+
+
+class Door:
+    """Checks each order of a driver.
+
+    Parameters
+    ----------
+    name, address : str
+        The driver and its device, for messages.
+
+    Attributes
+    ----------
+    limits : MachineLimits
+        Those of the bench; none at first.
+    """
+
+    def __init__(self, name: str, address: str) -> None:
+        self._where = f"{name} at {address}"
+        self._announced = False
+        self.limits = MachineLimits()
+
+    def admit(self, arm: bool, what: str) -> None:
+        """Refuse an order unless the driver is armed; log the first one.
+
+        Raises
+        ------
+        InstrumentError
+            It is not armed.
+        """
+        if not arm:
+            raise InstrumentError(
+                f"{self._where} only reads, and this order changes the machine: {what}. Nothing was sent. Set "
+                "arm = true for the instrument in the bench file (arm=True in its settings) if it may"
+            )
+        if not self._announced:
+            self._announced = True
+            log.info("%s is armed (%s); its first order: %s", self._where, self.limits, what)
+
+    def position(self, place: Sequence[float], what: str = "position") -> list[float]:
+        """Return X, Y, Z, m; InstrumentError unless they are finite and within the limits."""
+        try:
+            found = [float(x) for x in place]
+        except (TypeError, ValueError, OverflowError):
+            found = []
+        if len(found) != 3 or not all(map(math.isfinite, found)):
+            raise InstrumentError(f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {place!r}")
+        for axis, x in zip("XYZ", found, strict=True):
+            span = self.limits.spans.get(axis)
+            if span is not None and not span[0] - _ROUNDING <= x <= span[1] + _ROUNDING:
+                raise InstrumentError(
+                    f"{self._where}: {axis} would go to {1e3 * x:.6g} mm; the limits of the bench are "
+                    f"{1e3 * span[0]:.6g} and {1e3 * span[1]:.6g} mm. Nothing was sent"
+                )
+        return found
+
+    def feed(self, feed: float) -> float:
+        """Return a feed, m/s; InstrumentError unless it is finite, above 0 and within the limits."""
+        return self._bounded(feed, "feed", self.limits.feed, 6e4, "mm/min", positive=True)
+
+    def speed(self, speed: float) -> float:
+        """Return a spindle speed, 1/min; InstrumentError unless it is finite and within the limits."""
+        return self._bounded(speed, "spindle speed", self.limits.spindle_speed, 1.0, "/min")
+
+    def _bounded(
+        self, value: float, what: str, limit: float | None, scale: float, unit: str, positive: bool = False
+    ) -> float:
+        try:
+            found = float(value)
+        except (TypeError, ValueError, OverflowError):
+            found = math.nan
+        if not math.isfinite(found * scale) or (positive and found <= 0):
+            above = " above 0" if positive else ""
+            raise InstrumentError(
+                f"{self._where}: expected a finite {what}{above}; found {str(value)[:60]}. Nothing was sent"
+            )
+        if limit is not None and abs(found) > limit * (1 + _ROUNDING):
+            raise InstrumentError(
+                f"{self._where}: the {what} would be {found * scale:.6g} {unit}; the limit of the bench is "
+                f"{limit * scale:.6g} {unit}. Nothing was sent"
+            )
+        return found

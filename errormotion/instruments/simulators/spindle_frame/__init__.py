@@ -1,0 +1,1 @@
+"""Simulated frames of sensors around a bar."""

@@ -1,0 +1,115 @@
+"""What a control prints: the grammar of ``DPRNT[...]`` and the characters that two makers' controls send for it.
+
+Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT
+2000M/99M Programmer's Manual, p. 193 (digits before and behind the point, ISO code with even parity, line feed). The
+form of FANUC is from memory; see ``docs/reference/devices/dprnt.md``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from errormotion.errors import InstrumentError
+
+MOST_PLACES = 8  # of a number, before and behind its point together
+
+Control = Literal["haas", "fanuc"]
+Zeros = Literal["blank", "none"]
+
+_NUMBER = re.compile(r"#(\d+)\s*\[\s*(\d)(\d)\s*\]")
+_TEXT = re.compile(r"[A-Z0-9+\-/* ]*")
+
+
+@dataclass(frozen=True)
+class Number:
+    """A variable of a block: its value, and its places before and behind the point."""
+
+    value: float
+    whole: int
+    decimals: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """One ``DPRNT[...]``: texts and numbers in their order."""
+
+    parts: tuple[str | Number, ...]
+
+    def text(self, control: Control = "haas", zeros: Zeros = "blank") -> str:
+        """Return the characters without the end of the block, as a control of a maker writes them.
+
+        ``zeros`` is for FANUC: leading zeros as blanks, with a place for the sign, or not at all.
+        """
+        return "".join(
+            part.replace("*", " ") if isinstance(part, str) else _written(part, control, zeros) for part in self.parts
+        )
+
+
+Order = Block | Literal["POPEN", "PCLOS"]
+
+
+def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
+    """Return the block between the brackets of ``DPRNT[...]``.
+
+    Parameters
+    ----------
+    template : str
+        Such as ``X#5061[53]*Y#5062[53]``.
+    value_of : callable
+        Returns the value of a variable, given its number; may raise an InstrumentError.
+
+    Raises
+    ------
+    InstrumentError
+        A character that a control cannot print, a variable without a format, a format with no or too many places.
+    """
+    parts: list[str | Number] = []
+    place = 0
+    while place < len(template):
+        if number := _NUMBER.match(template, place):
+            parts.append(_number(number, value_of))
+            place = number.end()
+        elif text := _matched(template, place):
+            parts.append(text)
+            place += len(text)
+        elif template[place] == "#":
+            raise InstrumentError(f"'{template[place:][:12]}': expected a variable with its format, such as #5061[53]")
+        else:
+            raise InstrumentError(f"'{template[place]}' cannot be printed; expected letters, digits, + - / and *")
+    return Block(tuple(parts))
+
+
+def _matched(template: str, place: int) -> str:
+    found = _TEXT.match(template, place)
+    return found[0] if found else ""
+
+
+def _number(found: re.Match[str], value_of: Callable[[str], float]) -> Number:
+    whole, decimals = int(found[2]), int(found[3])
+    if not 0 < whole + decimals <= MOST_PLACES:
+        raise InstrumentError(f"'{found[0]}': expected 1 to {MOST_PLACES} places in all; found {whole + decimals}")
+    return Number(value_of(found[1]), whole, decimals)
+
+
+def _written(number: Number, control: Control, zeros: Zeros) -> str:
+    magnitude = f"{abs(number.value):.{number.decimals}f}"
+    if not number.decimals:
+        magnitude = str(math.trunc(abs(number.value)))  # the printed example: 1.5436 with [40] is 1
+    negative = number.value < 0 and float(magnitude) != 0
+    if control == "haas":
+        width = number.whole + (number.decimals + 1 if number.decimals else 0)
+        return ("-" * negative + magnitude).rjust(width)
+    digits, point, fraction = magnitude.partition(".")
+    digits = (digits[-number.whole :] if number.whole else digits[-1]).lstrip("0") or "0"
+    if zeros == "none":
+        return "-" * negative + digits + point + fraction
+    return ("-" if negative else " ") + digits.rjust(number.whole) + point + fraction
+
+
+def in_iso_code(text: bytes) -> bytes:
+    """Return characters in ISO code: seven bits, and the eighth so that their number of ones is even."""
+    return bytes(code | (code.bit_count() & 1) << 7 for code in text)

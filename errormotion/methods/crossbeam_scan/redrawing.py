@@ -1,0 +1,199 @@
+"""Sources of scans, drawn anew for the Monte Carlo method: noise of points and lines, pose, lever, scales.
+
+Scans of the pocket state no noise. Their lines are drawn with replacement, which has the scatter that they have.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.cutting import Scans
+from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.methods.crossbeam_scan.identification.registrations import register_all
+from errormotion.methods.crossbeam_scan.identification.scans import cold_cycles, rig_of
+from errormotion.plugins import Redraw, Redrawing
+
+if TYPE_CHECKING:
+    from numpy.random import Generator
+
+    from errormotion.arrays import Array
+    from errormotion.methods.crossbeam_scan.identification.carriage import Rig
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
+RADIUS_UNCERTAINTY = 1e-6
+"""Standard uncertainty of the radius of a pocket, m, where the data state none."""
+HEIGHT = ("cycle", "artefact", "profile", "point")
+
+
+def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:  # noqa: ARG001 - one signature
+    """Return the scans with their sources.
+
+    Raises
+    ------
+    MethodError
+        The carriage follows a guide: how far it does is an assumption that no reading contains.
+    """
+    if "pocket_radius" in raw:
+        return _pocket(raw, settings)
+    if settings.strain == "guided":
+        raise MethodError(
+            "The Monte Carlo method needs strain = 'free' or 'rigid': how closely the carriage follows its guide is "
+            "an assumption that is not drawn."
+        )
+    reduced = _scans(raw)
+    sources = {"heights": _heights(reduced, settings, cold_cycles(raw, reduced.sizes["cycle"]))}
+    rig = rig_of(raw)
+    if rig.pose_covariance is not None:
+        sources["profiler pose"] = _pose(rig)
+    if rig.lever_uncertainty.any():
+        sources["lever"] = _lever(rig)
+    if settings.scale_uncertainty > 0:
+        sources["scale of the profiler"] = _strain(settings.scale_uncertainty, together=False)
+    if settings.expansion_uncertainty > 0:
+        sources["expansion of the artefacts"] = _strain(settings.expansion_uncertainty, together=True)
+    return Redrawing(reduced, settings.model_copy(update={"moved": "keep"}), sources)
+
+
+def _scans(raw: xr.Dataset) -> xr.Dataset:
+    """Return the scans of a campaign in memory, cut out of a record where it is one."""
+    scans = Scans(raw)
+    cut: dict[tuple[int, int], tuple[Array, Array, float]] = {}
+    for place in np.ndindex(scans.cycles, scans.artefacts):
+        try:
+            height, _, y, time = scans.scan(*place)
+        except MethodError:
+            continue
+        cut[place] = height, y, time
+    lines = max(len(y) for _, y, _ in cut.values())
+    shape = (scans.cycles, scans.artefacts, lines)
+    height = np.full((*shape, raw.sizes["point"]), np.nan, dtype=np.float32)
+    y, time = np.full(shape, np.nan), np.full(shape[:2], np.nan)
+    for place, (h, along, when) in cut.items():
+        height[(*place, slice(len(along)))], y[(*place, slice(len(along)))], time[place] = h, along, when
+    known = np.isfinite(time).any(axis=1)
+    when = np.arange(scans.cycles, dtype=float)
+    when[known] = [float(np.nanmean(row)) for row in time[known]]
+    kept = (
+        "x",
+        "position",
+        "profiler_pose",
+        "lever",
+        "lever_uncertainty",
+        "pose_covariance",
+        "height_noise",
+        "warm_up",
+    )
+    reduced = raw[[name for name in kept if name in raw.variables]].load()
+    return reduced.assign(
+        height=(HEIGHT, height, {"units": "m"}), y=(HEIGHT[:3], y, {"units": "m"}), time=("cycle", when, {"units": "s"})
+    )
+
+
+def _heights(raw: xr.Dataset, settings: Settings, cold: list[int]) -> Redraw:
+    """Return the noise of the points, and the jitter of the lines along z and along the feed.
+
+    The noise of the points is raised to the variance of their blocks: what neighbouring points have in common is drawn
+    as if they were independent, with the same effect on a block. The jitter that a registration finds is that of both
+    scans; half of its variance is the cold scan's.
+    """
+    quality = register_all(Scans(raw), cold, float(raw["height_noise"]), settings).quality
+    warm = [c for c in range(raw.sizes["cycle"]) if c not in cold]
+    factor, jitter_z, jitter_y = (quality[name].copy() for name in ("variance_factor", "jitter_z", "jitter_y"))
+    for values, both in ((factor, 1.0), (jitter_z, 2.0), (jitter_y, 2.0)):
+        values[cold] = np.where(np.isfinite(values[cold]), values[cold], np.nan_to_num(values[warm]).mean(axis=0))
+        values /= np.sqrt(both)
+    noise = np.nan_to_num(quality["noise_found"] * np.sqrt(factor))
+    jitter = np.nan_to_num(np.stack([jitter_z, jitter_y], axis=-1))
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        height = raw["height"].transpose(*HEIGHT).values.copy()
+        y = raw["y"].transpose(*HEIGHT[:3]).values
+        for (c, k), white in np.ndenumerate(noise):
+            scan = height[c, k]
+            lines = generator.normal(size=(2, len(scan), 1)) * jitter[c, k][:, None, None]
+            change = white * generator.standard_normal(scan.shape, dtype=np.float32) + lines[0]
+            if jitter[c, k, 1] > 0:
+                change += lines[1] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[c, k]))
+            scan += change.astype(np.float32)
+        return raw.assign(height=(HEIGHT, height, raw["height"].attrs)), settings
+
+    return Redraw(draw, groups=("cold scan",), own=True)
+
+
+def _pitch(y: Array) -> float:
+    return float(np.nanmedian(np.diff(y)))
+
+
+def _pose(rig: Rig) -> Redraw:
+    values, factor = calibration.parameters(rig.pose), chain.root(rig.pose_covariance)
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        a, b, g, dx, dy, dz = values + generator.normal(size=6) @ factor
+        matrix = calibration.pose(a, b, g, dx, dy, dz).as_matrix()
+        return raw.assign(profiler_pose=(("row", "column"), matrix)), settings
+
+    return Redraw(draw, groups=("profiler pose",))
+
+
+def _lever(rig: Rig) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        lever = rig.lever + rig.lever_uncertainty * generator.normal(size=3)
+        return raw.assign(lever=("direction", lever, raw["lever"].attrs)), settings
+
+    return Redraw(draw, groups=("lever",))
+
+
+def _strain(relative: float, *, together: bool) -> Redraw:
+    """Return scales of x and z that each scan has on its own, or the expansion of x, y and z ``together``.
+
+    A surface that is wider by e has the height z - e x dz/dx at x.
+    """
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        height = raw["height"].transpose(*HEIGHT).values.copy()
+        x, y = raw["x"].values, raw["y"].transpose(*HEIGHT[:3]).values
+        for place in np.ndindex(height.shape[:2]):
+            scan, along = height[place], np.nan_to_num(y[place])
+            e = relative * (np.full(3, generator.normal()) if together else generator.normal(size=3) * (1, 0, 1))
+            across = np.nan_to_num(np.gradient(scan, axis=1) / np.median(np.diff(x)))
+            change = e[2] * np.nan_to_num(scan) - e[0] * x * across
+            if e[1]:
+                change -= e[1] * along[:, None] * np.nan_to_num(np.gradient(scan, axis=0) / _pitch(y[place]))
+            scan += change.astype(np.float32)
+        return raw.assign(height=(HEIGHT, height, raw["height"].attrs)), settings
+
+    return Redraw(draw, own=True)
+
+
+def _pocket(raw: xr.Dataset, settings: Settings) -> Redrawing:
+    """Return scans of the pocket: their lines with replacement, and radius and centre as they are known."""
+    radius = float(raw["pocket_radius_uncertainty"]) if "pocket_radius_uncertainty" in raw else RADIUS_UNCERTAINTY
+    sources = {"lines": Redraw(_lines, own=True), "radius of the pocket": _shift("pocket_radius", radius)}
+    if "pocket_centre_uncertainty" in raw:
+        centre = np.asarray(raw["pocket_centre_uncertainty"].values, dtype=float)
+        sources["centre of the pocket"] = _shift("pocket_centre", centre)
+    return Redrawing(raw.load(), settings, sources)
+
+
+def _lines(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+    """Return every scan with as many of its own lines, drawn with replacement."""
+    scans = []
+    for number in range(raw.sizes["scan"]):
+        drawn = np.sort(generator.integers(0, raw.sizes["profile"], raw.sizes["profile"]))
+        scans.append(raw[["height", "stage"]].isel(scan=number, profile=drawn))
+    chosen = xr.concat(scans, "scan")
+    return raw.assign({name: chosen[name].transpose(*raw[name].dims) for name in ("height", "stage")}), settings
+
+
+def _shift(name: str, uncertainty: Array | float) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        value = raw[name]
+        change = uncertainty * generator.normal(size=value.shape)
+        return raw.assign({name: value.copy(data=value.values + change)}), settings
+
+    return Redraw(draw, own=True)

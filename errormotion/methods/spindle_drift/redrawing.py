@@ -1,0 +1,177 @@
+"""Sources of a drift record or of a detection of beams, drawn anew for the Monte Carlo method."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.datasets.files.hashing import DatasetHasher
+from errormotion.methods.spindle_drift.identification.detection import segmented
+from errormotion.methods.spindle_drift.identification.drift import UNSEEN, beams_of
+from errormotion.methods.spindle_drift.identification.frame_expansion import frame_warming, temperature_knots
+from errormotion.methods.spindle_drift.identification.record import (
+    average_record,
+    noise,
+    run_out_at_rest,
+    sensors,
+)
+from errormotion.methods.spindle_drift.identification.uncertainty import REFERENCE
+from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.plugins import Redraw, Redrawing
+
+if TYPE_CHECKING:
+    from errormotion.arrays import Array
+    from errormotion.methods.spindle_drift.identification.record import Record
+    from errormotion.methods.spindle_drift.settings import Settings
+
+
+def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+    """Return the means of a drift record, or the steps of a detection, with their sources."""
+    return _detection(raw, settings, errors) if "sphere_radius" in raw else _drift(raw, settings, errors)
+
+
+def _drift(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+    with DatasetHasher(raw) as hasher:
+        record = average_record(raw, settings, hasher)
+    averages = record.averages
+    raw = raw.drop_vars("distance").sel(channel=list(CHANNELS))
+    zero = float(errors.attrs["reference_time"])
+    first, last = (float(t) + zero for t in errors.attrs["reference_interval"])
+    reference = np.flatnonzero(
+        (averages.time > first - 1e-6) & (averages.time < last + 1e-6) & np.isfinite(averages.mean).all(axis=0)
+    )
+    known = np.isfinite(errors["EX"].values) | np.isin(np.arange(averages.time.size), reference)
+    reduced = _means(raw, record, np.where(known, averages.mean, np.nan))
+    half = settings.average / 2
+    stated: dict[str, Any] = {
+        "average": half,
+        "spin_up": 0.0,
+        "reference_time": max(first - float(averages.time[0]), 0.0),
+        "reference_average": last - first + half,
+        "functional_point": tuple(map(float, errors.attrs["functional_point"])),
+        "frame_smoothing": 0.0,
+        "unseen_rotation": 0.0,
+        "noise": "stated",
+    }
+    sigma = noise(raw, averages, settings, [])
+    _, _, covariance, group = beams_of(raw, settings, [])
+    sources = {"readings": _readings(sigma), group: _beams(covariance, settings.beams, group)}
+    if settings.bar_radius_uncertainty:
+        sources["bar radius"] = _bar_radius(settings.bar_radius_uncertainty)
+    rests = run_out_at_rest(record, reference, float(raw["distance_noise"]))
+    if rests:
+        sources["run-out at rest"] = _changes(np.array([change for *_, change in rests]))
+    warming = frame_warming(raw, record, settings, [])
+    if warming is not None:
+        sources["frame expansion"] = _frame_expansion(settings.frame_expansion_uncertainty)
+        index = sensors(raw).index(settings.frame_temperature)
+        reduced["temperature"][:, index] = warming.temperature
+        knots = temperature_knots(warming, averages.time, settings.frame_smoothing)
+        sources["frame temperature"] = _frame_temperature(knots, index)
+    if settings.unseen_rotation > 0:
+        sources[UNSEEN] = _unseen_rotation(errors)
+    return Redrawing(reduced, settings.model_copy(update=stated), sources)
+
+
+def _means(raw: xr.Dataset, record: Record, mean: Array) -> xr.Dataset:
+    """Return a record of means, in memory."""
+    slow = [name for name in raw.variables if "time" in raw[name].dims]
+    attrs = {key: value for key, value in raw.attrs.items() if key not in ("sample_rate", "time_start")}
+    means = raw.drop_vars(slow).load().drop_attrs(deep=False).assign_attrs(attrs)
+    means = means.assign_coords(time=("time", record.averages.time, {"units": "s"}))
+    means["distance"] = (("channel", "time"), mean, {"units": "m"})
+    if record.temperature is not None:
+        means["temperature"] = (("time", "sensor"), record.temperature.T.copy(), {"units": "degC"})
+    if record.spindle_speed is not None:
+        means["spindle_speed"] = (("time",), record.spindle_speed, {"units": "1/min"})
+    return means
+
+
+def _shifted(raw: xr.Dataset, name: str, change: Array) -> xr.Dataset:
+    """Return raw data with a variable changed; the change has its order of dimensions."""
+    return raw.assign({name: raw[name].copy(data=raw[name].values + change)})
+
+
+def _readings(sigma: Array) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return _shifted(raw, "distance", sigma * generator.normal(size=sigma.shape)), settings
+
+    return Redraw(draw, groups=(REFERENCE,), own=True)
+
+
+def _beams(covariance: Array, which: str, group: str) -> Redraw:
+    """Return origins and directions by their covariance (5, 6, 6), one draw for the record."""
+    size = np.sqrt(np.einsum("cii->ci", covariance))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / (unit[:, :, None] * unit[:, None, :]))
+    factor = unit[:, :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    origin, direction = (f"{'nominal' if which == 'nominal' else 'beam'}_{part}" for part in ("origin", "direction"))
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        change = np.einsum("cij,cj->ci", factor, generator.normal(size=factor.shape[:2]))
+        raw = raw.assign({name: raw[name].transpose("channel", "direction") for name in (origin, direction)})
+        turned = raw[direction].values + change[:, 3:]
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        raw = raw.assign({direction: raw[direction].copy(data=turned)})
+        return _shifted(raw, origin, change[:, :3]), settings
+
+    return Redraw(draw, groups=(group,))
+
+
+def _bar_radius(uncertainty: float) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return _shifted(raw, "bar_radius", uncertainty * np.asarray(generator.normal())), settings
+
+    return Redraw(draw, groups=("bar radius",))
+
+
+def _changes(changes: Array) -> Redraw:
+    """Return changes of the readings (source, 5, instant), each one draw."""
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return _shifted(raw, "distance", np.tensordot(generator.normal(size=len(changes)), changes, axes=1)), settings
+
+    return Redraw(draw, groups=("run-out at rest",))
+
+
+def _frame_expansion(relative: float) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        expansion = raw["frame_expansion"]
+        factor = 1.0 + relative * generator.normal()
+        return raw.assign(frame_expansion=expansion.copy(data=expansion.values * factor)), settings
+
+    return Redraw(draw, groups=("frame expansion",))
+
+
+def _frame_temperature(knots: Array, index: int) -> Redraw:
+    """Return the smoothed temperature of the frame; ``knots`` (knot, instant), K, are one draw each."""
+
+    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        temperature = raw["temperature"].transpose("time", "sensor")
+        changed = temperature.values.copy()
+        changed[:, index] += generator.normal(size=len(knots)) @ knots
+        return raw.assign(temperature=temperature.copy(data=changed)), settings
+
+    return Redraw(draw, groups=("frame temperature",))
+
+
+def _unseen_rotation(errors: xr.Dataset) -> Redraw:
+    """Return the rotation about the spindle axis: no reading contains it, it moves a functional point off the axis."""
+    rows = errors["influence"].sel(source=errors["source_group"].values == UNSEEN).transpose("source", "time", "dof")
+    effect = np.nan_to_num(rows.values)
+
+    def act(result: xr.Dataset, generator: np.random.Generator) -> xr.Dataset:
+        change = np.tensordot(generator.normal(size=len(effect)), effect, axes=1)
+        return result.assign({name: result[name] + change[:, k] for k, name in enumerate(result.em.names)})
+
+    return Redraw(act=act, groups=(UNSEEN,))
+
+
+def _detection(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+    """Return the readings of the stepped sphere; their noise is that of the residuals of each beam."""
+    steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
+    steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
+    noise = errors["noise"].sel(beam=[str(name) for name in raw["channel"].values]).values[:, None, None]
+    return Redrawing(steps, settings, {"readings": _readings(np.broadcast_to(noise, steps["distance"].shape))})

@@ -1,0 +1,19 @@
+"""The plugin ``monte_carlo``: Monte Carlo evaluations as datasets."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from errormotion.plugins import DatasetInfo, lazy
+
+
+class MonteCarloDataset:
+    """Monte Carlo evaluations of error datasets."""
+
+    info: ClassVar[DatasetInfo] = DatasetInfo(
+        id="monte_carlo",
+        summary="Monte Carlo evaluation of a result: intervals, and whether the linear ones are validated",
+        schemas=("errormotion.monte_carlo/1",),
+    )
+    violations = lazy("errormotion.montecarlo.result:violations")
+    chapters = lazy("errormotion.montecarlo.report:chapters")

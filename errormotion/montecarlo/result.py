@@ -1,0 +1,234 @@
+"""The result of a Monte Carlo evaluation as a dataset, schema ``errormotion.monte_carlo/1``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets import hash_dataset
+from errormotion.datasets.schemas import ERROR_ROWS
+from errormotion.errors import DatasetError
+from errormotion.montecarlo.adaptive import Summary
+from errormotion.montecarlo.validation import NOT_VALIDATED, UNDECIDED, VALIDATED, WORDS, Validation
+
+SCHEMA = "errormotion.monte_carlo/1"
+_END = ("...", "dof", "limit")
+_ONE = ("...", "dof")
+TABLE: dict[str, tuple[tuple[str, ...], str]] = {
+    "linear": (_ONE, "estimate by the method; m, rad"),
+    "linear_uncertainty": (_ONE, "its standard uncertainty by linear propagation"),
+    "mean": (_ONE, "mean of the trials"),
+    "uncertainty": (_ONE, "standard deviation of the trials: the standard uncertainty"),
+    "symmetric": (_END, "probabilistically symmetric coverage interval"),
+    "shortest": (_END, "shortest coverage interval"),
+    "standard_error": (_END, "of the ends of the symmetric interval, by the finite number of trials"),
+    "distance": (_END, "of the ends of the linear interval from the symmetric one: d_low, d_high"),
+    "tolerance": (_ONE, "numerical tolerance of the standard uncertainty"),
+    "verdict": (_ONE, "1: the linear interval is validated; 0: it is not; -1: the trials do not decide"),
+    "stable": (_ONE, "1: the adaptive procedure found the results stable"),
+    "missing": (_ONE, "trials without a value"),
+}
+"""Variables: dimensions, ``...`` those of the error dataset, and meaning."""
+ATTRIBUTES = ("method", "method_version", "machine", "component", "frame", "functional_point", "reference", "sign")
+NUMBERS = ("trials", "probability", "digits", "seed")
+
+UNITS = {row.name: row.unit for row in ERROR_ROWS}
+
+
+def build(
+    errors: xr.Dataset,
+    where: Mapping[str, NDArray[np.intp]],
+    linear: Array,
+    u: Array,
+    found: Summary,
+    validation: Validation,
+    seed: int,
+    sources: Sequence[str],
+    reasons: Mapping[str, int],
+) -> xr.Dataset:
+    """Return the dataset of an evaluation.
+
+    Parameters
+    ----------
+    errors : Dataset
+        The result that was evaluated.
+    where : mapping
+        Indices of the places along each dimension.
+    linear, u : ndarray (place, dof)
+        Estimates and standard uncertainties by linear propagation.
+    found : Summary
+    validation : Validation
+    seed : int
+    sources : sequence of str
+        What was drawn.
+    reasons : mapping of str to int
+        Why trials gave no result, by count.
+
+    Raises
+    ------
+    DatasetError
+        The result does not conform to the schema.
+    """
+    dims, names = [str(dim) for dim in errors.em.dims], list(errors.em.names)
+    shape = (*(len(where[dim]) for dim in dims), len(names))
+    known = np.isfinite(linear.ravel())
+    ends = {
+        "symmetric": found.symmetric,
+        "shortest": found.shortest,
+        "standard_error": found.standard_error,
+        "distance": np.stack([validation.low, validation.high]),
+    }
+    ones = {
+        "linear": linear.ravel(),
+        "linear_uncertainty": u.ravel(),
+        "mean": found.mean,
+        "uncertainty": found.uncertainty,
+        "tolerance": found.tolerance,
+    }
+    flags = {
+        "verdict": np.where(known, validation.verdict, UNDECIDED).astype(np.int8),
+        "stable": found.stable.astype(np.int8),
+        "missing": np.where(known, found.missing, 0).astype(np.int64),
+    }
+    variables: dict[str, Any] = {
+        name: ((*dims, "dof", "limit"), np.where(known, values, np.nan).T.reshape(*shape, 2))
+        for name, values in ends.items()
+    }
+    variables |= {
+        name: ((*dims, "dof"), np.where(known, values, np.nan).reshape(shape)) for name, values in ones.items()
+    }
+    variables |= {name: ((*dims, "dof"), values.reshape(shape)) for name, values in flags.items()}
+    places = errors[names].isel({dim: where[dim] for dim in dims})
+    own = {name: places[name].variable for name in places.coords if set(map(str, places[name].dims)) <= set(dims)}
+    refused = int(found.missing[known].max(initial=0))
+    notes = [f"{count} trials were refused: {reason}" for reason, count in sorted(reasons.items())]
+    if refused and not notes:
+        notes = [f"{refused} trials gave no value at some place."]
+    thinned = [f"{len(where[dim])} of {errors.sizes[dim]} places along {dim} are kept."
+               for dim in dims if len(where[dim]) < errors.sizes[dim]]  # fmt: skip
+    attrs = {name: errors.attrs[name] for name in ATTRIBUTES if name in errors.attrs}
+    attrs |= {
+        "schema": SCHEMA,
+        "trials": found.trials,
+        "probability": found.probability,
+        "digits": found.digits,
+        "seed": seed,
+        "sources": list(sources),
+        "errors_hash": hash_dataset(errors),
+        "notes": [*notes, *thinned] or [""],
+    }
+    ds = xr.Dataset(variables, coords={**own, "dof": names, "limit": ["low", "high"]}, attrs=attrs)
+    for name, (_, meaning) in TABLE.items():
+        ds[name].attrs["long_name"] = meaning
+    if wrong := violations(ds):
+        raise DatasetError(f"The result of the Monte Carlo evaluation does not conform to {SCHEMA}:", wrong)
+    return ds
+
+
+def violations(ds: xr.Dataset) -> list[str]:
+    """Return every violation of the schema, one sentence each."""
+    found = [f"attribute '{name}': missing" for name in (*ATTRIBUTES[:5], *NUMBERS) if name not in ds.attrs]
+    linear = ds.variables.get("linear")
+    own = [] if linear is None else [str(dim) for dim in linear.dims if dim != "dof"]
+    for name, (dims, meaning) in TABLE.items():
+        if name not in ds.variables:
+            found.append(f"{name}: missing; expected {meaning}")
+            continue
+        expected = tuple(part for dim in dims for part in (own if dim == "..." else [dim]))
+        if ds.variables[name].dims != expected:
+            found.append(f"{name}: expected dims ({', '.join(expected)}); found {ds.variables[name].dims}")
+    for name in ("dof", "limit"):
+        if name not in ds.coords:
+            found.append(f"{name}: missing; expected its labels")
+    if not found and not np.isin(ds["verdict"].values, (VALIDATED, NOT_VALIDATED, UNDECIDED)).all():
+        found.append("verdict: expected 1, 0 or -1")
+    return found
+
+
+@dataclass(frozen=True)
+class Line:
+    """What is said of one freedom.
+
+    Attributes
+    ----------
+    name : str
+    verdict : int
+        That of the worst place.
+    linear_uncertainty, uncertainty, tolerance : float
+        At the place where the intervals differ most against the tolerance; m or rad.
+    distance : float
+        Larger one of both ends there.
+    linear, interval : tuple of float
+        Ends of both intervals there.
+    place : str
+        Where that is; empty for one place.
+    open_places, places : int
+        Places that are not validated or undecided, and all.
+    """
+
+    name: str
+    verdict: int
+    linear_uncertainty: float
+    uncertainty: float
+    tolerance: float
+    distance: float
+    linear: tuple[float, float]
+    interval: tuple[float, float]
+    place: str
+    open_places: int
+    places: int
+
+    @property
+    def word(self) -> str:
+        """The verdict in words."""
+        return WORDS[self.verdict]
+
+
+def lines(ds: xr.Dataset) -> list[Line]:
+    """Return one line for each freedom that has values."""
+    from scipy.special import ndtri
+
+    own = [str(dim) for dim in ds["linear"].dims if dim != "dof"]
+    factor = float(ndtri(0.5 + float(ds.attrs["probability"]) / 2))
+    found = []
+    for name in map(str, ds["dof"].values):
+        one = ds.sel(dof=name)
+        y, u, tolerance, verdict = (
+            one[key].values.ravel() for key in ("linear", "linear_uncertainty", "tolerance", "verdict")
+        )
+        moving = np.isfinite(y) & ((u > 0) | (one["uncertainty"].values.ravel() > 0))
+        if not moving.any():
+            continue
+        worst = verdict[moving]
+        value = NOT_VALIDATED if (worst == NOT_VALIDATED).any() else int(worst.min())
+        distance = one["distance"].transpose(*own, "limit").values.reshape(-1, 2).max(axis=1)
+        ratio = np.where(moving, distance / np.maximum(tolerance, 1e-300), -1.0)
+        ratio[np.isnan(ratio)] = -0.5
+        candidates = np.where(moving & (verdict == value), ratio, -1.0)
+        at = int(np.argmax(candidates))
+        low, high = one["symmetric"].transpose(*own, "limit").values.reshape(-1, 2)[at]
+        found.append(
+            Line(name, value, float(u[at]), float(one["uncertainty"].values.ravel()[at]), float(tolerance[at]),
+                 float(distance[at]), (float(y[at] - factor * u[at]), float(y[at] + factor * u[at])),
+                 (float(low), float(high)), _place(one, own, at), int((worst != VALIDATED).sum()), int(moving.sum()))
+        )  # fmt: skip
+    return found
+
+
+def _place(ds: xr.Dataset, dims: list[str], number: int) -> str:
+    """Return a place in words."""
+    index = np.unravel_index(number, [ds.sizes[dim] for dim in dims]) if dims else ()
+    parts = []
+    for dim, i in zip(dims, index, strict=True):
+        if ds.sizes[dim] == 1:
+            continue
+        label = ds[dim].values[i] if dim in ds.coords else i + 1
+        unit = str(ds[dim].attrs.get("units", UNITS.get(dim, ""))) if dim in ds.coords else ""
+        parts.append(f"{dim} {label:g} {unit}".strip() if isinstance(label, float) else f"{dim} {label}")
+    return ", ".join(parts)

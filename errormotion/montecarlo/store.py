@@ -1,0 +1,134 @@
+"""Trials on disk while an evaluation is in work: written beside and renamed, so that what is there is whole."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import RunError
+
+KEY = "evaluation.json"
+_CHUNK = re.compile(r"block-(\d{4,})-(\d+)-(\d+)\.npy")
+
+
+class Store:
+    """A folder of trials; a context manager.
+
+    Parameters
+    ----------
+    folder : path
+        It is created where it is missing.
+    key : mapping
+        What the trials belong to.
+
+    Raises
+    ------
+    RunError
+        The folder holds the trials of another evaluation, other files, or cannot be written.
+    """
+
+    def __init__(self, folder: str | Path, key: dict[str, Any]) -> None:
+        self.folder, self._key = Path(folder), key
+
+    def __enter__(self) -> Self:
+        file = self.folder / KEY
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if file.exists():
+                found = json.loads(file.read_text(encoding="utf-8"))
+                if found != self._key:
+                    keys = set(self._key) | set(found if isinstance(found, dict) else {})
+                    differ = [
+                        k for k in sorted(keys) if not isinstance(found, dict) or found.get(k) != self._key.get(k)
+                    ]
+                    raise RunError(
+                        f"{self.folder}: holds trials of another evaluation ({', '.join(differ)} differ). Remove the "
+                        "folder, or give another name to --out"
+                    )
+            elif any(self.folder.iterdir()):
+                raise RunError(f"{self.folder}: expected an empty folder or trials of this evaluation; found others")
+            else:
+                self._write(file, json.dumps(self._key, indent=1).encode())
+        except (OSError, ValueError) as error:
+            raise RunError(f"{self.folder}: expected a folder for the trials that can be written; {error}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the trials: an interrupted evaluation is continued from them."""
+
+    def block(self, number: int, size: int) -> Array | None:
+        """Return a complete block (size, k), mapped from its file; None where there is none."""
+        return self._read(self._block_file(number), size)
+
+    def chunks(self, number: int, size: int) -> list[range]:
+        """Return the trials of a block that are there."""
+        found = []
+        for file in sorted(self.folder.glob(f"block-{number:04d}-*.npy")):
+            match = _CHUNK.fullmatch(file.name)
+            if match is None:
+                continue
+            first, stop = int(match[2]), int(match[3])
+            if first < stop <= size and self._read(file, stop - first) is not None:
+                found.append(range(first, stop))
+        return found
+
+    def keep(self, number: int, trials: range, values: Array) -> None:
+        """Write some trials (n, k) of a block."""
+        self._save(self.folder / f"block-{number:04d}-{trials.start}-{trials.stop}.npy", values)
+
+    def join(self, number: int, size: int) -> Array:
+        """Join the trials of a block to one file and return them, mapped from it."""
+        parts = self.chunks(number, size)
+        files = [self.folder / f"block-{number:04d}-{part.start}-{part.stop}.npy" for part in parts]
+        whole: Array | None = None
+        for part, file in zip(parts, files, strict=True):
+            values = np.load(file, allow_pickle=False)
+            whole = np.full((size, values.shape[1]), np.nan) if whole is None else whole
+            whole[part.start : part.stop] = values
+        if whole is None:
+            raise RunError(f"{self.folder}: the trials of block {number} are missing")
+        self._save(self._block_file(number), whole)
+        for file in files:
+            file.unlink(missing_ok=True)
+        joined = self.block(number, size)
+        return whole if joined is None else joined
+
+    def remove(self) -> None:
+        """Remove the folder; the evaluation is finished."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _block_file(self, number: int) -> Path:
+        return self.folder / f"block-{number:04d}.npy"
+
+    def _read(self, file: Path, size: int) -> Array | None:
+        """Return the values of a file, None where it is not one of ours."""
+        try:
+            values = np.load(file, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError):
+            return None
+        return values if values.ndim == 2 and len(values) == size and values.dtype == np.float64 else None
+
+    def _save(self, file: Path, values: Array) -> None:
+        part = file.with_name(f".{file.name}.part")
+        with part.open("wb") as stream:
+            np.save(stream, np.asarray(values, dtype=np.float64), allow_pickle=False)
+            stream.flush()
+            with contextlib.suppress(OSError):
+                os.fsync(stream.fileno())
+        part.replace(file)
+
+    def _write(self, file: Path, content: bytes) -> None:
+        part = file.with_name(f".{file.name}.part")
+        part.write_bytes(content)
+        part.replace(file)

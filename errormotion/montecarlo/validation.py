@@ -1,0 +1,80 @@
+"""Whether the linear propagation of uncertainty is validated by the Monte Carlo method: JCGM 101, clause 8."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from errormotion.arrays import Array
+from errormotion.montecarlo.adaptive import Summary
+
+VALIDATED, NOT_VALIDATED, UNDECIDED = 1, 0, -1
+WORDS = {VALIDATED: "validated", NOT_VALIDATED: "not validated", UNDECIDED: "undecided"}
+FALSE_ALARM = 0.05
+"""Probability that the finite number of trials decides any of all quantities wrongly."""
+MOST_MISSING = 0.01
+"""Share of trials without a value above which a quantity is undecided."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Comparison of the linear interval with the symmetric one of the Monte Carlo method.
+
+    Attributes
+    ----------
+    low, high : ndarray (k,)
+        Distances of the ends, d_low and d_high, 8.1.
+    verdict : ndarray (k,)
+        ``VALIDATED`` where both are within the tolerance, ``NOT_VALIDATED`` where one is not, ``UNDECIDED`` where the
+        number of trials does not tell, or trials gave no value.
+    """
+
+    low: Array
+    high: Array
+    verdict: NDArray[np.int8]
+
+
+def validate_linear(
+    value: Array,
+    uncertainty: Array,
+    found: Summary,
+    *,
+    factor: float | None = None,
+    floor: float = 0.0,
+    short: bool = False,
+) -> Validation:
+    """Compare the interval ``value`` +- ``factor`` times ``uncertainty`` with that of the trials.
+
+    Parameters
+    ----------
+    value, uncertainty : ndarray (k,)
+        Estimate and standard uncertainty by linear propagation.
+    found : Summary
+        Of the trials.
+    factor : float, optional
+        Coverage factor; default that of the normal distribution.
+    floor : float
+        Difference that is rounding, whatever the tolerance.
+    short : bool
+        Compare with the shortest interval instead of the symmetric one.
+
+    Notes
+    -----
+    The ends of the trials' interval have standard errors. A quantity is decided where its distances are inside or
+    outside the tolerance by a margin; the margin holds jointly for all quantities with probability 95 % (Bonferroni).
+    """
+    k = float(ndtri(0.5 + found.probability / 2)) if factor is None else factor
+    ends = np.stack([value - k * uncertainty, value + k * uncertainty])
+    distance = np.abs(ends - (found.shortest if short else found.symmetric))
+    known = np.isfinite(distance).all(axis=0)
+    margin = -float(ndtri(FALSE_ALARM / 4 / max(int(known.sum()), 1))) * found.standard_error
+    limit = np.maximum(found.tolerance, floor)
+    with np.errstate(invalid="ignore"):
+        inside = np.all(distance + margin <= limit, axis=0) | np.all(distance <= floor, axis=0)
+        outside = np.any(distance - margin > limit, axis=0)
+    verdict = np.where(inside, VALIDATED, np.where(outside, NOT_VALIDATED, UNDECIDED))
+    verdict[~known | (found.missing > MOST_MISSING * found.trials)] = UNDECIDED
+    return Validation(distance[0], distance[1], verdict.astype(np.int8))

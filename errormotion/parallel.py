@@ -1,0 +1,214 @@
+"""Execution of many small tasks with Dask: in threads or processes of this computer, or on a cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from errormotion.errors import RunError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+SCHEDULERS = ("threads", "processes", "sync")
+CPU_COUNT = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+CLUSTER_TIMEOUT = 15.0
+"""Time within which a cluster must answer and have a worker, s."""
+
+Done = Callable[[int, Any], None]
+Lost = Callable[[int, str], None]
+
+
+def checked_scheduler(wanted: str) -> str:
+    """Return the name of a scheduler, or the address of one of Dask.
+
+    Raises
+    ------
+    RunError
+        There is no such scheduler.
+    """
+    if "://" not in wanted and wanted not in SCHEDULERS:
+        raise RunError(
+            f"Expected {', '.join(SCHEDULERS)} or the address of a Dask scheduler, such as tcp://host:8786; "
+            f"found '{wanted}'"
+        )
+    return wanted
+
+
+def one_thread_at_a_time() -> bool:
+    """Return whether numba's parallel kernels may be called from only one thread at a time."""
+    import numba
+
+    numba.get_num_threads()  # selects the layer
+    return bool(numba.threading_layer() == "workqueue")  # type: ignore[attr-defined, unused-ignore]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    number: int
+    value: Any
+
+
+def _answer(number: int, function: Callable[..., Any], task: tuple[Any, ...]) -> _Answer:
+    return _Answer(number, function(*task))
+
+
+class Workers:
+    """Threads, processes or a cluster, for one or several lists of tasks; a context manager.
+
+    Parameters
+    ----------
+    scheduler : str
+        ``threads``, ``processes``, ``sync`` (one after another), or the address of a Dask scheduler.
+    workers : int, optional
+        Number of threads or processes; default one for each processor. Not for a cluster.
+    version : str
+        Version of errormotion that the workers of a cluster must have.
+
+    Raises
+    ------
+    RunError
+        An unknown scheduler, a cluster that does not answer or has other versions, Dask missing.
+    """
+
+    def __init__(self, scheduler: str, workers: int | None, version: str) -> None:
+        self.scheduler = checked_scheduler(scheduler)
+        if workers is not None and (workers < 1 or scheduler not in SCHEDULERS):
+            raise RunError(f"--workers: expected 1 or more, and no number for a cluster; found {workers}")
+        self.count = 1 if scheduler == "sync" else workers or CPU_COUNT
+        self._version = version
+        self._executor: Executor | None = None
+        self._client: Client | None = None
+
+    def __enter__(self) -> Self:
+        if self.scheduler == "threads":
+            self._executor = ThreadPoolExecutor(self.count)
+        elif self.scheduler == "processes":
+            self._executor = ProcessPoolExecutor(
+                self.count, multiprocessing.get_context("spawn"), _start_process, (max(1, CPU_COUNT // self.count),)
+            )
+        elif self.scheduler != "sync":
+            self._client = _connected(self.scheduler, self._version)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+        if self._client is not None:
+            self._client.close()
+
+    def run(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], done: Done, lost: Lost) -> None:
+        """Execute ``function(*task)`` for all tasks; call ``done`` with the number and the value of each, in any order.
+
+        ``lost`` is called with the number of a task whose process ended, and the reason.
+        """
+        if self._client is not None:
+            self._on_cluster(function, tasks, done, lost)
+        elif self._executor is not None:
+            self._locally(function, tasks, done, lost)
+        else:
+            for number, task in enumerate(tasks):
+                done(number, function(*task))
+
+    def _locally(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], done: Done, lost: Lost) -> None:
+        try:
+            from dask.base import compute
+            from dask.callbacks import Callback
+            from dask.delayed import delayed
+        except ImportError as error:
+            raise _missing("dask") from error
+        finished: set[int] = set()
+
+        def after(_key: Any, value: Any, *_: Any) -> None:
+            if isinstance(value, _Answer):
+                finished.add(value.number)
+                done(value.number, value.value)
+
+        graph = [delayed(_answer, pure=False)(number, function, task) for number, task in enumerate(tasks)]
+        try:
+            with Callback(posttask=after):
+                compute(*graph, scheduler=self.scheduler, pool=self._executor, chunksize=1)
+        except BrokenProcessPool:
+            for number in range(len(tasks)):
+                if number not in finished:
+                    lost(
+                        number,
+                        "the process ended unexpectedly (use fewer --workers if memory is short); repeat the command",
+                    )
+
+    def _on_cluster(
+        self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], done: Done, lost: Lost
+    ) -> None:
+        from dask.delayed import delayed
+        from distributed import as_completed
+
+        client: Any = self._client
+        futures = client.compute([delayed(_answer, pure=False)(n, function, task) for n, task in enumerate(tasks)])
+        number_of = {future: number for number, future in enumerate(futures)}
+        for future in as_completed(futures, loop=client.loop):
+            if future.status == "finished":
+                answer = future.result()
+                done(answer.number, answer.value)
+            else:  # the task did not reach its own error handling: a worker died, or lacks errormotion
+                lost(number_of[future], f"the cluster did not execute it: {future.exception() or future.status}")
+
+
+def _start_process(threads: int) -> None:
+    """Set up a process: its number of threads; Ctrl-C is handled by the parent process."""
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _connected(address: str, version: str) -> Client:
+    """Return a client of a Dask scheduler that has workers, all with this version of errormotion."""
+    try:
+        import dask  # noqa: F401
+        from distributed import Client
+    except ImportError as error:
+        raise _missing("distributed") from error
+    try:
+        client = Client(address, timeout=CLUSTER_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise RunError(f"{address}: expected a Dask scheduler; none answers ({error})") from error
+    try:
+        _check_workers(client, address, version)
+    except BaseException:
+        client.close()
+        raise
+    return client
+
+
+def _check_workers(client: Client, address: str, version: str) -> None:
+    """Raise RunError for a cluster without workers, or whose workers have another version of errormotion."""
+    try:
+        client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
+    except TimeoutError as error:
+        raise RunError(
+            f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'"
+        ) from error
+    versions: Any = client.get_versions(packages=["errormotion"])
+    wrong = [
+        f"{worker} has {found['packages'].get('errormotion') or 'none'}"
+        for worker, found in versions["workers"].items()
+        if found["packages"].get("errormotion") != version
+    ]
+    if wrong:
+        raise RunError(
+            f"{address}: expected errormotion {version} on every worker; {', '.join(wrong)}. Install it there."
+        )
+
+
+def _missing(package: str) -> RunError:
+    return RunError(
+        f"Parallel execution needs the package '{package}', which is not installed: "
+        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' executes one task after another."
+    )

@@ -1,0 +1,72 @@
+"""Control chart of individual values with their own uncertainties (Shewhart; ISO 7870-2 for equal ones).
+
+Between two steps the centre is the generalised mean of the values that do not depart alone, with weights w for the
+covariance ``V = V0 + tau^2``: V0 is what the runs state, and tau the reproducibility of the machine and its set-up from
+the moving ranges. The limits are three standard deviations of a value from this centre,
+``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has limits of its own, and a source that all runs share
+cancels. The limit of a moving range is its expectation plus three of its standard deviations, for normal values
+``(sqrt(2 / pi) + 3 sqrt(1 - 2 / pi)) sd = 2.606 sd``, where sd is that of the difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.record.regression import by_moving_ranges, difference_variance
+from errormotion.record.series import Series
+from errormotion.record.steps import Model
+
+WIDTH = 3.0
+"""Standard deviations between centre and limit."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Centre and limits of each value (n,), moving ranges and their limits (n - 1,), and tau; SI.
+
+    A range across a step is NaN.
+    """
+
+    centre: Array
+    lower: Array
+    upper: Array
+    moving_range: Array
+    range_limit: Array
+    tau: float
+
+    def outside(self, value: Array) -> NDArray[np.bool_]:
+        """Return which values are outside of their limits, bool (n,)."""
+        found: NDArray[np.bool_] = (value < self.lower) | (value > self.upper)
+        return found
+
+
+def chart(series: Series, model: Model) -> Chart:
+    """Return the control chart of a series, with new limits after each step of its model."""
+    y, n = series.value, series.size
+    bounds = [0, *(step.index for step in model.steps), n]
+    used = np.ones(max(n - 1, 0), dtype=bool)
+    used[[k - 1 for k in bounds[1:-1]]] = False
+    whole = used.copy()
+    for k in model.departing:
+        used[max(k - 1, 0) : k + 1] = False
+    tau = by_moving_ranges(y, series.covariance, used)
+    V = series.covariance + tau**2 * np.eye(n)
+    centre, width = np.empty(n), np.empty(n)
+    for first, last in pairwise(bounds):
+        inside = np.arange(first, last)
+        kept = np.setdiff1d(inside, model.departing)
+        kept = kept if kept.size else inside
+        w = np.zeros(n)
+        w[kept] = np.linalg.solve(V[np.ix_(kept, kept)], np.ones(kept.size))
+        w /= w.sum()
+        centre[inside] = w @ y
+        variance = np.diag(V) - 2 * V @ w + w @ V @ w
+        width[inside] = WIDTH * np.sqrt(np.maximum(variance[inside], 0.0))
+    limit = (np.sqrt(2 / np.pi) + WIDTH * np.sqrt(1 - 2 / np.pi)) * np.sqrt(difference_variance(V))
+    ranges = np.where(whole, np.abs(np.diff(y)), np.nan)
+    return Chart(centre, centre - width, centre + width, ranges, limit, tau)

@@ -1,0 +1,297 @@
+"""One figure of many runs as a series: a figure of merit, or an error at a place.
+
+The effect of a source that several runs share, by its identity in their error datasets, comes from ``influence``: of an
+error directly, of a figure of merit as its change when the errors change by one standard uncertainty of the source. A
+figure that a method computes from other variables does not respond; its runs then count as independent.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from errormotion.errors import DatasetError, ErrormotionError, RunError
+from errormotion.plugins import FigureOfMerit
+from errormotion.record.entry import Entry
+from errormotion.record.series import Series
+from errormotion.tolerances.conformity import matches
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+LONGEST = 1000
+"""Values of a series; of more runs, the newest count."""
+MOST_LISTED = 30
+"""Names of figures in a message."""
+NEAR = 1e-3
+"""Largest distance of a target from the place that is asked for, m."""
+FREEDOM = re.compile(r"(E[XYZABC]|deviation)(?: after (\d{1,6}(?:\.\d+)?) min)?")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The figure of one run, SI, k = 1, with the signed effect of each source that has an identity."""
+
+    run: str
+    name: str
+    time: float
+    value: float
+    u: float
+    unit: str
+    influence: Mapping[str, float] = field(default_factory=dict)
+    origin: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A figure over time, what was left out of it, and what a reader should know."""
+
+    series: Series
+    figure: str
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def follow(runs: Sequence[tuple[Path, Entry]], figure: str, at: Sequence[float] | None = None) -> Followed:
+    """Return a figure of runs over time.
+
+    Parameters
+    ----------
+    runs : sequence of (path, entry)
+    figure : str
+        Name of a figure of merit; ``*`` stands for any characters, and a short form for the name that holds its parts
+        in their order: ``d(Z)60``. Or a freedom of the error datasets, ``EZ`` for its last known value over time, or
+        ``EZ after 60 min``.
+    at : sequence of float, optional
+        Place of the freedom, m: the functional point of errors over time, else the commanded position.
+
+    Raises
+    ------
+    RunError
+        No run states the figure, or one states several; what there is.
+    """
+    dated = sorted(((path, each) for path, each in runs if each.time is not None), key=lambda run: _time(run[1]))
+    left_out = [f"{each.folder}: its time is unknown" for _, each in runs if each.time is None]
+    if len(dated) > LONGEST:
+        left_out.append(f"{len(dated) - LONGEST} older runs: only the {LONGEST} newest are used")
+        dated = dated[-LONGEST:]
+    freedom = FREEDOM.fullmatch(figure.strip())
+    if at is not None and freedom is None:
+        raise RunError(f"--at: expected --figure with a freedom, such as EZ; found '{figure}'")
+    names = {} if freedom else _names(dated, figure)
+    found = list[Reading]()
+    for path, entry in dated:
+        if not freedom and path not in names:
+            left_out.append(f"{entry.folder}: does not state it")
+            continue
+        try:
+            found.append(_of_freedom(path, entry, freedom, at) if freedom else _of_merit(path, entry, names[path]))
+        except ErrormotionError as error:
+            left_out.append(f"{entry.folder}: {error}")
+        except Exception as error:  # noqa: BLE001 - of a foreign plugin, or a damaged file
+            left_out.append(f"{entry.folder}: {type(error).__name__}: {error}")
+    if not found:
+        reasons = "".join(f"\n  - {reason}" for reason in left_out[:5])
+        raise RunError(f"No value of '{figure}' in {len(runs)} runs. There are: {_available(dated)}{reasons}")
+    return Followed(_series(found), figure, tuple(left_out), tuple(_remarks(found, at)))
+
+
+def _time(entry: Entry) -> float:
+    return entry.time.timestamp() if entry.time is not None else np.nan
+
+
+def _available(runs: Sequence[tuple[Path, Entry]]) -> str:
+    """Return the names of the figures of runs, the most frequent first, and how freedoms are asked for."""
+    counts = Counter(each.name for _, entry in runs for each in entry.figures or ())
+    listed = [f"'{name}'" for name, _ in counts.most_common(MOST_LISTED)]
+    more = f", and {len(counts) - MOST_LISTED} more" if len(counts) > MOST_LISTED else ""
+    freedoms = "a freedom of the error datasets, EX to EC, at a place with --at"
+    return "; ".join([", ".join(listed) + more, freedoms] if listed else [freedoms])
+
+
+def _names(runs: Sequence[tuple[Path, Entry]], figure: str) -> dict[Path, FigureOfMerit]:
+    """Return the figure of each run that states it, by the strictest reading of its name that any run has."""
+    for agrees in (str.__eq__, lambda wanted, name: "*" in wanted and matches(wanted, name), _short):
+        found = {}
+        for path, entry in runs:
+            own = [each for each in entry.figures or () if agrees(figure, each.name)]
+            if len(own) > 1:
+                several = ", ".join(f"'{each.name}'" for each in own[:MOST_LISTED])
+                raise RunError(f"'{figure}' stands for several figures of {entry.folder}: {several}. Give one of them")
+            if own:
+                found[path] = own[0]
+        if found:
+            return found
+    raise RunError(f"No value of '{figure}' in {len(runs)} runs. There are: {_available(runs)}")
+
+
+def _short(wanted: str, name: str) -> bool:
+    """Return whether a name begins with the first part of a short form and holds the others in their order."""
+    parts, words = _parts(wanted[:100]), _parts(name)
+    if not parts or not words or words[0] != parts[0]:
+        return False
+    rest = iter(words)
+    return all(part in rest for part in parts)
+
+
+def _parts(text: str) -> list[str | float]:
+    """Return the words and numbers of a name."""
+    found = re.findall(r"\d+(?:\.\d+)?|[^\d\s]+", text)
+    return [float(each) if each[0].isdigit() else each for each in found]
+
+
+def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
+    """Return a figure of merit with the effects of the shared sources, as far as the error dataset states them."""
+    u = _checked(stated.value, stated.expanded_uncertainty / 2)
+    effects = dict[str, float]()
+    origin: tuple[str, ...] = (entry.method,)
+    if entry.errors and (path / entry.errors).exists():
+        from errormotion import datasets
+
+        errors = datasets.load(path / entry.errors)
+        origin = _origin(errors)
+        for row, identity in _identified(errors):
+            high, low = (_figure(_moved(errors, row, sign), stated.name) for sign in (1.0, -1.0))
+            if np.isfinite(high - low):
+                effects[identity] = effects.get(identity, 0.0) + 0.5 * (high - low)
+    return Reading(entry.folder, stated.name, _time(entry), stated.value, u, stated.unit, effects, origin)
+
+
+def _figure(errors: xr.Dataset, name: str) -> float:
+    from errormotion.datasets.merit import figures_of
+
+    return next((each.value for each in figures_of(errors) if each.name == name), np.nan)
+
+
+def _moved(errors: xr.Dataset, row: int, sign: float) -> xr.Dataset:
+    """Return errors that one standard uncertainty of a source has changed."""
+    names = errors.em.names
+    influence = "influence" if len(names) > 1 else "deviation_influence"
+    changed = {}
+    for k, name in enumerate(names):
+        F = errors[influence].isel(source=row)
+        F = F.isel(dof=k, drop=True) if "dof" in F.dims else F
+        changed[name] = errors[name].copy(data=errors[name].values + sign * F.transpose(*errors[name].dims).values)
+    return errors.assign(changed)
+
+
+def _identified(errors: xr.Dataset) -> list[tuple[int, str]]:
+    """Return row and identity of the sources that have one."""
+    influence = "influence" if len(errors.em.names) > 1 else "deviation_influence"
+    if "source_id" not in errors.variables or influence not in errors.variables:
+        return []
+    return [(row, str(each)) for row, each in enumerate(errors["source_id"].values) if str(each)]
+
+
+def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[float] | None) -> Reading:
+    """Return a freedom of the error dataset of a run, at a place and an instant."""
+    from errormotion import datasets
+
+    if not entry.errors:
+        raise RunError("has no errors yet")
+    errors = datasets.load(path / entry.errors)
+    name, minutes = freedom[1], freedom[2]
+    origin = _origin(errors)
+    if name not in errors.em.names:
+        raise DatasetError(f"has no {name}; its errors are {', '.join(errors.em.names)}")
+    errors, place = _at_place(errors, at)
+    if minutes is not None:
+        if errors.em.dims != ("time",):
+            raise DatasetError("has no errors over time, so that 'after' is not defined")
+        errors = errors.em.to_times([60.0 * float(minutes)])
+        place = 0
+    k = errors.em.names.index(name)
+    values = errors.em.estimates().values.reshape(-1, len(errors.em.names))[:, k]
+    if place is None:
+        known = np.flatnonzero(np.isfinite(values))
+        if not known.size:
+            raise DatasetError(f"{name} is unknown{'' if at is None else ' there: a rotation is not known'}")
+        place = int(known[-1])
+    u = errors.em.expanded(1.0).values.reshape(-1, len(errors.em.names))[place, k]
+    effects = dict[str, float]()
+    influence = "influence" if len(errors.em.names) > 1 else "deviation_influence"
+    for row, identity in _identified(errors):
+        F = errors[influence].transpose("source", ..., *(["dof"] if influence == "influence" else [])).values[row]
+        effect = F.reshape(-1, len(errors.em.names))[place, k]
+        effects[identity] = effects.get(identity, 0.0) + float(effect)
+    value = float(values[place])
+    unit = str(errors[name].attrs.get("units", "m"))
+    return Reading(entry.folder, freedom[0], _time(entry), value, _checked(value, float(u)), unit, effects, origin)
+
+
+def _at_place(errors: xr.Dataset, at: Sequence[float] | None) -> tuple[xr.Dataset, int | None]:
+    """Return errors that hold a place, and its index; without one, the last known value over time."""
+    dims = errors.em.dims
+    if dims in ((), ("time",)):
+        return (errors if at is None else errors.em.at(at)), (0 if dims == () else None)
+    if at is None:
+        raise DatasetError(f"states errors over {', '.join(dims)}; give the place with --at")
+    own = [axis for axis in "xyz" if axis in errors.variables]
+    if dims == ("position",):
+        moving = [axis for axis in own if errors[axis].dims == dims]
+        if len(moving) == 1:
+            return errors.em.to_positions([at["xyz".index(moving[0])]], moving[0]), 0
+    if len(dims) != 1 or len(own) < 3:
+        raise DatasetError(f"states errors over {', '.join(dims)} without x, y and z; the place is not defined")
+    away = np.sqrt(sum((errors[axis].values - at["xyz".index(axis)]) ** 2 for axis in own))
+    nearest = int(np.nanargmin(away))
+    if not away[nearest] <= NEAR:
+        raise DatasetError(f"its nearest position is {1e3 * away[nearest]:.1f} mm away from the place")
+    return errors, nearest
+
+
+def _checked(value: float, u: float) -> float:
+    if not np.isfinite(value):
+        raise DatasetError("the value is unknown")
+    if not (np.isfinite(u) and u > 0):
+        raise DatasetError("the uncertainty is unknown")
+    return u
+
+
+def _origin(errors: xr.Dataset) -> tuple[str, ...]:
+    """Return what has to be the same for values to be comparable: component, frame, method and functional point."""
+    point = ", ".join(f"{1e3 * each:g}" for each in np.asarray(errors.attrs["functional_point"], dtype=float))
+    names = ("method", "component", "frame")
+    return (*(str(errors.attrs.get(name, "")) for name in names), point)
+
+
+def _series(found: list[Reading]) -> Series:
+    """Return readings as a series; a source of one run only is part of its own uncertainty."""
+    units = {each.unit for each in found}
+    if len(units) > 1:
+        raise RunError(f"The figure has several units: {', '.join(sorted(units))}. Give a name that matches one figure")
+    counts = Counter(identity for each in found for identity, effect in each.influence.items() if effect)
+    shared = sorted(identity for identity, count in counts.items() if count > 1)
+    F = np.array([[each.influence.get(identity, 0.0) for each in found] for identity in shared])
+    u = np.array([each.u for each in found])
+    return Series(
+        np.array([each.time for each in found]),
+        np.array([each.value for each in found]),
+        np.maximum(u, np.sqrt((F**2).sum(axis=0))) if shared else u,
+        F if shared else np.zeros((0, len(found))),
+        shared,
+        [each.run for each in found],
+        [each.name for each in found],
+        units.pop(),
+    )
+
+
+def _remarks(found: list[Reading], at: Any) -> list[str]:
+    """Return what makes values of several runs hard to compare."""
+    known = [each.origin for each in found if len(each.origin) == 4]
+    notes = []
+    for k, what in ((0, "methods"), (1, "components"), (2, "frames"), (3, "functional points (mm)")):
+        values = sorted({origin[k] for origin in known})
+        if len(values) > 1 and not (k == 3 and at is not None):
+            advice = " Give --method." if k == 0 else " Give --at." if k == 3 else " Give --method or --test."
+            notes.append(f"The runs state several {what}: {'; '.join(values[:5])}.{advice}")
+    lacking = len(found) - len(known)
+    if lacking and known:
+        notes.append(f"{lacking} of {len(found)} runs have no error dataset; their sources count as independent.")
+    return notes

@@ -1,0 +1,122 @@
+"""Generalised least squares with a variance between runs, and its two estimates.
+
+The values are ``y = X b + m + e``: e has the stated covariance V0, m is what the machine and its set-up change from run
+to run, independent with the standard deviation tau, the reproducibility. Two estimates of tau:
+
+* Paule and Mandel (J. Res. NBS 87 (1982) 377): tau such that the weighted sum of squared residuals is its expectation,
+  ``r' (V0 + tau^2)^-1 r = n - p``; here with a full covariance and p parameters.
+* Moving ranges, as in a chart of individual values (ISO 7870-2): ``E|y_k - y_(k-1)| = sqrt(2 / pi) sd`` for normal
+  values, where ``sd^2 = 2 tau^2 + v_k`` and v_k follows from V0; tau such that the sum of the ranges is its
+  expectation. A step enters one range only, a trend hardly any.
+
+Both are 0 where the stated uncertainties alone explain the scatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import brentq
+from scipy.stats import chi2 as chi_square
+from scipy.stats import t as student
+
+from errormotion.arrays import Array
+
+COVERAGE = 0.95
+"""Of the intervals of a trend and of a step."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters of a fit.
+
+    Attributes
+    ----------
+    parameters, half_width : ndarray, (p,)
+        With their intervals (``COVERAGE``).
+    covariance : ndarray, (p, p)
+    tau : float
+        Reproducibility by Paule and Mandel.
+    chi2, p : float
+        Of the residuals for the stated uncertainties alone, tau = 0, and the probability of a smaller one.
+    degrees : int
+    fitted, fitted_half_width : ndarray, (n,)
+    """
+
+    parameters: Array
+    half_width: Array
+    covariance: Array
+    tau: float
+    chi2: float
+    p: float
+    degrees: int
+    fitted: Array
+    fitted_half_width: Array
+
+
+def fit(X: Array, y: Array, V0: Array) -> Fit | None:
+    """Return the fit of ``y = X b`` (n, p); None without a degree of freedom, or for dependent columns.
+
+    The quantile is that of Student's distribution with n - p degrees of freedom, since tau is estimated from as many.
+    """
+    n, p = X.shape
+    if n <= p or np.linalg.matrix_rank(X) < p:
+        return None
+    chi2 = float(_residual_square(X, y, V0, 0.0))
+    tau = _paule_mandel(X, y, V0)
+    V = V0 + tau**2 * np.eye(n)
+    factor = cho_factor(V)
+    C: Array = np.linalg.inv(X.T @ cho_solve(factor, X))
+    b: Array = C @ (X.T @ cho_solve(factor, y))
+    quantile = float(student.ppf(0.5 + COVERAGE / 2, n - p))
+    spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))
+    below = float(chi_square.cdf(chi2, n - p))
+    half_width: Array = quantile * np.sqrt(np.diag(C))
+    fitted: Array = X @ b
+    return Fit(b, half_width, C, tau, chi2, below, n - p, fitted, quantile * spread)
+
+
+def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> float:
+    """Return tau from the moving ranges of residuals (n,); ``used`` (n - 1,) leaves out ranges, across a step say."""
+    d = np.abs(np.diff(residual))
+    v = difference_variance(V0)
+    if used is not None:
+        d, v = d[used], v[used]
+    if not d.size:
+        return 0.0
+    total = float(np.sum(d) * np.sqrt(np.pi / 2))
+
+    def excess(tau: float) -> float:
+        return float(np.sum(np.sqrt(2 * tau**2 + v))) - total
+
+    return 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, total / d.size, xtol=1e-6 * total / d.size))
+
+
+def difference_variance(V: Array) -> Array:
+    """Return the variance of the differences of neighbours, (n - 1,); a shared source cancels where it acts alike."""
+    diagonal = np.diag(V)
+    found: Array = np.maximum(diagonal[1:] + diagonal[:-1] - 2 * np.diag(V, 1), 0.0)
+    return found
+
+
+def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
+    """Return tau; the sum of squares falls with tau, so that there is one root at most."""
+    degrees = int(X.shape[0] - X.shape[1])
+
+    def excess(tau: float) -> float:
+        return float(_residual_square(X, y, V0, tau)) - degrees
+
+    if excess(0.0) <= 0:
+        return 0.0
+    rest = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    high = float(np.sqrt(rest @ rest / degrees))  # with tau alone the sum is at most n - p here
+    return float(brentq(excess, 0.0, high, xtol=1e-6 * high)) if excess(high) < 0 else high
+
+
+def _residual_square(X: Array, y: Array, V0: Array, tau: float) -> float:
+    factor = cho_factor(V0 + tau**2 * np.eye(y.size))
+    WX, Wy = cho_solve(factor, X), cho_solve(factor, y)
+    b = np.linalg.solve(X.T @ WX, X.T @ Wy)
+    return float((y - X @ b) @ (Wy - WX @ b))

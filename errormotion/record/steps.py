@@ -1,0 +1,259 @@
+"""Steps in a series beside its trend, and single runs that depart from it, with a stated rate of false alarms.
+
+Candidates are a step between any two neighbouring times with ``LEAST_SIDE`` values on either side, and a departure of
+any single run. The statistic of a candidate is its share g of the weighted sum of squares, in the metric of the
+covariance and orthogonal to what the model already holds, over the scale: ``g (1 / r + 1 / s) / 2``. Here s is the
+mean square of the rest, and r the square that follows from the moving ranges without those that the candidate itself
+changes; steps that are not yet found inflate s, but hardly r. The largest statistic of each kind is compared with its
+own distribution where there is nothing to find, from simulated normal series with the same times and the same
+covariance: the probability of a false alarm anywhere is ``FALSE_STEPS + FALSE_DEPARTURES``. What is found joins the
+model, the positions found before are sought again, and the search is repeated with the distribution for this model
+until nothing more is significant.
+
+A step that is hardly significant may be chance, and would then take its size from the trend. The interval of the trend
+therefore covers the intervals with and without the steps and departures whose p is above ``CERTAIN``.
+
+The interval of the time of a step holds all positions whose log likelihood is within 7.35 / 2 of the best: the 95 %
+quantile of the larger of two independent exponential variables (Eo and Morley, Quantitative Economics 6 (2015) 463).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from errormotion.arrays import Array
+from errormotion.record.regression import Fit, by_moving_ranges, difference_variance, fit
+from errormotion.record.series import Series
+
+FALSE_STEPS = 0.035
+"""Probability that a step is found in a series where there is none."""
+FALSE_DEPARTURES = 0.01
+"""Probability that a departing run is found in a series where there is none."""
+LEAST_SIDE = 3
+"""Values on either side of a step."""
+CERTAIN = 0.001
+"""Probability of chance up to which a step is taken for certain in the interval of the trend."""
+MOST = 20
+"""Steps and departures that are sought."""
+SIMULATIONS = 1999
+LIKELIHOOD_DROP = 7.35
+"""Twice the drop of the log likelihood within the 95 % interval of a step's position."""
+TINY = np.finfo(float).tiny
+LEAST_SHARE = 1e-6
+"""Of a candidate, the share of its square that is orthogonal to the model."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A change at value number ``index``: a step before it, or a departure of this value alone."""
+
+    index: int
+    single: bool = False
+    p: float = np.nan
+
+    def column(self, n: int) -> Array:
+        """Return its column of the model, (n,)."""
+        k = np.arange(n)
+        return (k == self.index).astype(float) if self.single else (k >= self.index).astype(float)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step: between the values ``index - 1`` and ``index``, surely after value ``first`` and up to value ``last``."""
+
+    index: int
+    first: int
+    last: int
+    size: float
+    half_width: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """Trend, steps and departures of a series.
+
+    Attributes
+    ----------
+    fit : Fit or None
+        The first two parameters are the value at the first run and the trend per year; None for too few values.
+    steps : tuple of Step
+        In the order of time.
+    departing : tuple of int
+        Values that depart alone.
+    trend : tuple of float
+        Change per year, with the limits of its interval.
+    """
+
+    fit: Fit | None
+    steps: tuple[Step, ...] = ()
+    departing: tuple[int, ...] = ()
+    trend: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+
+
+def model_of(series: Series) -> Model:
+    """Return trend, steps and departures of a series."""
+    base = _base(series)
+    if base.shape[1] < 2:
+        return Model(None)
+    found = _search(series, base)
+    X = _design(base, found)
+    result = fit(X, series.value, series.covariance)
+    if result is None:
+        return Model(None)
+    V = series.covariance + result.tau**2 * np.eye(series.size)
+    steps, departing = list[Step](), list[int]()
+    for number, each in enumerate(found):
+        if each.single:
+            departing.append(each.index)
+            continue
+        column = base.shape[1] + number
+        first, last = _interval(series, base, found, number, V)
+        size, half_width = float(result.parameters[column]), float(result.half_width[column])
+        steps.append(Step(each.index, first, last, size, half_width, each.p))
+    trend = _trend(series, base, found, result)
+    return Model(result, tuple(sorted(steps, key=lambda step: step.index)), tuple(sorted(departing)), trend)
+
+
+def _trend(series: Series, base: Array, found: list[Candidate], result: Fit) -> tuple[float, float, float]:
+    """Return the trend with its interval, which covers the one without what may be chance."""
+    fits = [result]
+    certain = [each for each in found if each.p <= CERTAIN]
+    if len(certain) < len(found) and (without := fit(_design(base, certain), series.value, series.covariance)):
+        fits.append(without)
+    low = min(float(each.parameters[1] - each.half_width[1]) for each in fits)
+    high = max(float(each.parameters[1] + each.half_width[1]) for each in fits)
+    return float(result.parameters[1]), low, high
+
+
+def _base(series: Series) -> Array:
+    """Return the columns of a constant and a trend; the constant alone where there are fewer than three times."""
+    t = series.years
+    if np.unique(t).size < 3:
+        return np.ones((series.size, 1))
+    return np.column_stack([np.ones_like(t), t])
+
+
+def _design(base: Array, found: list[Candidate]) -> Array:
+    return np.column_stack([base, *(each.column(len(base)) for each in found)])
+
+
+def _search(series: Series, base: Array) -> list[Candidate]:
+    found: list[Candidate] = []
+    noise = np.random.default_rng(20260301).normal(size=(SIMULATIONS, series.size))
+    while len(found) < MOST:
+        X = _design(base, found)
+        candidates = _candidates(series, found)
+        if not candidates or series.size - X.shape[1] < 2:
+            break
+        best = _Trial(series, X, candidates).significant(noise)
+        if best is None:
+            break
+        found = _placed_anew(series, base, [*found, best])
+    return found
+
+
+def _candidates(series: Series, found: list[Candidate], single: bool | None = None) -> list[Candidate]:
+    """Return what may be added to a model; ``single`` restricts them to steps, or to departures."""
+    n, t = series.size, series.time
+    steps = [each.index for each in found if not each.single]
+    taken = {each.index for each in found if each.single}
+    made = []
+    if single is not True:
+        made += [
+            Candidate(k)
+            for k in range(LEAST_SIDE, n - LEAST_SIDE + 1)
+            if t[k] > t[k - 1] and all(abs(k - other) >= LEAST_SIDE for other in steps)
+        ]
+    if single is not False:
+        made += [Candidate(k, single=True) for k in range(n) if k not in taken]
+    return made
+
+
+def _placed_anew(series: Series, base: Array, found: list[Candidate]) -> list[Candidate]:
+    """Return candidates at their best positions, each sought anew beside the others, at most five times around."""
+    for _ in range(5):
+        before = list(found)
+        for number, each in enumerate(found):
+            others = found[:number] + found[number + 1 :]
+            candidates = _candidates(series, others, each.single)
+            if candidates:
+                best = _Trial(series, _design(base, others), candidates).best()
+                found[number] = replace(best, p=each.p)
+        if found == before:
+            break
+    return found
+
+
+class _Trial:
+    """Candidates beside a model: their directions in whitened coordinates, and their statistics."""
+
+    def __init__(self, series: Series, X: Array, candidates: list[Candidate], V: Array | None = None) -> None:
+        y, V0 = series.value, series.covariance
+        if V is None:
+            residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+            V = V0 + by_moving_ranges(residual, V0) ** 2 * np.eye(series.size)
+        self._L = np.linalg.cholesky(V)
+        self._Q, _ = np.linalg.qr(solve_triangular(self._L, X, lower=True))
+        Z = solve_triangular(self._L, np.column_stack([c.column(series.size) for c in candidates]), lower=True)
+        size = (Z**2).sum(axis=0)
+        Z = Z - self._Q @ (self._Q.T @ Z)
+        rest = (Z**2).sum(axis=0)
+        kept = rest > LEAST_SHARE * size
+        self.candidates = [c for c, keep in zip(candidates, kept, strict=True) if keep]
+        self._G = Z[:, kept] / np.sqrt(rest[kept])
+        self._v = difference_variance(V)
+        self._index = np.array([c.index for c in self.candidates], dtype=int)
+        self._single = np.array([c.single for c in self.candidates])
+        self._white = solve_triangular(self._L, y, lower=True)
+
+    def squares(self) -> Array:
+        """Return twice the gain of the log likelihood by each candidate, (candidates,)."""
+        found: Array = (self._white @ self._G) ** 2
+        return found
+
+    def best(self) -> Candidate:
+        """Return the candidate with the largest gain."""
+        return self.candidates[int(np.argmax(self.squares()))]
+
+    def significant(self, noise: Array) -> Candidate | None:
+        """Return the significant candidate with the largest gain; None where none is significant."""
+        gain, own, null = self.squares(), self._statistics(self._white[None])[0], self._statistics(noise)
+        best, largest = None, 0.0
+        for single, rate in ((False, FALSE_STEPS), (True, FALSE_DEPARTURES)):
+            kind = np.flatnonzero([each.single == single for each in self.candidates])
+            if not kind.size:
+                continue
+            p = float((1 + np.sum(null[:, kind].max(axis=1) >= own[kind].max())) / (1 + len(null)))
+            first = kind[np.argmax(own[kind])]
+            if p <= rate and gain[first] > largest:
+                best, largest = replace(self.candidates[first], p=p), float(gain[first])
+        return best
+
+    def _statistics(self, white: Array) -> Array:
+        """Return the statistics of the candidates for each row of whitened values (m, n)."""
+        rest = white - (white @ self._Q) @ self._Q.T
+        d = np.abs(np.diff(rest @ self._L.T, axis=1)) / np.sqrt(np.maximum(self._v, TINY))
+        # The ranges that a candidate itself changes: the one before its value, and of a single value the one behind.
+        around = np.pad(d, ((0, 0), (1, 1)))
+        own = around[:, self._index] + np.where(self._single, around[:, self._index + 1], 0.0)
+        ends = (self._index == 0) | (self._index == d.shape[1])
+        count = d.shape[1] - 1 - (self._single & ~ends)
+        scale = (d.sum(axis=1, keepdims=True) - own) / count
+        gain = (white @ self._G) ** 2
+        square = ((rest**2).sum(axis=1, keepdims=True) - gain) / (white.shape[1] - self._Q.shape[1] - 1)
+        ranges = np.pi / 4 * scale**2
+        found: Array = 0.5 * gain * (1 / np.maximum(ranges, 1e-12) + 1 / np.maximum(square, 1e-12))
+        return found
+
+
+def _interval(series: Series, base: Array, found: list[Candidate], number: int, V: Array) -> tuple[int, int]:
+    """Return the last value surely before a step, and the first one surely after it."""
+    others = found[:number] + found[number + 1 :]
+    trial = _Trial(series, _design(base, others), _candidates(series, others, single=False), V)
+    gain = trial.squares()
+    inside = [c.index for c, each in zip(trial.candidates, gain, strict=True) if each >= gain.max() - LIKELIHOOD_DROP]
+    return min(inside) - 1, max(inside)

@@ -1,0 +1,272 @@
+"""Monte Carlo evaluation of a method: the same trials whatever executes them, kept, resumed, and judged."""
+
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.random import SeedSequence
+from typer.testing import CliRunner
+
+from errormotion import datasets, montecarlo, plugins
+from errormotion.cli.app import app
+from errormotion.errors import DatasetError, MethodError, RunError
+from errormotion.montecarlo import evaluation, trials
+from errormotion.montecarlo.places import PLACES, chosen_places
+from errormotion.montecarlo.report import chapters, texts
+from errormotion.montecarlo.result import SCHEMA, lines
+from errormotion.montecarlo.store import Store
+from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.report.document import Source
+
+TRIALS = 100
+NOISE, OFFSET = 1e-6, 2e-6  # m
+
+
+class Straight:
+    """Displacement along X and Y at three times; a reading has noise, all of them share an offset of the sensor."""
+
+    info = MethodInfo("straight", "A method that exists in this test only", "simulated_only")
+    needs = Needs((), "errormotion.raw.straight/1")
+    Settings = PluginSettings
+
+    def identify(self, raw, settings):
+        values = np.full((raw.sizes["time"], 6), np.nan)
+        values[:, :2] = raw["reading"].values
+        covariance, influence = np.full((len(values), 6, 6), np.nan), np.full((1, len(values), 6), np.nan)
+        covariance[:, :2, :2] = NOISE**2 * np.eye(2) + OFFSET**2
+        influence[0, :, :2] = OFFSET
+        return datasets.build_errors(
+            values, covariance, dims=("time",), coords={"time": raw["time"].values}, component="tool", machine="none",
+            frame="machine", functional_point=np.zeros(3), reference="none", method="straight", method_version="1",
+            provenance={"settings": {}}, influence=influence, sources=["offset"], source_groups=["sensor"],
+        )  # fmt: skip
+
+    def redrawing(self, raw, settings, errors):
+        def noise(raw, settings, generator):
+            return raw.assign(reading=raw["reading"] + generator.normal(0, NOISE, raw["reading"].shape)), settings
+
+        def offset(raw, settings, generator):
+            return raw.assign(reading=raw["reading"] + generator.normal(0, OFFSET)), settings
+
+        return Redrawing(
+            raw.load(), settings, {"noise": Redraw(noise, own=True), "offset": Redraw(offset, ("sensor",))}
+        )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    """Let the registry know the method of this test."""
+    real = plugins.get
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plugins, "get", lambda group, name: Straight if name == "straight" else real(group, name))
+        yield
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory):
+    """A raw dataset on disk, its method, settings and linear result."""
+    reading = 1e-5 * np.arange(6.0).reshape(3, 2)
+    raw = xr.Dataset({"reading": (("time", "axis"), reading, {"units": "m"})}, {"time": [0.0, 60.0, 120.0]})
+    path = datasets.save(raw.assign_attrs(schema=Straight.needs.raw_schema), tmp_path_factory.mktemp("raw") / "raw.nc")
+    return path, Straight, PluginSettings(), Straight().identify(raw, PluginSettings())
+
+
+@pytest.fixture(scope="module")
+def found(measured, tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
+    """The evaluation, one trial after another."""
+    return _evaluate(measured, tmp_path_factory.mktemp("sync") / "trials", scheduler="sync")
+
+
+def _evaluate(measured, folder, **options):
+    path, method, settings, errors = measured
+    options = {"trials": TRIALS, "seed": 5} | options
+    return montecarlo.evaluate(path, method.info.id, settings, errors, folder, **options)
+
+
+def test_the_trials_have_the_stated_uncertainty(found):
+    u, linear = (found[name].sel(dof="EX").values for name in ("uncertainty", "linear_uncertainty"))
+    # a standard deviation of 100 normal values is known to 1 / sqrt(200), 7 %; four of these
+    np.testing.assert_allclose(u / linear, 1.0, atol=0.28)
+    assert found.attrs["schema"] == SCHEMA
+    assert found.attrs["trials"] == TRIALS
+
+
+def test_threads_give_the_same_bits_and_leave_no_trials(measured, found, tmp_path):
+    again = _evaluate(measured, tmp_path / "trials", scheduler="threads", workers=3)
+    assert again.identical(found)
+    assert not (tmp_path / "trials").exists()
+
+
+@pytest.mark.slow
+def test_processes_and_a_cluster_give_the_same_bits(tmp_path):
+    from distributed import LocalCluster
+
+    subject = plugins.get("methods", "normal_vector").conformance()[0]
+    raw, settings = subject.make(0)[0].isel(time=slice(0, 3)), subject.effective_settings()
+    path = datasets.save(raw, tmp_path / "raw.nc")
+    given = path, subject.plugin, settings, subject.identify(raw)
+    found = _evaluate(given, tmp_path / "zero", scheduler="sync")
+    assert _evaluate(given, tmp_path / "one", scheduler="processes", workers=2).identical(found)
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        assert _evaluate(given, tmp_path / "two", scheduler=cluster.scheduler_address).identical(found)
+
+
+def test_a_stopped_evaluation_continues_where_it_was(measured, found, tmp_path, monkeypatch):
+    seen = []
+
+    class StopsAfter:
+        def stage(self, name, total=None): ...
+        def note(self, text): ...
+
+        def advance(self, done):
+            seen.append(done)
+            if done >= 3 * evaluation.CHUNK:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _evaluate(measured, tmp_path / "trials", scheduler="sync", progress=StopsAfter())
+    assert len(list((tmp_path / "trials").glob("block-*.npy"))) == 3
+    computed = Counter()
+    whole = evaluation.compute
+    monkeypatch.setattr(evaluation, "compute", lambda *task: computed.update([task[7]]) or whole(*task))
+    continued = _evaluate(measured, tmp_path / "trials", scheduler="sync")
+    assert continued.identical(found)
+    assert sorted(computed) == [3 * evaluation.CHUNK, 4 * evaluation.CHUNK]
+
+
+def test_trials_of_another_evaluation_are_not_used(measured, tmp_path):
+    with Store(tmp_path / "trials", {"seed": 1}):
+        pass
+    with pytest.raises(RunError, match="another evaluation"):
+        _evaluate(measured, tmp_path / "trials", scheduler="sync")
+
+
+def test_damaged_trials_are_made_again(tmp_path):
+    with Store(tmp_path / "trials", {"seed": 1}) as store:
+        store.keep(0, range(2), np.ones((2, 3)))
+        store.keep(0, range(2, 4), np.ones((2, 3)))
+        file = tmp_path / "trials" / "block-0000-2-4.npy"
+        file.write_bytes(file.read_bytes()[:40])
+        assert store.chunks(0, 4) == [range(2)]
+
+
+@pytest.mark.parametrize(("options", "message"), [({"trials": 10}, "from 100 on"), ({"digits": 3}, "1 or 2"),
+                                                  ({"scheduler": "elsewhere"}, "Dask scheduler")])  # fmt: skip
+def test_options_that_make_no_sense_are_refused(measured, tmp_path, options, message):
+    with pytest.raises((MethodError, RunError), match=message):
+        _evaluate(measured, tmp_path / "trials", **options)
+
+
+def test_a_method_without_redrawing_is_refused(measured):
+    _, method, settings, errors = measured
+
+    class Plain:
+        info = method.info
+
+    with pytest.raises(MethodError, match="does not state how its sources are drawn"):
+        trials.redrawing_of(Plain(), None, settings, errors)
+
+
+def test_reduced_data_that_give_other_values_are_a_defect(measured):
+    path, method, settings, errors = measured
+    raw = datasets.load(path).load()
+
+    class Shifted(method):
+        def redrawing(self, raw, settings, errors):
+            scaled = raw.assign(reading=raw["reading"] + 1e-5)
+            return Redrawing(scaled, settings, {})
+
+    with pytest.raises(MethodError, match="defect of the method's redrawing"):
+        trials.redrawing_of(Shifted(), raw, settings, errors)
+
+
+def test_a_source_that_is_left_out_leaves_the_draws_of_the_others():
+    def adds(raw, settings, generator):
+        return [*raw, generator.normal()], settings
+
+    class Lists:
+        def identify(self, raw, settings):
+            return raw
+
+    drawn = Redrawing([], None, {name: Redraw(adds) for name in "abc"})
+    whole = trials.trial(Lists(), drawn, SeedSequence(3))
+    assert trials.trial(Lists(), drawn, SeedSequence(3), only=["a", "c"]) == [whole[0], whole[2]]
+
+
+def test_refused_trials_are_counted_and_named(measured, tmp_path, monkeypatch):
+    whole = trials.trial
+
+    def refuses(method, redrawing, sequence, only=None):
+        if sequence.spawn_key[-1] % 5 == 0:
+            raise MethodError("no luck")
+        return whole(method, redrawing, sequence, only)
+
+    monkeypatch.setattr(trials, "trial", refuses)
+    found = _evaluate(measured, tmp_path / "trials", scheduler="sync")
+    assert int(found["missing"].max()) == TRIALS // 5
+    assert any("20 trials were refused: no luck" in note for note in found.attrs["notes"])
+    assert {line.word for line in lines(found)} == {"undecided"}
+
+
+def test_long_records_are_thinned_and_keep_their_ends():
+    errors = xr.Dataset({"EX": (("time", "position"), np.zeros((3000, 7)))}, attrs={"schema": datasets.SCHEMA})
+    rows, where = chosen_places(errors)
+    assert len(rows) <= PLACES
+    assert [where["time"][0], where["time"][-1], len(where["position"])] == [0, 2999, 7]
+    assert rows[0] == 0
+    assert rows[-1] == 3000 * 7 - 1
+
+
+def test_a_curved_model_is_not_validated_and_a_straight_one_is():
+    """y = x^2 about 0 has no linear uncertainty; y = x has the normal one."""
+
+    def block(sequence, size):
+        x = np.random.default_rng(sequence).normal(size=size)
+        return np.stack([x, x**2], axis=1)
+
+    summary = montecarlo.propagate(block, trials=200_000, digits=1)
+    verdict = montecarlo.validate_linear(np.zeros(2), np.array([1.0, 1e-3]), summary).verdict
+    assert verdict.tolist() == [1, 0]
+
+
+def test_the_command_prints_and_stores_the_verdicts(measured, tmp_path):
+    out = tmp_path / "errors.nc"
+    command = ["identify", str(measured[0]), "--out", str(out), "--method", "straight", "--monte-carlo", str(TRIALS)]
+    result = CliRunner().invoke(app, [*command, "--scheduler", "sync", "--json"])
+    assert result.exit_code == 0, result.output
+    answer = json.loads(result.stdout)
+    stored = datasets.load(answer["monte_carlo"])
+    assert not list(datasets.violations(stored))
+    assert [verdict["freedom"] for verdict in answer["verdicts"]] == ["EX", "EY"]
+    assert {verdict["verdict"] for verdict in answer["verdicts"]} <= {"validated", "not validated", "undecided"}
+    page = tmp_path / "report.html"
+    assert CliRunner().invoke(app, ["report", str(out), "--out", str(page)]).exit_code == 0
+    assert "Monte Carlo evaluation of tool" in page.read_text(encoding="utf-8")
+    repeated = CliRunner().invoke(app, command)
+    assert repeated.exit_code == 1
+    assert "exists already" in repeated.output
+
+
+def test_a_number_of_trials_is_a_number(measured, tmp_path):
+    result = CliRunner().invoke(
+        app,
+        ["identify", str(measured[0]), "--out", str(tmp_path / "e.nc"), "--method", "straight", "--monte-carlo", "x"],
+    )
+    assert result.exit_code == 1
+    assert "expected 'auto' or a number of trials; found 'x'" in result.output
+
+
+def test_the_chapter_states_every_freedom(found):
+    (part,) = chapters(Source(found))
+    assert part.summary[0].startswith("Linear intervals: ")
+    head, rows = texts(found)
+    assert [row[0] for row in rows] == ["EX", "EY"]
+    assert all(len(row) == len(head) for row in rows)
+
+
+def test_what_breaks_the_schema_is_named(found):
+    broken = found.drop_vars("shortest").assign(verdict=found["verdict"] + 3)
+    with pytest.raises(DatasetError, match="shortest"):
+        datasets.validate(broken)

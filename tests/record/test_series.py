@@ -1,0 +1,158 @@
+"""Trend, steps and control limits of a series: coverage, false alarms and power against a known truth."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from errormotion.record.control import chart
+from errormotion.record.regression import by_moving_ranges, fit
+from errormotion.record.series import YEAR, Series
+from errormotion.record.steps import Model, model_of
+
+SLOPE = 2e-6
+"""True trend, m per year."""
+
+
+def series(
+    rng: np.random.Generator,
+    count: int,
+    tau: float,
+    size: float = 0.0,
+    after: int = 0,
+    shared: float = 0.0,
+    slope: float = SLOPE,
+) -> Series:
+    """Return three years of values with u of 0.5 um to 1.5 um; a step of ``size`` u before value ``after``."""
+    t = np.sort(rng.uniform(0, 3 * YEAR, count))
+    u = rng.uniform(0.5e-6, 1.5e-6, count)
+    y = 5e-6 + slope * t / YEAR + u * rng.normal(size=count) + tau * rng.normal(size=count)
+    y += size * np.sqrt(np.mean(u**2) + tau**2) * (np.arange(count) >= after) + shared * rng.normal()
+    F = np.full((1, count), shared)
+    return Series(t, y, np.sqrt(u**2 + shared**2), F, ["bar"] if shared else [])
+
+
+def bound(rate: float, count: int) -> float:
+    """Return three standard deviations of a rate that is counted."""
+    return 3 * float(np.sqrt(rate * (1 - rate) / count))
+
+
+@pytest.mark.parametrize("tau", [0.0, 2e-6])
+def test_false_alarms_and_coverage_without_a_step(tau: float) -> None:
+    rng, count = np.random.default_rng(1), 100
+    found = [model_of(series(rng, 16, tau)) for _ in range(count)]
+    assert np.mean([bool(each.steps) for each in found]) <= 0.05 + bound(0.05, count)
+    assert np.mean([bool(each.departing) for each in found]) <= 0.02 + bound(0.02, count)
+    covered = np.mean([each.trend[1] <= SLOPE <= each.trend[2] for each in found])
+    assert covered >= 0.95 - bound(0.95, count)
+
+
+def test_a_step_of_four_standard_deviations_is_found_where_it_is_with_its_size() -> None:
+    rng, count, n = np.random.default_rng(2), 60, 36
+    hits, within, covered = 0, 0, 0
+    for _ in range(count):
+        values = series(rng, n, 1e-6, size=4.0, after=20)
+        steps = model_of(values).steps
+        hits += bool(steps)
+        for step in steps[:1]:
+            within += step.first < 20 <= step.last
+            true = 4 * np.sqrt(np.mean(values.u**2) + 1e-12)
+            covered += abs(step.size - true) <= step.half_width
+    assert hits >= (0.9 - bound(0.9, count)) * count
+    assert within >= (0.95 - bound(0.95, hits)) * hits
+    assert covered >= (0.9 - bound(0.9, hits)) * hits
+
+
+def test_several_steps_are_found_and_a_departure_is_none() -> None:
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(20):
+        values = series(rng, 45, 0.5e-6)
+        y = values.value + 12e-6 * (np.arange(45) >= 15) - 12e-6 * (np.arange(45) >= 30)
+        y[22] += 20e-6
+        found.append(model_of(Series(values.time, y, values.u)))
+    counts = [(len(each.steps), each.departing) for each in found]
+    assert np.mean([count == (2, (22,)) for count in counts]) >= 0.75  # exactly: some have a false one beside
+    assert all({step.index for step in each.steps} & {14, 15, 16} for each in found)
+
+
+def test_a_step_between_equal_times_is_not_sought() -> None:
+    t = np.repeat([0.0, 1.0, 2.0], 4) * YEAR
+    y = np.where(np.arange(12) >= 6, 50e-6, 0.0)
+    steps = model_of(Series(t, y + 1e-7 * np.arange(12) % 3, np.full(12, 1e-6))).steps
+    assert all(step.index in (4, 8) for step in steps)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_values_have_no_step(count: int) -> None:
+    values = series(np.random.default_rng(4), count, 0.0)
+    found = model_of(values)
+    assert found.steps == ()
+    assert (found.fit is None) == (count <= 2)
+    assert np.isfinite(chart(values, found).upper).all()
+
+
+def test_a_shared_source_shifts_the_constant_and_not_the_trend() -> None:
+    values = series(np.random.default_rng(5), 20, 0.0, shared=50e-6)
+    alone = Series(values.time, values.value, np.sqrt(values.u**2 - 50e-6**2))
+    X = np.column_stack([np.ones(20), values.years])
+    shared, without = (fit(X, each.value, each.covariance) for each in (values, alone))
+    assert shared is not None
+    assert without is not None
+    assert shared.parameters[1] == pytest.approx(without.parameters[1], rel=1e-6)
+    assert shared.half_width[1] == pytest.approx(without.half_width[1], rel=1e-6)
+    assert shared.half_width[0] > 40 * without.half_width[0]
+    limits, same = (chart(each, Model(None)) for each in (values, alone))
+    assert limits.upper - limits.lower == pytest.approx(same.upper - same.lower, rel=1e-6)
+
+
+@pytest.mark.parametrize("tau", [0.0, 1e-6, 4e-6])
+def test_both_estimates_of_the_reproducibility_are_near_the_truth(tau: float) -> None:
+    rng, n = np.random.default_rng(6), 400
+    values = series(rng, n, tau)
+    X = np.column_stack([np.ones(n), values.years])
+    found = fit(X, values.value, values.covariance)
+    assert found is not None
+    spread = np.sqrt(np.mean(values.u**2) + tau**2)
+    for estimate in (found.tau, by_moving_ranges(values.value, values.covariance)):
+        # variance of an estimated variance: 2 / n, about 1.6 times as much from ranges
+        assert abs(estimate**2 - tau**2) <= 4 * spread**2 * np.sqrt(2 * 1.65 / n)
+
+
+def test_the_trend_is_that_of_ordinary_least_squares_where_all_uncertainties_are_alike() -> None:
+    rng, n = np.random.default_rng(7), 12
+    t, y = np.arange(n) * YEAR / 4, rng.normal(0, 5e-6, n)
+    X = np.column_stack([np.ones(n), t / YEAR])
+    found = fit(X, y, np.eye(n) * 1e-14)
+    assert found is not None
+    expected, (square,), *_ = np.linalg.lstsq(X, y, rcond=None)
+    assert found.parameters == pytest.approx(expected, rel=1e-9)
+    assert found.covariance == pytest.approx(np.linalg.inv(X.T @ X) * square / (n - 2), rel=1e-4)
+
+
+def test_values_in_control_are_outside_of_their_limits_as_often_as_three_sigma_state() -> None:
+    rng, count, n = np.random.default_rng(8), 200, 100
+    outside = ranges = 0
+    for _ in range(count):
+        values = series(rng, n, 1e-6, slope=0.0)
+        limits = chart(values, Model(None))
+        outside += limits.outside(values.value).sum()
+        ranges += (limits.moving_range > limits.range_limit).sum()
+    stated = 2 * norm.sf(3)
+    # tau is estimated: with 60 degrees of freedom three sigma are exceeded 1.4 times as often
+    assert stated / 2 <= outside / (count * n) <= 2.5 * stated
+    assert ranges / (count * (n - 1)) == pytest.approx(2 * norm.sf(2.606), abs=0.003)
+
+
+def test_limits_follow_the_uncertainty_of_each_run_and_begin_anew_after_a_step() -> None:
+    rng, n = np.random.default_rng(9), 40
+    u = np.where(np.arange(n) % 2, 3e-6, 0.5e-6)
+    y = u * rng.normal(size=n) + 100e-6 * (np.arange(n) >= 20)
+    values = Series(np.arange(n) * YEAR / 12, y, u)
+    found = model_of(values)
+    assert [step.index for step in found.steps] == [20]
+    limits = chart(values, found)
+    width = limits.upper - limits.centre
+    assert (width[1::2] > 1.5 * width[::2]).all()
+    assert np.unique(limits.centre).size == 2
+    assert limits.centre[[0, -1]] == pytest.approx([0.0, 100e-6], abs=1e-6)
+    assert np.isnan(limits.moving_range[19])
