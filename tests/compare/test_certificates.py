@@ -83,3 +83,36 @@ def test_one_thermometer_in_two_volumes_is_one_draw():
 def test_certificates_that_are_none_are_refused(text):
     with pytest.raises(DatasetError, match="attribute 'certificates': expected a JSON object"):
         certificates.certified({"certificates": text}, {"bar radius": ("bar", "radius")})
+
+
+def identities(ds):
+    return {str(name): str(key) for name, key in zip(ds["source"].values, ds["source_id"].values, strict=True) if key}
+
+
+def test_each_source_that_can_be_certified_has_its_identity():
+    stated = {"certificates": json.dumps(dict.fromkeys(certificates.ITEMS, "N-1")), "start": START}
+    machine = VirtualMachine("cframe", seed=3)
+    machine.start([Event(120.0, 12000.0, None)])
+    times = np.arange(0.25, 3600.0, 20.0)
+    raw = drifting.raw_drift(machine, times, seed=1, beams="true", warm_up=False, expansion=True).assign_attrs(stated)
+    raw = raw.assign(frame_expansion=(("channel", "direction"), np.full((5, 3), 2e-6), {"units": "m/K"}))
+    settings = {"average": 40.0, "bar_radius_uncertainty": U_RADIUS, "frame_temperature": str(raw["sensor"].values[0])}
+    found = identities(identified("spindle_drift", raw, **settings))
+    assert found["bar radius"] == "certificate N-1: bar, radius"
+    assert found["frame expansion"] == "certificate N-1: frame, coefficient of expansion"
+
+    raw = tracking.raw(machine, tracking.target_grid(machine, (3, 3, 2)), seed=1).assign_attrs(stated)
+    warm = {"temperature": 24.0, "coefficient_uncertainty": 1e-6, "temperature_uncertainty": 0.2}
+    volume = identified(
+        "multilateration", raw, parametric=False, scale_uncertainty=1e-6, expansion={"coefficient": 11e-6, **warm}
+    )
+    found = identities(volume)
+    assert found["tracker scale"] == "certificate N-1: tracker, scale"
+    assert found["coefficient of expansion"] == "certificate N-1: scales, coefficient of expansion"
+    assert found["scale temperature X"] == "certificate N-1: scale thermometer, offset at X"
+
+    (beam,) = plugins.get("methods", "beam_direction")().conformance()
+    raw, _ = beam.make(0)
+    settings = {**beam.settings, "layout": {**beam.settings["layout"], "scale_uncertainty": 1e-3}}
+    found = identities(identified("beam_direction", raw.assign_attrs(stated), **settings))
+    assert found == {"scale of the sensor": "certificate N-1: sensor, gain"}
