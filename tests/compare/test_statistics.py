@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import kstest
 
 from errormotion.compare.consensus import consensus, random_effects
-from errormotion.compare.normal import Information, Reduced, short, solve
 from errormotion.compare.low_rank import whitener
+from errormotion.compare.normal import Information, Reduced, short, solve
 from errormotion.compare.pairs import pair
 from errormotion.compare.stack import Estimate, gathered
 
