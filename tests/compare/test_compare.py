@@ -315,6 +315,31 @@ def test_sizes_are_printed_in_the_units_of_the_field():
     assert re.search(r"^Z -?[23]\d\.?\d* ± \d\.?\d* mm$", point.size)
 
 
+def test_datasets_without_any_source_are_compared():
+    t, rng = np.arange(0.0, 3000.0, 300.0), np.random.default_rng(6)
+
+    def plain(u):
+        values = drift(t) + u * rng.normal(size=(len(t), 6))
+        columns = {
+            name: ("time", values[:, k], {"units": "m" if k < 3 else "rad"}) for k, name in enumerate(datasets.DOF)
+        }
+        columns["covariance"] = (("time", "dof", "dof_"), np.tile(np.eye(6) * u**2, (len(t), 1, 1)))
+        return made(t, rng).drop_dims("source").assign(columns)
+
+    found = compare({"one": plain(1e-7), "exact": plain(1e-10)})
+    assert float(found["p"].min()) > 1e-4
+    en = found["en"].values
+    assert np.mean(np.abs(en[np.isfinite(en)]) <= 1) > 0.8
+
+
+def test_a_wrong_functional_point_is_found_where_some_rotations_are_compared():
+    t, rng = np.arange(0.0, 9000.0, 300.0), np.random.default_rng(7)
+    moved = made(t, rng, name="moved").em.at([0.0, 0.0, 0.05]).assign_attrs(functional_point=[0.0, 0.0, 0.0])
+    found = compare({"moved": moved, "right": made(t, rng)}, freedoms=("EX", "EY", "EZ", "EA"))
+    names = [cause.name for rank in range(found.sizes["rank"]) if (cause := cause_text(found, 0, rank)) is not None]
+    assert names[0].startswith("functional point of '")
+
+
 def single(values):
     """Return errors at one position."""
     return datasets.build_errors(
