@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.diagnosis import Cause, diagnose
+from errormotion.compare.diagnosis.shift import course_of
 from errormotion.compare.ground import Ground, common_ground
 from errormotion.compare.pairs import pair
 from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
-from errormotion.compare.shift import course_of
 from errormotion.compare.stack import Estimate
 from errormotion.errors import DatasetError
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from errormotion.compare.diagnosis.shift import fitted, smooth
 from errormotion.compare.low_rank import whitener
-from errormotion.compare.shift import fitted, smooth
 
 SIZE, NOISE = np.array([10e-6, 5e-6, 20e-6]), 1e-7
 LATE = 183.0
