@@ -180,9 +180,9 @@ def _placed_anew(series: Series, base: Array, found: list[Candidate]) -> list[Ca
         for number, each in enumerate(found):
             others = found[:number] + found[number + 1 :]
             candidates = _candidates(series, others, each.single)
-            if candidates:
-                best = _Trial(series, _design(base, others), candidates).best()
-                found[number] = replace(best, p=each.p)
+            trial = _Trial(series, _design(base, others), candidates) if candidates else None
+            if trial is not None and trial.candidates:
+                found[number] = replace(trial.best(), p=each.p)
         if found == before:
             break
     return found
@@ -254,6 +254,8 @@ def _interval(series: Series, base: Array, found: list[Candidate], number: int, 
     """Return the last value surely before a step, and the first one surely after it."""
     others = found[:number] + found[number + 1 :]
     trial = _Trial(series, _design(base, others), _candidates(series, others, single=False), V)
+    if not trial.candidates:
+        return found[number].index - 1, found[number].index
     gain = trial.squares()
     inside = [c.index for c, each in zip(trial.candidates, gain, strict=True) if each >= gain.max() - LIKELIHOOD_DROP]
     return min(inside) - 1, max(inside)

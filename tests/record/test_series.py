@@ -91,6 +91,35 @@ def test_few_values_have_no_step(count: int) -> None:
     assert np.isfinite(chart(values, found).upper).all()
 
 
+@pytest.mark.parametrize("kind", ["constant", "alternating", "huge", "one time", "tiny", "mixed", "all shared"])
+@pytest.mark.parametrize("count", [3, 7, 12])
+def test_any_series_has_an_answer(count: int, kind: str) -> None:
+    rng = np.random.default_rng(2)
+    t, u, y = np.sort(rng.uniform(0, YEAR, count)), np.full(count, 1e-6), 1e-6 * rng.normal(size=count)
+    F, identities = np.zeros((0, count)), list[str]()
+    if kind == "constant":
+        y[:] = 5e-6
+    elif kind == "alternating":
+        y = 1e-6 * (np.arange(count) % 2)
+    elif kind == "huge":
+        y *= 1e9
+    elif kind == "one time":
+        t[:] = t[0]
+    elif kind == "tiny":
+        u[:] = 1e-15
+    elif kind == "mixed":
+        u = 10.0 ** rng.uniform(-12, -3, count)
+    else:
+        F, identities = u[None].copy(), ["bar"]
+    values = Series(t, y, u, F, identities)
+    found = model_of(values)
+    limits = chart(values, found)
+    assert (limits.upper >= limits.lower).all()
+    assert (found.fit is None) == (kind == "one time")
+    assert all(step.first < step.index <= step.last for step in found.steps)
+    assert kind != "constant" or found.steps == ()
+
+
 def test_a_shared_source_shifts_the_constant_and_not_the_trend() -> None:
     values = series(np.random.default_rng(5), 20, 0.0, shared=50e-6)
     alone = Series(values.time, values.value, np.sqrt(values.u**2 - 50e-6**2))
