@@ -170,6 +170,21 @@ def test_a_list_of_recordings_names_files(tmp_path) -> None:
         read_index(path)
 
 
+def test_a_long_list_of_recordings_is_refused_before_it_is_taken_apart(tmp_path) -> None:
+    path = tmp_path / "list.rec"
+    path.write_text("errormotion-sessions/1\n" + 50_000 * "\n")
+    tracemalloc.start()
+    try:
+        with pytest.raises(ReplayError, match="at most 64 recordings; found 50000"):
+            read_index(path)
+        assert tracemalloc.get_traced_memory()[1] < 40 * 50_000
+    finally:
+        tracemalloc.stop()
+    path.write_text("errormotion-sessions/1\n" + "frame a.rec\n" * 100_000)
+    with pytest.raises(ReplayError, match="of at most"):
+        read_index(path)
+
+
 def test_the_end_of_an_answer_is_found_wherever_pieces_end() -> None:
     line = Received(b"")
     for data in (b"abc-->d->", b"-" * 9 + b">x", b"->"):

@@ -41,6 +41,8 @@ NOTE = "NOTE "
 MOST_NOTE_BYTES = 1 << 20
 MOST_PARTS = 64
 """Recordings in a list."""
+MOST_INDEX = MOST_NOTE_BYTES + (1 << 16)
+"""Bytes of a list of recordings."""
 
 
 class EndOfRecordingError(ReplayError):
@@ -256,13 +258,15 @@ def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
 def read_index(path: Path) -> dict[str, Path]:
     """Return the recordings that a list names, by part; ReplayError where it is not such a list."""
     try:
+        if (size := path.stat().st_size) > MOST_INDEX:
+            raise ReplayError(f"{path}: expected a list of recordings of at most {MOST_INDEX} bytes; found {size}")
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ReplayError(f"The recording {path} cannot be read: {error}") from None
-    pairs = [line.partition(" ") for line in lines[1 + _has_note(lines) :]]
     expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
-    if len(pairs) > MOST_PARTS:
-        raise ReplayError(f"{path}: expected a list of at most {MOST_PARTS} recordings; found {len(pairs)}")
+    if (count := len(lines) - 1 - _has_note(lines)) > MOST_PARTS:
+        raise ReplayError(f"{path}: expected a list of at most {MOST_PARTS} recordings; found {count}")
+    pairs = [line.partition(" ") for line in lines[-count:]] if count > 0 else []
     if not lines or lines[0] != expected or not all(_is_name(name) for _, _, name in pairs):
         raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
     try:
