@@ -137,6 +137,7 @@ def test_what_plain_xarray_does_to_a_covariance_is_reported(change):
     changed = change(ds).assign_attrs(ds.attrs)
     assert any("time_index" in each and "ds.em" in each for each in datasets.violations(changed))
     assert datasets.violations(ds.isel(time=slice(2, 9, 3))) == []
+    assert datasets.violations(ds.isel(time=3)) == []
 
 
 @pytest.mark.parametrize(
