@@ -12,6 +12,7 @@ LAYERS = [
     [("compensation", "thermal models")],
     [("compare", "agreement of several results")],
     [("testing", "conformance kit for plugins")],
+    [("montecarlo", "uncertainty by JCGM 101")],
     [("methods", "one folder a method"), ("instruments", "one folder a kind, a device")],
     [("report", "elements of chapters")],
     [("tolerances", "limits and decisions")],
@@ -24,7 +25,7 @@ COLOURS = ("#dbe9f6", "#e8eef4")
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(7.6, 9.4), dpi=130)
+    figure, axes = plt.subplots(figsize=(7.6, 10.1), dpi=130)
     height, gap = 0.78, 0.22
     for level, row in enumerate(reversed(LAYERS)):
         width = 8.0 / len(row)

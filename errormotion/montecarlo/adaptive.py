@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from errormotion.arrays import Array
-from errormotion.montecarlo.intervals import fewest, shortest, standard_errors, symmetric
+from errormotion.montecarlo.intervals import confidence, fewest, shortest, standard_errors, symmetric
 
 Block = Callable[[SeedSequence, int], Array]
 """``block(sequence, size)``: ``size`` samples of k quantities (size, k), NaN where a trial gave no value."""
@@ -25,6 +25,8 @@ MOST_TRIALS = 1_000_000
 """Trials after which the adaptive procedure stops in any case."""
 STABLE = float(ndtr(2.0))
 """Quantile that belongs to the factor of two standard deviations."""
+FALSE_ALARM = 0.05
+"""Probability that the finite number of trials puts the end of any interval outside of its bounds."""
 COLUMNS = 4_000_000
 """Samples that are sorted at a time, which bounds the memory."""
 
@@ -47,6 +49,8 @@ class Summary:
         Ends of the intervals, 7.7.
     standard_error : ndarray (2, k)
         Of both ends of the symmetric interval, from the finite number of trials.
+    low_bounds, high_bounds : ndarray (2, k)
+        Bounds of both ends that hold for all quantities together with a probability of 95 % (Bonferroni).
     tolerance : ndarray (k,)
         Numerical tolerance of the standard uncertainty, 7.9.2.
     missing : ndarray (k,)
@@ -63,6 +67,8 @@ class Summary:
     symmetric: Array
     shortest: Array
     standard_error: Array
+    low_bounds: Array
+    high_bounds: Array
     tolerance: Array
     missing: NDArray[np.int64]
     stable: NDArray[np.bool_]
@@ -213,7 +219,7 @@ def summarise(
     """Return what the samples of all blocks, each (n, k), say; a part of the quantities is sorted at a time."""
     trials, k = sum(len(block) for block in blocks), blocks[0].shape[1]
     mean, u, tolerance = (np.full(k, np.nan) for _ in range(3))
-    central, short, error = (np.full((2, k), np.nan) for _ in range(3))
+    central, short, error, low_bounds, high_bounds = (np.full((2, k), np.nan) for _ in range(5))
     missing = np.zeros(k, dtype=np.int64)
     step = max(1, COLUMNS // max(trials, 1))
     for first in range(0, k, step):
@@ -229,6 +235,9 @@ def summarise(
             mean[at], u[at] = values.mean(axis=0), values.std(axis=0, ddof=1)
             central[:, at], short[:, at] = symmetric(values, probability), shortest(values, probability)
             error[:, at] = standard_errors(values, probability)
+            low_bounds[:, at], high_bounds[:, at] = confidence(values, probability, FALSE_ALARM / (2 * k))
     tolerance = numerical_tolerance(u, digits)
     found = np.zeros(k, dtype=bool) if stable is None else stable
-    return Summary(trials, probability, digits, mean, u, central, short, error, tolerance, missing, found)
+    return Summary(
+        trials, probability, digits, mean, u, central, short, error, low_bounds, high_bounds, tolerance, missing, found
+    )

@@ -38,6 +38,24 @@ def standard_errors(ordered: Array, probability: float) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
+def confidence(ordered: Array, probability: float, alarm: float) -> tuple[Array, Array]:
+    """Return bounds (2, k) of the low and of the high end of the symmetric interval, from ordered samples (M, k).
+
+    Each end is outside of its bounds with at most the probability ``alarm``, whatever the distribution: the number of
+    samples below a quantile is binomial. Infinite where the samples are too few.
+    """
+    from scipy.stats import binom
+
+    count, share = len(ordered), (1.0 - probability) / 2.0
+    beyond = np.full((1, ordered.shape[1]), np.inf)
+    padded = np.concatenate([-beyond, ordered, beyond])  # sample number r, counted from 1, is row r
+    found = []
+    for q in (share, 1.0 - share):
+        low, high = (int(binom.ppf(p, count, q)) for p in (alarm / 2, 1.0 - alarm / 2))
+        found.append(np.stack([padded[low], padded[min(high + 1, count + 1)]]))
+    return found[0], found[1]
+
+
 def fewest(probability: float) -> int:
     """Return the fewest samples that have an interval with samples on both sides of it."""
     return int(np.ceil(round(2.0 / (1.0 - probability), 9)))

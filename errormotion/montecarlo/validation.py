@@ -13,8 +13,6 @@ from errormotion.montecarlo.adaptive import Summary
 
 VALIDATED, NOT_VALIDATED, UNDECIDED = 1, 0, -1
 WORDS = {VALIDATED: "validated", NOT_VALIDATED: "not validated", UNDECIDED: "undecided"}
-FALSE_ALARM = 0.05
-"""Probability that the finite number of trials decides any of all quantities wrongly."""
 MOST_MISSING = 0.01
 """Share of trials without a value above which a quantity is undecided."""
 
@@ -63,18 +61,20 @@ def validate_linear(
 
     Notes
     -----
-    The ends of the trials' interval have standard errors. A quantity is decided where its distances are inside or
-    outside the tolerance by a margin; the margin holds jointly for all quantities with probability 95 % (Bonferroni).
+    The ends of the trials' interval are known within bounds, which hold for all quantities together with a probability
+    of 95 %. A quantity is decided where all that lies within the bounds is inside the tolerance, or all outside.
     """
     k = float(ndtri(0.5 + found.probability / 2)) if factor is None else factor
     ends = np.stack([value - k * uncertainty, value + k * uncertainty])
-    distance = np.abs(ends - (found.shortest if short else found.symmetric))
+    seen = found.shortest if short else found.symmetric
+    distance = np.abs(ends - seen)
     known = np.isfinite(distance).all(axis=0)
-    margin = -float(ndtri(FALSE_ALARM / 4 / max(int(known.sum()), 1))) * found.standard_error
     limit = np.maximum(found.tolerance, floor)
     with np.errstate(invalid="ignore"):
-        inside = np.all(distance + margin <= limit, axis=0) | np.all(distance <= floor, axis=0)
-        outside = np.any(distance - margin > limit, axis=0)
+        bounds = np.stack([found.low_bounds, found.high_bounds], axis=1) + (seen - found.symmetric)
+        off = bounds - ends
+        inside = np.all(np.abs(off) <= limit, axis=(0, 1)) | np.all(distance <= floor, axis=0)
+        outside = np.any((off[0] > limit) | (off[1] < -limit), axis=0)
     verdict = np.where(inside, VALIDATED, np.where(outside, NOT_VALIDATED, UNDECIDED))
     verdict[~known | (found.missing > MOST_MISSING * found.trials)] = UNDECIDED
     return Validation(distance[0], distance[1], verdict.astype(np.int8))

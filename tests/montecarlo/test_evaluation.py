@@ -21,7 +21,7 @@ from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redra
 from errormotion.report.document import Source
 
 TRIALS = 40
-NOISE, OFFSET = 1e-6, 2e-6  # m
+NOISE, OFFSET = 0.5e-6, 0.9e-6  # m
 
 
 class Straight:
@@ -111,6 +111,17 @@ def test_processes_and_a_cluster_give_the_same_bits(tmp_path):
     assert _evaluate(given, tmp_path / "one", scheduler="processes", workers=2).identical(found)
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
         assert _evaluate(given, tmp_path / "two", scheduler=cluster.scheduler_address).identical(found)
+
+
+@pytest.mark.slow
+def test_as_many_trials_as_it_takes(measured, tmp_path, monkeypatch):
+    """u = 1.03 um and a tolerance of 0.5 um: some hundred trials decide, and the linear model is validated."""
+    monkeypatch.setattr(evaluation, "block_size", lambda probability, cheap: 60)
+    found = _evaluate(measured, tmp_path / "trials", trials=None, scheduler="sync", most=3000)
+    assert 120 <= found.attrs["trials"] < 3000
+    assert found.attrs["trials"] % 60 == 0
+    assert found["stable"].sel(dof=["EX", "EY"]).values.all()
+    assert (found["verdict"].sel(dof=["EX", "EY"]) == 1).all()
 
 
 def test_a_stopped_evaluation_continues_where_it_was(measured, found, tmp_path, monkeypatch):

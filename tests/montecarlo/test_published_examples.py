@@ -222,3 +222,22 @@ def test_another_package_gives_the_same_gauge_block():
     assert ours.uncertainty[0] == pytest.approx(theirs.std(), abs=0.4)
     ends = np.array(intervals.symmetric(theirs, 0.99))[:, 0]
     np.testing.assert_array_less(np.abs(ours.symmetric[:, 0] - ends), 4 * error)
+
+
+def test_bounds_of_an_end_hold_as_often_as_stated():
+    """Of 4000 samples of 300, both quantiles lie within their bounds but for the stated share."""
+    samples = np.sort(np.random.default_rng(2).exponential(size=(300, 4000)), axis=0)
+    alarm = 0.05
+    for bounds, q in zip(intervals.confidence(samples, 0.95, alarm), (0.025, 0.975), strict=True):
+        missed = int(((bounds[0] > -np.log(1 - q)) | (bounds[1] < -np.log(1 - q))).sum())
+        # at most the stated share, and not much less: the binomial distribution is discrete
+        assert stats.binom.ppf(1e-4, 4000, alarm / 3) < missed < stats.binom.ppf(1 - 1e-4, 4000, alarm)
+
+
+def test_a_linear_model_is_never_rejected_by_few_trials():
+    """Two hundred quantities by 100 trials each, as normal as they are stated: none may be 'not validated'."""
+    for seed in range(20):
+        found = propagate(
+            lambda sequence, n: np.random.default_rng(sequence).normal(size=(n, 200)), trials=100, seed=seed
+        )
+        assert (validate_linear(np.zeros(200), np.ones(200), found).verdict != NOT_VALIDATED).all()
