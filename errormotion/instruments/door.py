@@ -76,6 +76,18 @@ class Door:
             self.coordinate(axis, x)
         return found
 
+    def extent(self, way: Sequence[float], what: str) -> None:
+        """Raise InstrumentError unless a way, (3,) m, is finite and no longer than the distance of the limits."""
+        if len(way) != 3 or not all(isinstance(x, int | float) and abs(x) < 1e300 for x in way):
+            raise InstrumentError(f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {way!r}")
+        for axis, x in zip("XYZ", way, strict=True):
+            span = self.limits.spans.get(axis)
+            if span is not None and abs(x) > span[1] - span[0] + _ROUNDING:
+                raise InstrumentError(
+                    f"{self._where}: {axis} would go {1e3 * abs(x):.6g} mm; the limits of the bench are "
+                    f"{1e3 * (span[1] - span[0]):.6g} mm apart. Nothing was sent"
+                )
+
     def coordinate(self, axis: str, x: float) -> None:
         """Raise InstrumentError where the coordinate of an axis, m, is outside of the limits."""
         span = self.limits.spans.get(axis)

@@ -18,7 +18,12 @@ from errormotion.testing.kit import run_check
 from errormotion.testing.method_checks import METHOD_CHECKS
 
 ROOT = Path(__file__).parents[2]
-EXAMPLES = sorted(path for path in (ROOT / "examples").glob("virtual_*/*.toml") if path.name != "bench.toml")
+EXAMPLES = sorted(
+    path
+    for folder in ("virtual_*", "one_machine")
+    for path in ROOT.glob(f"examples/{folder}/*.toml")
+    if path.name != "bench.toml"
+)
 LIMITS = """
 [limits]
 X = ["0.4 mm", "1.4 mm"]

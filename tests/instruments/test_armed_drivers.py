@@ -36,6 +36,7 @@ ARGUMENTS: dict[str, Any] = {
     "text": "G90 G21\nG1 X1 F100\nM30\n",
     "tool": "bar",
     "schedule": [{"time": 0.0, "spindle_speed": 100.0}],
+    "time": 0.0,
     "step": 1e-3,
     "count": 3,
     "kind": "plane",
@@ -120,7 +121,7 @@ TIGHT = MachineLimits({"X": (-1e-3, 1e-3), "Y": (-1e-3, 1e-3), "Z": (-1e-3, 1e-3
 WRONG = [math.nan, math.inf, -math.inf, 1e308, 10**400, "fast"]
 
 
-MOVES = ("move_to", "probe", "spindle", "run_program", "run_steps", "start")
+MOVES = ("move_to", "probe", "spindle", "run_program", "run_steps", "start", "follow")
 
 
 @pytest.mark.parametrize(

@@ -355,7 +355,7 @@ def test_iso_code_shows_damaged_characters() -> None:
 def test_lines_of_a_cycle_that_came_too_late_are_no_touches_of_the_next_one(late: int) -> None:
     touches = ball_touches()
     address = f"{ADDRESS}&fault=late&fault_at={late}&late_by=0.5"
-    with Dprnt(address, QUICK) as probe, VirtualController("sim://cframe/controller?seed=3") as control:
+    with Dprnt(address, QUICK) as probe, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         begun = control.run_program(program(touches))
         here = world("cframe", 3)
         blocks = [when for when, order in here.port_output if not isinstance(order, str)]

@@ -179,10 +179,7 @@ class VirtualController(Driver):
         InstrumentError
             A stream is running, or the machine cannot follow the schedule.
         """
-        events = [event_fields(event) for event in schedule]
-        for event in events:
-            self._door.speed(event.get("spindle_speed", 0.0))
-        self._change("start", schedule=events)
+        self._change("start", schedule=self._events(schedule))
 
     def follow(self, schedule: Iterable[Any], time: float) -> None:
         """Warm up by a schedule from time 0 on, and set the clock to a time, s, also back.
@@ -195,7 +192,7 @@ class VirtualController(Driver):
         InstrumentError
             A stream is running, alarm, or the machine cannot follow the schedule.
         """
-        self._call("follow", schedule=[event_fields(event) for event in schedule], time=float(time))
+        self._change("follow", schedule=self._events(schedule), time=float(time))
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
@@ -218,7 +215,8 @@ class VirtualController(Driver):
         Parameters
         ----------
         start : (3,)
-            Commanded centre of the sphere at the first position, m.
+            Commanded centre of the sphere at the first position, m, in the coordinates of the measuring frame. Where
+            the frame stands on the machine is unknown to the driver: of the limits, it holds the length of the way.
         direction : (3,)
             Of the steps.
         step : float
@@ -232,9 +230,10 @@ class VirtualController(Driver):
         dict
             ``duration`` of the motion and ``longest_lead_in`` before it, s.
         """
-        goal = [x + step * (count - 1) * u for x, u in zip(start, direction, strict=True)]
-        self._door.position(start, "start")
-        self._door.position(goal, "end")
+        way = [float(step) * (count - 1) * float(u) for u in direction]
+        self._door.extent(way, "steps")
+        if not all(math.isfinite(x) for x in start):
+            raise InstrumentError(f"Expected a start of three finite numbers; found {start!r}")
         self._door.feed(step / travel if travel > 0 else math.nan)
         return self._facts(
             "run_steps",
@@ -388,6 +387,13 @@ class VirtualController(Driver):
             what = ", ".join(missing) if isinstance(found, dict) else "everything"
             raise ProtocolError(f"The answer to '{op}' lacks {what}; found {str(found)[:200]}")
         return found
+
+    def _events(self, schedule: Iterable[Any]) -> list[dict[str, Any]]:
+        """Return the events of a schedule, whose spindle speeds are within the limits."""
+        events = [event_fields(event) for event in schedule]
+        for event in events:
+            self._door.speed(event.get("spindle_speed", 0.0))
+        return events
 
     def _change(self, op: str, **arguments: Any) -> Any:
         """Send an order that moves or changes the machine."""

@@ -62,6 +62,10 @@ class FrameSettings(SensorSettings):
     direction: dict[str, Vector] = Field(
         default_factory=lambda: dict(NOMINAL_DIRECTION), description="beam directions as drawn (x, y, z)"
     )
+    machine_position: Place = Field(
+        default=(0.0, 0.0, 0.0),
+        description="machine coordinates (X, Y, Z) of the origin of the frame, for the limits of the bench",
+    )
     bar_radius: Length = Field(default=5e-3, description="calibrated radius of the bar", gt=0)
     levels: tuple[Length, Length] = Field(default=(_L1, _L2), description="z of the levels L1 and L2")
     expansion: tuple[Expansion, Expansion, Expansion] = Field(

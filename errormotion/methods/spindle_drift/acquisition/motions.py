@@ -51,13 +51,15 @@ def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
             "direction); without them the positions of the sphere are unknown"
         )
     unit = np.array([direction[name] for name in CHANNELS], np.float64)
+    stands = np.array(getattr(frame, "machine_position", (0.0, 0.0, 0.0)), np.float64)
     centres, _ = sphere_centres(
         settings,
         np.array([origin[name] for name in CHANNELS], np.float64),
         unit / np.linalg.norm(unit, axis=1, keepdims=True),
     )
     return [
-        Step("move", (float(x), float(y), float(z)), math.nan, settings.dwell) for x, y, z in centres.reshape(-1, 3)
+        Step("move", (float(x), float(y), float(z)), math.nan, settings.dwell)
+        for x, y, z in (stands + centres).reshape(-1, 3)
     ]
 
 

@@ -799,6 +799,20 @@ def test_a_long_program_comes_in_parts(play: Callable[[Test], None], monkeypatch
     play(test)
 
 
+@pytest.mark.parametrize("offset", ["g5x_offset", "g92_offset", "tool_offset", "rotation_xy"])
+def test_a_program_in_machine_coordinates_does_not_run_with_an_offset(
+    play: Callable[[Test], None], offset: str
+) -> None:
+    async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
+        setattr(fake.values, offset, 1.0 if offset == "rotation_xy" else (0.0, 1.0, *(0.0,) * 7))
+        assert "an offset" in await wire.ask("run_program", text="M2", machine_coordinates=True)
+        assert "run" not in fake.lines
+        assert "program" in await wire.ask("run_program", text="M2")
+        await wire.ask("finish")
+
+    play(test)
+
+
 @pytest.mark.parametrize(
     ("limit", "line"),
     [(None, "G53 G0 "), (0.2, "G53 G0 "), (0.01, "G53 G1 F600.000000 ")],
