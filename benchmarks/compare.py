@@ -1,6 +1,7 @@
 """Time of comparisons: two long datasets, and many short ones, with their rates beside it."""
 
 import time
+import tracemalloc
 
 import numpy as np
 
@@ -37,21 +38,39 @@ def made(size: int, sources: int, rng: np.random.Generator, truth: np.ndarray) -
     )
 
 
-def main() -> None:
+def memory(size: int, sources: int) -> float:
+    """Return the largest memory that a comparison of two datasets allocates, MB."""
+    found = warm_ups(2, size, sources)
+    tracemalloc.start()
+    compare(found, causes=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 1e6
+
+
+def warm_ups(count: int, size: int, sources: int) -> dict[str, object]:
+    """Return datasets of one warm-up."""
     rng = np.random.default_rng(0)
-    for count, size, sources in ((2, 10_000, 30), (20, 200, 5)):
-        t = np.linspace(0.0, 7200.0, size)[:, None]
-        truth = 20e-6 * (1 - np.exp(-t / np.array([900.0, 1200, 1500, 1800, 2100, 2400])))
-        found = {f"dataset {k}": made(size, sources, rng, truth) for k in range(count)}
-        begin = time.perf_counter()
-        result = compare(found, causes=False)
-        seconds = time.perf_counter() - begin
-        en = np.abs(result["en"].values)
-        inside = np.mean(en[np.isfinite(en)] <= 1)
-        print(
-            f"{count} datasets of {size} instants with {sources} sources: {seconds:.2f} s; "
-            f"{result.sizes['pair']} pairs, |En| <= 1 in {100 * inside:.1f} %, joint p {result.attrs['fit_p']:.2f}"
-        )
+    t = np.linspace(0.0, 7200.0, size)[:, None]
+    truth = 20e-6 * (1 - np.exp(-t / np.array([900.0, 1200, 1500, 1800, 2100, 2400])))
+    return {f"dataset {k}": made(size, sources, rng, truth) for k in range(count)}
+
+
+def main() -> None:
+    for count, size, sources, uses in ((2, 10_000, 30, 2), (20, 200, 5, 1), (1000, 200, 5, 1)):
+        found = warm_ups(count, size, sources)
+        for use in range(uses):
+            begin, cpu = time.perf_counter(), time.process_time()
+            result = compare(found, causes=False)
+            seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
+            en = np.abs(result["en"].values)
+            print(
+                f"{count} datasets of {size} instants with {sources} sources{', again' if use else ''}: "
+                f"{seconds:.2f} s ({cpu:.2f} s of processor time); {result.sizes['pair']} pairs, |En| <= 1 in "
+                f"{100 * np.mean(en[np.isfinite(en)] <= 1):.1f} %, joint p {result.attrs['fit_p']:.2f}"
+            )
+    peaks = {size: memory(size, 30) for size in (10_000, 40_000)}
+    print("memory: " + ", ".join(f"{size} instants {peak:.0f} MB" for size, peak in peaks.items()))
 
 
 if __name__ == "__main__":

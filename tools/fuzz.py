@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import inspect
 import multiprocessing
 import os
 import platform
@@ -44,7 +45,7 @@ TABLE = (
     "|---|---|---|---|---|---|---|---|",
 )
 INSTRUMENTS = "errormotion/instruments"
-OF_PROGRAMME = tuple(f"tests/support/{name}.py" for name in ("fuzzing", "mutants", "wire_readers"))
+OF_PROGRAMME = tuple(f"tests/support/{name}.py" for name in ("fuzzing", "mutants"))
 SAME_FOR_ALL = (f"{INSTRUMENTS}/transports/**/*.py", f"{INSTRUMENTS}/*.py", *OF_PROGRAMME)
 """Files that every row depends on."""
 
@@ -63,14 +64,15 @@ def work(task: tuple[int, int, int]) -> tuple[int, fuzzing.Found]:
 
 
 @cache
-def code_of(device: str) -> str:
-    """Return a checksum of what a row depends on: the code of all instruments of the kind, and the good frames."""
+def code_of(codec: fuzzing.Codec) -> str:
+    """Return a checksum of what a row depends on: the code of all instruments of the kind, its reader, good frames."""
+    device = codec.device.partition(" ")[0]
     patterns = [*SAME_FOR_ALL, f"tests/data/vectors/{device}.toml"]
     for plugin in plugins.available("instruments"):
         if plugin.id == device:
             kind = plugin.entry_point.value.removeprefix(INSTRUMENTS.replace("/", ".") + ".").partition(".")[0]
             patterns.append(f"{INSTRUMENTS}/{kind}/**/*.py")
-    total = hashlib.sha256()
+    total = hashlib.sha256(inspect.getsource(codec.read).encode())
     for path in sorted({path for pattern in patterns for path in ROOT.glob(pattern)}):
         total.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return total.hexdigest()[:10]
@@ -87,7 +89,7 @@ def row(codec: fuzzing.Codec, found: fuzzing.Found) -> str:
         f"{found.memory / 1024:.0f} KiB",
         f"{codec.longest} bytes",
         errors,
-        f"`{code_of(codec.device.partition(' ')[0])}`",
+        f"`{code_of(codec)}`",
     )
     return f"| {' | '.join(cells)} |"
 
@@ -157,7 +159,7 @@ def is_done(body: str, codec: fuzzing.Codec, frames: int) -> bool:
     for line in body.splitlines():
         cells = [each.strip() for each in line.strip("| ").split("|")]
         if cells[0] == codec.name and len(cells) == TABLE[1].count("---"):
-            same = cells[-1] == f"`{code_of(codec.device.partition(' ')[0])}`"
+            same = cells[-1] == f"`{code_of(codec)}`"
             return same and int(cells[1]) >= frames and f"* {codec.name}: " not in body
     return False
 

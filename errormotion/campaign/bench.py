@@ -14,6 +14,7 @@ from errormotion.campaign.journal import cause_of
 from errormotion.errors import BenchError
 from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
+from errormotion.plugins.kind_registry import changes_machine
 
 log = logging.getLogger(__name__)
 
@@ -101,6 +102,7 @@ class OpenBench:
         for instrument in self.plan.instruments:
             try:
                 driver = instrument.driver(instrument.address, instrument.settings)
+                self._bind(driver)
                 try:
                     driver.open()
                     identity = driver.identify()
@@ -112,6 +114,21 @@ class OpenBench:
                 self.answers.append(Answer(instrument, error=cause_of(error)))
             else:
                 self.answers.append(Answer(instrument, driver, identity))
+
+    def hold(self, forbidden: str = "") -> None:
+        """Have every instrument hold the limits of the bench from now on; ``forbidden``: why none may move anything."""
+        for answer in self.answers:
+            if answer.driver is not None:
+                self._bind(answer.driver, forbidden)
+
+    def _bind(self, driver: Any, forbidden: str = "") -> None:
+        if hasattr(driver, "bound"):
+            driver.bound(self.plan.limits.of_machine(forbidden))
+        elif changes_machine(driver):
+            raise BenchError(
+                f"The driver '{driver.info.id}' can move or change a machine and holds no limits: it lacks the method "
+                "'bound'. 'errormotion plugins check' lists what such a driver needs"
+            )
 
     def close(self) -> None:
         """Close every instrument in reverse order, also if one of them fails."""

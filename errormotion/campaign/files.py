@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from errormotion import plugins
-from errormotion.campaign.limits import Limits, extent, steps_of, violations
+from errormotion.campaign.limits import NO_MOTIONS, Limits, extent, steps_of, violations
 from errormotion.campaign.machine import completed, contradictions, limits_within, read_machine
 from errormotion.campaign.timeline import Timeline, follower
 from errormotion.datasets import certificates
@@ -403,6 +403,8 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
         steps = steps_of(plugins.get("methods", method), settings, bench.settings_by_kind)
     except MethodError as error:
         return [f"{where}: {error}"]
+    if steps is None and hasattr(plugins.get("methods", method), "programs"):
+        return [f"{where}: {NO_MOTIONS.format(method)}, and it writes NC programs"]
     told = violations(extent(steps), bench.limits) if steps else []
     tables = "[limits]" if bench.description is None else "[limits] and [machine]"
     return [f"{where}: {text} ({tables} of {bench.source})" for text in told]

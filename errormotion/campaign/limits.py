@@ -11,7 +11,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from errormotion.datasets.units import Length, Speed, Velocity, format_quantity
-from errormotion.plugins import Step
+from errormotion.errors import MethodError
+from errormotion.plugins import MachineLimits, Step
 
 AXES = ("X", "Y", "Z")
 _ROUNDING = 1e-9
@@ -37,6 +38,11 @@ class Limits(BaseModel):
                 )
         return self
 
+    def of_machine(self, forbidden: str = "") -> MachineLimits:
+        """Return the limits as drivers hold them; ``forbidden`` as in `MachineLimits`."""
+        spans = {axis: span for axis in AXES if (span := getattr(self, axis)) is not None}
+        return MachineLimits(spans, self.feed, self.spindle_speed, forbidden)
+
 
 @dataclass(frozen=True)
 class Extent:
@@ -45,7 +51,7 @@ class Extent:
     Attributes
     ----------
     seconds : float
-        Duration, s.
+        Duration of the steps whose duration is known, s.
     path : float
         Length of all moves, m.
     low, high : (3,) tuple of float
@@ -55,6 +61,10 @@ class Extent:
     spindle_speed : float
         Highest, 1/min.
     touches, moves : int
+    rapid : int
+        Moves whose feed is that of the machine.
+    untimed : int
+        Steps whose duration is unknown.
     """
 
     seconds: float
@@ -65,23 +75,31 @@ class Extent:
     spindle_speed: float
     touches: int
     moves: int
+    rapid: int = 0
+    untimed: int = 0
 
 
 def extent(steps: Sequence[Step]) -> Extent:
     """Return the requirements of steps on a machine."""
-    positions = [step.place for step in steps if step.place is not None]
-    columns = list(zip(*positions, strict=True)) or [(math.nan,)] * 3
     moving = [step for step in steps if step.place is not None]
+    positions = [step.place for step in moving if step.place is not None]
+    columns = [[x for x in column if not math.isnan(x)] for column in zip(*positions, strict=True)] or [[]] * 3
     return Extent(
-        math.fsum(step.seconds for step in steps),
-        math.fsum(math.dist(a, b) for a, b in pairwise(positions)),
-        tuple(min(column) for column in columns),
-        tuple(max(column) for column in columns),
-        max((step.feed for step in moving), default=0.0),
-        max((step.spindle_speed for step in steps), default=0.0),
+        math.fsum(step.seconds for step in steps if not math.isnan(step.seconds)),
+        math.fsum(_distance(a, b) for a, b in pairwise(positions)),
+        tuple(min(column, default=math.nan) for column in columns),
+        tuple(max(column, default=math.nan) for column in columns),
+        max((step.feed for step in moving if not math.isnan(step.feed)), default=0.0),
+        max((abs(step.spindle_speed) for step in steps), default=0.0),
         sum(step.what == "touch" for step in steps),
         sum(step.what == "move" for step in steps),
+        sum(math.isnan(step.feed) for step in moving),
+        sum(math.isnan(step.seconds) for step in steps),
     )
+
+
+def _distance(a: Sequence[float], b: Sequence[float]) -> float:
+    return math.sqrt(sum((x - y) ** 2 for x, y in zip(a, b, strict=True) if not math.isnan(x - y)))
 
 
 def violations(found: Extent, limits: Limits) -> list[str]:
@@ -114,9 +132,39 @@ def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[St
     settings : its settings
     instruments : dict
         Settings of the bench's instruments by kind.
+
+    Raises
+    ------
+    MethodError
+        The method cannot tell, or states what is no step of a machine.
     """
     motions = getattr(method, "motions", None)
-    return None if motions is None else list(method().motions(settings, instruments))
+    if motions is None:
+        return None
+    steps: list[Any] = list(method().motions(settings, instruments))
+    for number, step in enumerate(steps):
+        if not isinstance(step, Step) or not _possible(step):
+            raise MethodError(
+                f"motions of '{method.info.id}': expected steps with finite positions X, Y, Z (NaN for an axis that "
+                f"stays), feeds above 0 (NaN for rapid) and finite spindle speeds; found step {number}: {step}"
+            )
+    return steps
+
+
+def _possible(step: Any) -> bool:
+    if not math.isfinite(step.spindle_speed) or math.isinf(step.seconds) or step.seconds < 0:
+        return False
+    if step.place is None:
+        return True
+    return (
+        len(step.place) == 3
+        and not any(math.isinf(x) for x in step.place)
+        and not all(math.isnan(x) for x in step.place)
+        and (math.isnan(step.feed) or 0 < step.feed < math.inf)
+    )
+
+
+NO_MOTIONS = "the method '{}' does not state its motions ('motions'); whether they stay within the limits is unknown"
 
 
 def _mm(value: float) -> str:

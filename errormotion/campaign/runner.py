@@ -26,6 +26,7 @@ from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
+from errormotion.campaign.limits import NO_MOTIONS
 from errormotion.campaign.recorder import DiskFullError, Recorder
 from errormotion.campaign.store import committed_length
 from errormotion.campaign.timeline import follower
@@ -290,6 +291,7 @@ class _Session:
         if test.certificates:
             attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
         own = self._set_clock(folder, test)
+        bench.hold("" if hasattr(method, "motions") else NO_MOTIONS.format(method.info.id))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None

@@ -26,8 +26,8 @@ from errormotion.errors import DatasetError
 KINDS = ("repeatability", "between groups", "reproducibility")
 BY = ("test", "operator", "instrument", "method")
 """What datasets can be grouped by."""
-LEVEL = 0.95
-"""Coverage probability of the intervals."""
+ENDS = (0.025, 0.975)
+"""Probabilities below the ends of the intervals."""
 
 ROUNDING = 1e-9
 """Share of a mean square below which a difference is rounding."""
@@ -88,9 +88,8 @@ def _label(ds: xr.Dataset, by: str) -> str:
     found = []
     for entry in provenance.of(ds).get("instruments") or []:
         identity = entry.get("identity") if isinstance(entry, dict) else None
-        serial = identity.get("serial_number") if isinstance(identity, dict) else None
-        if serial:
-            found.append(" ".join(str(part) for part in (identity.get("model"), serial) if part))
+        if isinstance(identity, dict) and identity.get("serial_number"):
+            found.append(" ".join(str(identity[key]) for key in ("model", "serial_number") if identity.get(key)))
     return ", ".join(sorted(found))
 
 
@@ -216,7 +215,7 @@ def _larger(each: _Square) -> float:
 
 def _bounds(degrees: float) -> tuple[float, float]:
     """Return G and H of a mean square: its interval is from (1 - G) to (1 + H) times its value."""
-    low, high = chi2.ppf([(1 - LEVEL) / 2, (1 + LEVEL) / 2], degrees) / degrees
+    low, high = (float(chi2.ppf(p, degrees)) / degrees for p in ENDS)
     return 1 - 1 / high, 1 / low - 1
 
 
@@ -237,7 +236,7 @@ def _sum(parts: Sequence[tuple[_Square, float]]) -> tuple[float, float]:
 
 def _difference(b: _Square, w: _Square, h: float) -> tuple[float, float]:
     """Return the interval of (MS_b - MS_w) / h (Ting et al. 1990)."""
-    low, high = fisher.ppf([(1 - LEVEL) / 2, (1 + LEVEL) / 2], b.degrees, w.degrees)
+    low, high = (float(fisher.ppf(p, b.degrees, w.degrees)) for p in ENDS)
     (G1, H1), (G2, H2) = _bounds(b.degrees), _bounds(w.degrees)
     G12 = ((high - 1) ** 2 - (G1 * high) ** 2 - H2**2) / high
     H12 = ((1 - low) ** 2 - (H1 * low) ** 2 - G2**2) / low

@@ -113,7 +113,7 @@ def build(
     if spread is not None:
         groups = {f"spread{end}": getattr(spread, name) for end, name in _SPREAD.items()}
         groups |= {"group": spread.groups, "common": spread.common}
-        variables |= {name: (dims, groups[name], {"long_name": text}) for name, (dims, text) in REPEATS.items()}
+        variables |= {name: (list(dims), groups[name], {"long_name": text}) for name, (dims, text) in REPEATS.items()}
     coords: dict[str, Any] = {
         **({"kind": list(KINDS)} if spread is not None else {}),
         "dataset": [each.name for each in estimates],

@@ -50,13 +50,16 @@ class Door:
         Raises
         ------
         InstrumentError
-            It is not armed.
+            It is not armed, or nothing may move.
         """
+        what = " ".join(what.split())[:200]
         if not arm:
             raise InstrumentError(
                 f"{self._where} only reads, and this order changes the machine: {what}. Nothing was sent. Set "
                 "arm = true for the instrument in the bench file (arm=True in its settings) if it may"
             )
+        if self.limits.forbidden:
+            raise InstrumentError(f"{self._where}: {what}: refused, since {self.limits.forbidden}. Nothing was sent")
         if not self._announced:
             self._announced = True
             log.info("%s is armed (%s); its first order: %s", self._where, self.limits, what)
@@ -70,13 +73,18 @@ class Door:
         if len(found) != 3 or not all(map(math.isfinite, found)):
             raise InstrumentError(f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {place!r}")
         for axis, x in zip("XYZ", found, strict=True):
-            span = self.limits.spans.get(axis)
-            if span is not None and not span[0] - _ROUNDING <= x <= span[1] + _ROUNDING:
-                raise InstrumentError(
-                    f"{self._where}: {axis} would go to {1e3 * x:.6g} mm; the limits of the bench are "
-                    f"{1e3 * span[0]:.6g} and {1e3 * span[1]:.6g} mm. Nothing was sent"
-                )
+            self.coordinate(axis, x)
         return found
+
+    def coordinate(self, axis: str, x: float) -> None:
+        """Raise InstrumentError where the coordinate of an axis, m, is outside of the limits."""
+        span = self.limits.spans.get(axis)
+        if not math.isfinite(x) or (span is not None and not span[0] - _ROUNDING <= x <= span[1] + _ROUNDING):
+            low, high = (1e3 * each for each in span or (-math.inf, math.inf))
+            raise InstrumentError(
+                f"{self._where}: {axis} would go to {1e3 * x:.6g} mm; the limits of the bench are {low:.6g} and "
+                f"{high:.6g} mm. Nothing was sent"
+            )
 
     def feed(self, feed: float) -> float:
         """Return a feed, m/s; InstrumentError unless it is finite, above 0 and within the limits."""

@@ -23,6 +23,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.storage import reading
 from errormotion.errors import MethodError, RunError
 from errormotion.montecarlo.adaptive import block_size, propagate, summarise
+from errormotion.montecarlo.intervals import fewest
 from errormotion.montecarlo.places import chosen_places
 from errormotion.montecarlo.result import build
 from errormotion.montecarlo.store import Store
@@ -36,8 +37,8 @@ CHUNK = 20
 """Trials of one task; a process that is killed loses at most those in work."""
 MOST = 100_000
 """Trials after which the adaptive procedure stops."""
-FEWEST = 100
-"""Smallest number of trials that is accepted: an interval of 95 % needs samples beyond its ends."""
+FEWEST = fewest(PROBABILITY)
+"""Smallest number of trials that is accepted: the interval needs samples beyond both of its ends."""
 FLOOR = 1e-13
 """Differences below are rounding, m or rad."""
 
@@ -133,6 +134,7 @@ def evaluate(
     workers: int | None = None,
     progress: Progress | None = None,
     most: int = MOST,
+    keep: bool = False,
 ) -> xr.Dataset:
     """Evaluate a result by the Monte Carlo method, JCGM 101, and compare its linear intervals.
 
@@ -147,8 +149,7 @@ def evaluate(
     errors : Dataset
         What the method made of the raw dataset with these settings.
     folder : path
-        Folder for the trials while the evaluation is in work; an interrupted one is continued from it, a finished one
-        leaves nothing there.
+        Folder for the trials while the evaluation is in work; an interrupted one is continued from it.
     trials : int, optional
         Number of trials; default: adaptive, 7.9.4, until all results are stable and every verdict is clear.
     digits : int
@@ -163,6 +164,8 @@ def evaluate(
         Receives the progress.
     most : int
         Largest number of trials of the adaptive procedure.
+    keep : bool
+        Whether the trials are kept at the end, until the result is stored: see `Store.remove`.
 
     Returns
     -------
@@ -210,7 +213,8 @@ def evaluate(
         raise MethodError(f"No trial of {summary.trials} gave a value everywhere that the result has one: {reason}")
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
     found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
-    store.remove()
+    if not keep:
+        store.remove()
     return found
 
 

@@ -40,7 +40,7 @@ def standard_errors(ordered: Array, probability: float) -> tuple[Array, Array]:
 
 def fewest(probability: float) -> int:
     """Return the fewest samples that have an interval with samples on both sides of it."""
-    return int(np.ceil(2.0 / (1.0 - probability)))
+    return int(np.ceil(round(2.0 / (1.0 - probability), 9)))
 
 
 def _ranks(count: int, probability: float) -> tuple[int, int]:

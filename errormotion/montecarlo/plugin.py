@@ -1,4 +1,4 @@
-"""The plugin ``monte_carlo``: Monte Carlo evaluations as datasets."""
+"""The plugin ``monte_carlo_evaluation``: Monte Carlo evaluations as datasets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class MonteCarloDataset:
     """Monte Carlo evaluations of error datasets."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
-        id="monte_carlo",
+        id="monte_carlo_evaluation",
         summary="Monte Carlo evaluation of a result: intervals, and whether the linear ones are validated",
         schemas=("errormotion.monte_carlo/1",),
     )

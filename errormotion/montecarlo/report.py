@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.montecarlo.result import Line, lines
-from errormotion.montecarlo.validation import NOT_VALIDATED, VALIDATED
+from errormotion.montecarlo.validation import NOT_VALIDATED
 from errormotion.report.document import Cell, KeyFigure, Part, Section, Source, Table, Text
 
 if TYPE_CHECKING:
     import xarray as xr
 
 MICROMETRE = (1e6, "um")
+HEAD = ["", "unit", "u linear", "u Monte Carlo", "difference", "tolerance", "linear interval"]
 ARCSEC = (648000 / np.pi, "arcsec")
 
 
@@ -22,27 +23,26 @@ def chapters(source: Source) -> list[Part]:
     ds = source.errors
     found = lines(ds)
     p = 100 * float(ds.attrs["probability"])
-    rows = [_row(line) for line in found]
-    intervals = [f"linear {p:g} %", f"Monte Carlo {p:g} %"]
-    head = ["", "unit", "u linear", "u Monte Carlo", *intervals, "difference", "tolerance", "linear interval", "place"]
-    caption = (
-        "Standard uncertainties and intervals at the place where both intervals differ most against the tolerance "
-        "(JCGM 101, clause 8)."
-    )
-    notes = [Text(note, "note") for note in ds.attrs["notes"] if note]
+    verdicts, intervals = [_row(line) for line in found], [_intervals(line) for line in found]
     how = Text(
         f"{int(ds.attrs['trials'])} trials with the seed {int(ds.attrs['seed'])}, each through the identification of "
-        f"{ds.attrs['method']} {ds.attrs['method_version']} with {', '.join(ds.attrs['sources'])} drawn anew "
-        f"(JCGM 101). The tolerance follows from {int(ds.attrs['digits'])} meaningful "
-        f"digit{'s' if int(ds.attrs['digits']) > 1 else ''} of the standard uncertainty."
+        f"{ds.attrs['method']} {ds.attrs['method_version']} with all sources drawn anew (JCGM 101): "
+        f"{', '.join(map(str, np.atleast_1d(ds.attrs['sources'])))}. The tolerance follows from "
+        f"{int(ds.attrs['digits'])} meaningful digit{'s' if int(ds.attrs['digits']) > 1 else ''} of the standard "
+        "uncertainty."
     )
-    table = Table(caption, head, rows, numeric=True)
+    notes = [Text(str(note), "note") for note in np.atleast_1d(ds.attrs["notes"]) if str(note)]
+    at = "at the place where both intervals differ most against the tolerance"
+    tables = [
+        Table(f"Standard uncertainties, and difference of the intervals, {at} (JCGM 101, clause 8).", HEAD, verdicts),
+        Table(f"Intervals of {p:g} %, {at}.", ["", "unit", "linear", "Monte Carlo", "place"], intervals),
+    ]
     return [
         Part(
             f"Monte Carlo evaluation of {ds.attrs['component']} by {ds.attrs['method']}",
             [KeyFigure("trials", Cell(f"{int(ds.attrs['trials'])}"), "")],
             [verdict(found)],
-            [Section("monte-carlo", "Linear intervals and Monte Carlo", [how, table, *notes])],
+            [Section("monte-carlo", "Linear intervals and Monte Carlo", [how, *tables, *notes])],
             kind="Monte Carlo evaluation",
         )
     ]
@@ -59,15 +59,22 @@ def verdict(found: list[Line]) -> str:
 
 
 def _row(line: Line) -> list[Cell | str]:
+    """Return the verdict on one freedom."""
     factor, unit = ARCSEC if line.name[-1] in "ABC" else MICROMETRE
     digits = _digits(line.uncertainty * factor)
-    low, high = (f"[{a * factor:.{digits}f}, {b * factor:.{digits}f}]" for a, b in (line.linear, line.interval))
-    word = line.word
-    if line.verdict != VALIDATED and line.places > 1:
-        word += f" at {line.open_places} of {line.places} places" if line.verdict == NOT_VALIDATED else ""
+    some = line.verdict == NOT_VALIDATED and line.places > 1
+    word = line.word + (f" at {line.open_places} of {line.places} places" if some else "")
     numbers = (f"{value * factor:.{digits}f}" for value in (line.linear_uncertainty, line.uncertainty))
     ends = (f"{value * factor:.2g}" for value in (line.distance, line.tolerance))
-    return [line.name, unit, *numbers, low, high, *ends, word, line.place]
+    return [line.name, unit, *numbers, *ends, word]
+
+
+def _intervals(line: Line) -> list[Cell | str]:
+    """Return both intervals of one freedom."""
+    factor, unit = ARCSEC if line.name[-1] in "ABC" else MICROMETRE
+    digits = _digits(line.uncertainty * factor)
+    ends = (f"[{a * factor:.{digits}f}, {b * factor:.{digits}f}]" for a, b in (line.linear, line.interval))
+    return [line.name, unit, *ends, line.place]
 
 
 def _digits(u: float) -> int:
@@ -76,15 +83,5 @@ def _digits(u: float) -> int:
 
 def texts(ds: xr.Dataset) -> tuple[list[str], list[list[str]]]:
     """Return head and rows of the table for the terminal."""
-    head = [
-        "",
-        "unit",
-        "u linear",
-        "u Monte Carlo",
-        "difference",
-        "tolerance",
-        "linear interval",
-        "largest difference at",
-    ]
-    rows = [[str(cell) for cell in _row(line)] for line in lines(ds)]
-    return head, [[*row[:4], *row[6:]] for row in rows]
+    rows = [[*map(str, _row(line)), line.place] for line in lines(ds)]
+    return [*HEAD, "largest difference at"], rows

@@ -91,7 +91,7 @@ def build(
         "uncertainty": found.uncertainty,
         "tolerance": found.tolerance,
     }
-    flags = {
+    flags: dict[str, NDArray[Any]] = {
         "verdict": np.where(known, validation.verdict, UNDECIDED).astype(np.int8),
         "stable": found.stable.astype(np.int8),
         "missing": np.where(known, found.missing, 0).astype(np.int64),

@@ -19,6 +19,9 @@ from errormotion.errors import RunError
 KEY = "evaluation.json"
 _CHUNK = re.compile(r"block-(\d{4,})-(\d+)-(\d+)\.npy")
 
+LARGEST_KEY = 2**20
+"""Bytes of the file of the key; more is none of ours."""
+
 
 class Store:
     """A folder of trials; a context manager.
@@ -44,7 +47,7 @@ class Store:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if file.exists():
-                found = json.loads(file.read_text(encoding="utf-8"))
+                found = json.loads(_small(file))
                 if found != self._key:
                     keys = set(self._key) | set(found if isinstance(found, dict) else {})
                     differ = [
@@ -58,7 +61,7 @@ class Store:
                 raise RunError(f"{self.folder}: expected an empty folder or trials of this evaluation; found others")
             else:
                 self._write(file, json.dumps(self._key, indent=1).encode())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise RunError(f"{self.folder}: expected a folder for the trials that can be written; {error}") from error
         return self
 
@@ -115,7 +118,7 @@ class Store:
         """Return the values of a file, None where it is not one of ours."""
         try:
             values = np.load(file, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError):
+        except (OSError, ValueError, EOFError):
             return None
         return values if values.ndim == 2 and len(values) == size and values.dtype == np.float64 else None
 
@@ -132,3 +135,10 @@ class Store:
         part = file.with_name(f".{file.name}.part")
         part.write_bytes(content)
         part.replace(file)
+
+
+def _small(file: Path) -> str:
+    """Return the text of a file; ValueError for one that is too large."""
+    if file.stat().st_size > LARGEST_KEY:
+        raise ValueError(f"{file.name} is larger than {LARGEST_KEY} bytes")
+    return file.read_text(encoding="utf-8")

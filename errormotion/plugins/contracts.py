@@ -212,11 +212,11 @@ class Step:
     what : str
         ``move``, ``touch`` or ``rest``.
     place : (3,) tuple of float or None
-        Where it ends, X Y Z, m; None where the machine stays.
+        Where it ends, X Y Z, m; NaN for an axis that stays; None where the machine stays.
     feed : float
-        m/s; NaN at rest.
+        m/s; NaN at rest, and for a rapid move, which the driver holds to the limit of the bench.
     seconds : float
-        How long it takes.
+        How long it takes; NaN where unknown, as for a rapid move.
     spindle_speed : float
         1/min.
     """
@@ -240,14 +240,19 @@ class MachineLimits:
         Highest feed, m/s.
     spindle_speed : float, optional
         Highest, 1/min.
+    forbidden : str
+        Why no order at all is allowed; empty where orders are allowed.
     """
 
     spans: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     feed: float | None = None
     spindle_speed: float | None = None
+    forbidden: str = ""
 
     def __str__(self) -> str:
         """Return the limits as a text."""
+        if self.forbidden:
+            return f"nothing may move: {self.forbidden}"
         texts = [f"{axis} {1e3 * low:.6g} to {1e3 * high:.6g} mm" for axis, (low, high) in self.spans.items()]
         texts += [] if self.feed is None else [f"feed up to {6e4 * self.feed:.6g} mm/min"]
         texts += [] if self.spindle_speed is None else [f"spindle up to {self.spindle_speed:.6g} /min"]
@@ -330,7 +335,9 @@ class Method(Protocol):
     ``programs(settings, instruments)`` : mapping of str to str
         The NC programs of the test, file name to text.
     ``motions(settings, instruments)`` : list of `Step`
-        Every step of the machine; checked against the limits of the bench before anything moves.
+        Every step of the machine; checked against the limits of the bench before anything moves. A method that moves a
+        machine, by a controller or by programs, must have it: without it nothing moves during its tests. Where a search
+        decides, the steps go to the ends of the search. MethodError where the settings do not determine them.
     ``check(settings)`` : mapping of str to str
         What is wrong, by setting, as far as it can be seen before a measurement; used when a campaign is read.
 

@@ -17,6 +17,7 @@ from errormotion.errors import PluginError
 GROUP = "errormotion.kinds"
 Contract = TypeVar("Contract", bound=type)
 _STATED = ("plausible", "capabilities")
+_NO_MEMBERS = (*_STATED, "changes_machine")
 
 
 def contract(
@@ -35,6 +36,34 @@ def contract(
 @cache
 def _points() -> Mapping[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def changing(cls: Contract) -> Contract:
+    """Mark a capability whose methods move or change a machine.
+
+    An instrument that has it needs the setting ``arm``, default false, without which it refuses these methods, and a
+    method ``bound(limits)``, after which each order is held to a `MachineLimits`.
+    """
+    cls.changes_machine = True  # type: ignore[attr-defined]
+    return cls
+
+
+def changes_machine(driver: Any) -> tuple[str, ...]:
+    """Return the methods and attributes by which a driver, or its class, can move or change a machine."""
+    return _changes(driver, kind(driver.info.kind))
+
+
+def _changes(driver: Any, protocol: Any) -> tuple[str, ...]:
+    found: list[str] = []
+    for capability in getattr(protocol, "capabilities", ()):
+        if getattr(capability, "changes_machine", False) and _has(driver, _first(capability)):
+            found += members(capability)
+    return tuple(dict.fromkeys(found))
+
+
+def kind_changes_machine(name: str) -> bool:
+    """Return whether instruments of a kind may be able to move or change a machine."""
+    return any(getattr(capability, "changes_machine", False) for capability in getattr(kind(name), "capabilities", ()))
 
 
 def kinds() -> tuple[str, ...]:
@@ -82,7 +111,7 @@ def members(protocol: type) -> dict[str, Any]:
         if getattr(base, "_is_protocol", False):
             for name in (*vars(base).get("__annotations__", {}), *vars(base)):
                 value = vars(base).get(name)
-                if not name.startswith("_") and name not in _STATED:
+                if not name.startswith("_") and name not in _NO_MEMBERS:
                     found[name] = value if inspect.isfunction(value) else None
     return found
 
@@ -101,6 +130,12 @@ def deviations(driver: Any, protocol: type) -> list[str]:
     for capability in getattr(protocol, "capabilities", ()):
         if _has(driver, _first(capability)):
             found += [f"{text} ({capability.__name__})" for text in _lacking(driver, capability)]
+    if _changes(driver, protocol):
+        arm = type(driver).Settings.model_fields.get("arm")
+        if arm is None or arm.default is not False:
+            found.append("it can change a machine: expected the setting 'arm' with the default false")
+        if not callable(getattr(driver, "bound", None)):
+            found.append("it can change a machine: expected bound(limits: MachineLimits)")
     return found
 
 
@@ -110,7 +145,8 @@ def _first(capability: type) -> str:
 
 
 def _has(driver: Any, name: str) -> bool:
-    annotated = any(name in vars(base).get("__annotations__", {}) for base in type(driver).__mro__)
+    cls = driver if isinstance(driver, type) else type(driver)
+    annotated = any(name in vars(base).get("__annotations__", {}) for base in cls.__mro__)
     return annotated or inspect.getattr_static(driver, name, None) is not None
 
 

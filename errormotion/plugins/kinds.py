@@ -3,7 +3,8 @@
 A contract has the members that every instrument of the kind must have. Its attribute ``capabilities`` lists further
 Protocols: an instrument that has the first method of a capability (without methods: its first attribute) must have all
 its members; methods look for it before they use it. Its attribute ``plausible`` holds the lowest and highest reading
-that a conformance check accepts, in SI units, or None.
+that a conformance check accepts, in SI units, or None. The decorator ``changing`` marks the capabilities by which an
+instrument moves or changes a machine.
 
 Kinds are open: a distribution registers a contract in the entry-point group ``errormotion.kinds``, under the name that
 its instruments give as ``info.kind``.
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.plugins.contracts import Contact, Instrument, Samples, Touch
-from errormotion.plugins.kind_registry import contract
+from errormotion.plugins.kind_registry import changing, contract
 from errormotion.plugins.readings import FrameGeometry, Measurement, Profiles, Scan
 
 Position = Sequence[float]
@@ -181,6 +182,7 @@ class LaserTracker(Instrument, Protocol):
 # ---------------------------------------------------------------------- touch_probe
 
 
+@changing
 class MovesMachine(Protocol):
     """A probe that commands the machine; others read what the machine's program prints."""
 
@@ -261,6 +263,7 @@ class State(TypedDict, total=False):
     alarms: Sequence[str]
 
 
+@changing
 class MovesAxes(Protocol):
     """A controller that moves the axes."""
 
@@ -271,6 +274,7 @@ class MovesAxes(Protocol):
         """Abort all motion, with ``spindle`` that of the spindle as well; always allowed."""
 
 
+@changing
 class TurnsSpindle(Protocol):
     """A controller that turns the spindle."""
 
@@ -278,6 +282,7 @@ class TurnsSpindle(Protocol):
         """Turn the spindle at a speed, 1/min; 0 stops it."""
 
 
+@changing
 class RunsPrograms(Protocol):
     """A controller that takes NC programs."""
 
@@ -285,6 +290,7 @@ class RunsPrograms(Protocol):
         """Start a program (ISO 6983); return ``duration`` and ``longest_lead_in``, s, where known."""
 
 
+@changing
 class Probes(Protocol):
     """A controller that moves until a touch probe trips."""
 
@@ -299,6 +305,7 @@ class PassesTime(Protocol):
         """Let time pass on the machine's clock, s."""
 
 
+@changing
 class RunsSchedules(Protocol):
     """A controller that mounts artefacts and turns the spindle by a schedule."""
 
@@ -309,6 +316,7 @@ class RunsSchedules(Protocol):
         """Start a schedule at time 0: events with ``time``, and optionally ``spindle_speed`` and ``compensation``."""
 
 
+@changing
 class StepsSphere(Protocol):
     """A controller that steps a mounted sphere along a line."""
 
@@ -316,6 +324,7 @@ class StepsSphere(Protocol):
         """Start a step program: first position, m, direction, step, m, their count, and the rest at each, s."""
 
 
+@changing
 class SetsTarget(Protocol):
     """A controller that turns a gauge in front of a point sensor."""
 
@@ -323,6 +332,7 @@ class SetsTarget(Protocol):
         """Set a plane, a bar or nothing, with the inclination and rotation of a plane, rad."""
 
 
+@changing
 class CarriesTracker(Protocol):
     """A controller that carries the laser tracker to a station."""
 

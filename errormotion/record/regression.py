@@ -68,7 +68,7 @@ def fit(X: Array, y: Array, V0: Array) -> Fit | None:
     tau = _paule_mandel(X, y, V0)
     V = V0 + tau**2 * np.eye(n)
     factor = cho_factor(V)
-    C: Array = np.linalg.inv(X.T @ cho_solve(factor, X))
+    C = np.asarray(np.linalg.inv(X.T @ cho_solve(factor, X)), dtype=float)
     b: Array = C @ (X.T @ cho_solve(factor, y))
     quantile = float(student.ppf(0.5 + COVERAGE / 2, n - p))
     spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import sys
 from collections.abc import Hashable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +21,7 @@ from errormotion.datasets.schemas import variants
 from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
-from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status
+from errormotion.plugins import MethodInfo, MethodSubject, Needs, Status, kind_registry
 from errormotion.testing.coverage import coverage, differences, recovers_truth
 from errormotion.testing.instrument_checks import check_settings
 from errormotion.testing.kit import Checks, require
@@ -56,6 +58,33 @@ def info_complete(subject: MethodSubject) -> str:
 def settings_strict(subject: MethodSubject) -> str:
     """Settings are a PluginSettings, refuse unknown keys, and are unchanged after a round trip through JSON."""
     return check_settings(subject.plugin.Settings, subject.effective_settings())
+
+
+@METHOD_CHECKS.add()
+def motions_stated(subject: MethodSubject) -> str:
+    """A method that can move a machine states its motions: by programs, or where its package names such a kind."""
+    plugin = subject.plugin
+    if hasattr(plugin, "motions"):
+        return "motions are stated"
+    name = plugin.info.id
+    require(not hasattr(plugin, "programs"), f"'{name}' writes NC programs and does not state its motions ('motions')")
+    moving = {each for each in kind_registry.kinds() if kind_registry.kind_changes_machine(each)}
+    found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(plugin)))
+    named = " and ".join(found)
+    require(not found, f"'{name}' uses a {named} and does not state its motions ('motions'); [] where nothing moves")
+    return "nothing that moves is used"
+
+
+def _texts_of(plugin: Any) -> set[str]:
+    """Return the texts in the source of a plugin's package, or of its module where it is in none."""
+    source = Path(str(sys.modules[plugin.__module__].__file__))
+    in_package = (source.parent / "__init__.py").exists()
+    found: set[str] = set()
+    for path in source.parent.rglob("*.py") if in_package else [source]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+    return found
 
 
 @METHOD_CHECKS.add()

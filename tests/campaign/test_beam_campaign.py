@@ -133,6 +133,8 @@ def test_an_interrupted_campaign_goes_on_with_the_faces_that_are_left(tmp_path, 
 
 
 def test_a_bench_without_a_control_is_refused_before_anything_is_measured(tmp_path):
-    control = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://cframe/controller?seed=3"'
+    control = (
+        '[instruments.control]\ndriver = "virtual_controller"\narm = true\naddress = "sim://cframe/controller?seed=3"'
+    )
     with pytest.raises(BenchError, match=r"needs controller; the bench .* offers point_lds"):
         write(tmp_path, [(control, "")])

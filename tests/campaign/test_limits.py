@@ -15,9 +15,11 @@ name = "Gantry"
 machine = "Gantry"
 [instruments.control]
 driver = "virtual_controller"
+arm = true
 address = "sim://gantry/controller?seed=31"
 [instruments.probe]
 driver = "controller_probe"
+arm = true
 address = "sim://gantry/controller?seed=31"
 """
 

@@ -168,7 +168,9 @@ def test_settings_that_contradict_the_machine_are_refused_when_the_campaign_is_r
     assert load_campaign(path).tests[0].settings.level == 0.025
 
 
-CONTROL = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://machine/controller?seed=5"\n'
+CONTROL = (
+    '[instruments.control]\ndriver = "virtual_controller"\narm = true\naddress = "sim://machine/controller?seed=5"\n'
+)
 
 
 def test_the_simulated_control_moves_the_machine_of_the_bench(tmp_path: Path) -> None:

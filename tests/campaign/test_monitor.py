@@ -38,7 +38,9 @@ def dcon(name: str, address: str, channels: str = '["spindle", "column"]', more:
     )
 
 
-CONTROL = '[instruments.control]\ndriver = "virtual_controller"\naddress = "sim://cframe/controller?seed=11"\n'
+CONTROL = (
+    '[instruments.control]\ndriver = "virtual_controller"\narm = true\naddress = "sim://cframe/controller?seed=11"\n'
+)
 
 
 class Module(socketserver.StreamRequestHandler):

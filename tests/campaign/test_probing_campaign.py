@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from armed import CONTROLLER
 
 from errormotion import datasets
 from errormotion.campaign import runner
@@ -33,6 +34,7 @@ machine = "{kind} (virtual)"
 
 [instruments.control]
 driver = "virtual_controller"
+arm = true
 address = "sim://{kind}/controller?seed=5{control}"
 
 [instruments.probe]
@@ -65,7 +67,7 @@ schedule = [{{ at = "0 s", spindle_speed = "12000 /min" }}]
 tool_axes = "{axes}"
 {settings}
 """
-PROBE = 'repeats = 1\napproach_feed = "12 m/min"'
+PROBE = 'arm = true\nrepeats = 1\napproach_feed = "12 m/min"'
 TOUCHES = 12  # of a cycle: four of each of three balls
 
 Lab = Callable[..., tuple[CampaignPlan, Path]]
@@ -196,7 +198,7 @@ def test_trouble_in_a_cycle_stops_everything_and_the_next_cycle_follows_when_it_
     lab: Lab, monkeypatch: pytest.MonkeyPatch, trouble: str, message: str
 ) -> None:
     plan, runs = lab()
-    with VirtualController("sim://gantry/controller?seed=5") as operator:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         virtual = here()
         break_now = operator.press_estop if trouble == "estop" else lambda: virtual.raise_alarm("servo alarm")
         with monkeypatch.context() as patch:
@@ -228,7 +230,7 @@ def test_trouble_in_a_cycle_stops_everything_and_the_next_cycle_follows_when_it_
 
 def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, runs = lab()
-    with VirtualController("sim://gantry/controller?seed=5") as operator:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         breaks_at(monkeypatch, "elapse", 20, lambda: here().raise_alarm("oil is hot"))
         with pytest.raises(RunError, match="in alarm: oil is hot; this occurred during the warm-up"):
             runner.run(plan, runs=runs)
@@ -247,7 +249,7 @@ def test_an_alarm_while_it_warms_up_stops_the_spindle(lab: Lab, monkeypatch: pyt
 )
 def test_a_broken_probe_ends_the_cold_cycle_with_nothing_kept(lab: Lab, fault: str, message: str) -> None:
     plan, runs = lab(probe=f"&fault={fault}")
-    with VirtualController("sim://gantry/controller?seed=5") as operator:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match=message):
             runner.run(plan, runs=runs)
         state = operator.state()
@@ -266,7 +268,7 @@ def test_a_ball_that_is_not_there_ends_the_cold_cycle(lab: Lab) -> None:
 
 def test_a_connection_lost_in_a_cycle_keeps_its_touches_and_stops(lab: Lab) -> None:
     plan, runs = lab(probe="&fault=disconnect&fault_at=150")
-    with VirtualController("sim://gantry/controller?seed=5") as operator:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match=r"Touch \d+ of 12"):
             runner.run(plan, runs=runs)
         assert operator.state()["commanded_spindle_speed"] == 0
@@ -277,7 +279,7 @@ def test_a_connection_lost_in_a_cycle_keeps_its_touches_and_stops(lab: Lab) -> N
 
 def test_a_connection_lost_while_the_spindle_turns_is_opened_again_to_stop_it(lab: Lab) -> None:
     plan, runs = lab(control="&fault=disconnect&fault_at=60")
-    with VirtualController("sim://gantry/controller?seed=5") as operator:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as operator:
         with pytest.raises(RunError, match="connection"):
             runner.run(plan, runs=runs)
         assert 0 < operator.state()["time"] < 1200
@@ -426,7 +428,7 @@ def test_a_machine_without_a_control_on_the_bench_warms_up_by_the_program_that_i
     plan = without_control(plan)
     monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
     machine, asked = here().machine, []
-    with VirtualController("sim://gantry/controller?seed=5") as at_the_machine:
+    with VirtualController("sim://gantry/controller?seed=5", CONTROLLER) as at_the_machine:
 
         def start(message: str) -> None:
             asked.append(message)

@@ -29,6 +29,7 @@ address = "sim://cframe/tracker?seed=3&lever=0.02,-0.01,-0.08&heading=0.4{fault}
 
 [instruments.control]
 driver = "virtual_controller"
+arm = true
 address = "sim://cframe/controller?seed=3"
 """
 CAMPAIGN = """

@@ -42,9 +42,14 @@ def test_a_program_reads_the_same(folder: Path) -> None:
     assert motions["spindle_speed"] == 12000.0
 
 
-def test_a_method_that_does_not_say_what_moves_is_told(folder: Path) -> None:
-    result = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run"])
-    assert "beam: the method does not report its motions" in result.stdout
+def test_moves_without_a_stated_feed_and_duration_are_counted(folder: Path) -> None:
+    result = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run", "--out", "pictures"])
+    assert result.exit_code == 0, result.output
+    assert "rapid in 366 moves" in result.stdout
+    assert "366 steps of unknown duration" in result.stdout
+    found = CliRunner().invoke(app, ["run", "virtual_beam/campaign.toml", "--dry-run", "--json"])
+    motions = json.loads(found.stdout)["tests"][0]["motions"]
+    assert (motions["rapid"], motions["untimed"], motions["seconds"]) == (366, 366, 0.0)
 
 
 @pytest.mark.parametrize("arguments", [["--dry-run"], ["virtual_beam/campaign.toml", "--out", "x"]])

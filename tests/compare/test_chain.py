@@ -5,11 +5,13 @@ import pytest
 from scipy.stats import kstest
 from typer.testing import CliRunner
 
-from errormotion import datasets
+from errormotion import datasets, plugins
 from errormotion.cli.app import app
 from errormotion.compare import compare
 from errormotion.errors import DatasetError
 from errormotion.kinematics.machines import Machine
+from errormotion.methods.multilateration import simulation as tracking
+from errormotion.twin import VirtualMachine
 
 CFRAME, GANTRY = "workpiece-X-Y-bed-Z-spindle-tool", "workpiece-bed-Y-X-Z-spindle-tool"
 TRAVEL = np.array([[0.0, 0.5], [0.0, 0.4], [-0.3, 0.0]])
@@ -21,13 +23,13 @@ ABOUT = {"machine": "M", "frame": "machine", "reference": "r", "method": "m", "m
 
 
 def motions(rng):
-    """Return smooth errors of three axes, (3, order, 6): cubic polynomials of the position in -1 to 1."""
-    return rng.normal(size=(3, 4, 6)) * np.array([4e-6] * 3 + [8e-6] * 3)
+    """Return smooth errors of three axes, (3, order, 6): polynomials of -1 to 1 whose coefficients fall off as n^-2."""
+    return rng.normal(size=(3, 12, 6)) * np.maximum(np.arange(12), 1)[:, None] ** -2.0 * ([4e-6] * 3 + [8e-6] * 3)
 
 
 def errors_of(c, axis, q):
     low, high = TRAVEL[axis]
-    return np.polynomial.legendre.legvander((2 * q - low - high) / (high - low), 3) @ c[axis]
+    return np.polynomial.legendre.legvander((2 * q - low - high) / (high - low), c.shape[1] - 1) @ c[axis]
 
 
 def volume(
@@ -55,9 +57,10 @@ def volume(
     )  # fmt: skip
 
 
-def axis(c, rng, *, n=9, point=(0, 0, 0), **more):
+def axis(c, rng, *, y=None, point=(0, 0, 0), **more):
     """Return the errors of Y at its own functional point."""
-    y = np.linspace(0.02, 0.38, n)
+    y = np.linspace(0.02, 0.38, 9) if y is None else y
+    n = y.size
     e = errors_of(c, 1, y) + U_AXIS * rng.normal(size=(n, 6))
     return datasets.build_errors(
         e, np.tile(np.diag(U_AXIS**2), (n, 1, 1)), dims=("position",), coords={"y": ("position", y)}, component="Y",
@@ -67,18 +70,35 @@ def axis(c, rng, *, n=9, point=(0, 0, 0), **more):
 
 @pytest.mark.parametrize("chain", [CFRAME, GANTRY])
 def test_the_volume_gives_the_errors_of_the_axis(chain, monkeypatch):
-    monkeypatch.setitem(globals(), "U", 1e-12)
-    monkeypatch.setitem(globals(), "U_AXIS", np.full(6, 1e-12))
+    monkeypatch.setitem(globals(), "U", 1e-10)
+    monkeypatch.setitem(globals(), "U_AXIS", np.full(6, 1e-10))
     rng = np.random.default_rng(2)
     c, point = motions(rng), (0.1, -0.2, 0.3)
     given = {
-        "axis": axis(c, rng, point=point),
+        "axis": axis(c, rng, point=point, y=np.linspace(*TRAVEL[1], 6)),  # where the targets are
         "volume": volume(c, chain, rng, own_point=point, source=lambda q: np.zeros(len(q))),
     }
     found = compare(given, causes=False)
     assert found.sizes["dof"] == (6 if chain == GANTRY else 4)
     assert np.abs(found["value"].values).max() > 1e-6
-    np.testing.assert_allclose(found["difference"].values, 0.0, atol=1e-9)  # first order: products of errors are left
+    np.testing.assert_allclose(found["difference"].values, 0.0, atol=2e-9)
+
+
+@pytest.mark.parametrize(("kind", "axis_name"), [("cframe", "X"), ("gantry", "Z")])
+def test_targets_of_a_tracker_give_the_true_errors_of_the_axes(kind, axis_name):
+    """The virtual machine has error motions of all orders; a machine of order 3 would leave 50 times their variance."""
+    machine = VirtualMachine(kind, seed=3)
+    q = tracking.target_grid(machine, (6, 6, 5))
+    cls = plugins.get("methods", "multilateration")
+    measured = cls().identify(tracking.raw(machine, q, seed=3), cls.Settings(parametric=False))
+    k = "XYZ".index(axis_name)
+    truth = machine.truth_axis(axis_name, np.linspace(q[:, k].min(), q[:, k].max(), 9))
+    truth["covariance"] = truth["covariance"] + (1e-8) ** 2 * np.eye(6)
+    truth = truth.assign_attrs({name: measured.attrs[name] for name in ("machine", "frame")})
+    found = compare({"truth": truth, "volume": measured}, causes=False)
+    assert np.abs(found["value"].values).max() > 2e-6
+    assert found["p"].item() > 0.001
+    assert np.nanmax(np.abs(found["en"].values)) < 1.6
 
 
 @pytest.mark.slow

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.app import app
+from errormotion.compare import compare as compared
 
 FEW = ("--freedoms", "EX,EY,EZ")
 
@@ -41,6 +43,45 @@ def stored(folder: Path, ds, test, created=""):
     (folder / "errors" / "example-1").mkdir(parents=True)
     datasets.save(ds, folder / "errors" / "example-1" / "errors.nc")
     run.save(errors="errors/example-1/errors.nc", **({"created": created} if created else {}))
+
+
+def without(ds, *names):
+    """Return a result that does not see some freedoms."""
+    k = [["EX", "EY", "EZ", "EA", "EB", "EC"].index(name) for name in names]
+    ds = ds.assign({name: ds[name] * np.nan for name in names}).copy(deep=True)
+    ds["covariance"].values[:, k] = np.nan
+    ds["covariance"].values[:, :, k] = np.nan
+    ds["influence"].values[..., k] = np.nan
+    return ds
+
+
+def both_ways(ds):
+    """Return the result of a foreign method, over a dimension of its own and time."""
+    twice = np.stack([ds.em.twist().values] * 2)
+    return datasets.build_errors(
+        twice, np.stack([ds["covariance"].values] * 2), dims=("way", "time"),
+        coords={"way": ("way", ["up", "down"], {"long_name": "direction of travel"}), "time": ds["time"].values},
+        method="foreign", method_version="1", provenance={}, start=ds.attrs["start"],
+        **{name: ds.attrs[name] for name in ("component", "machine", "frame", "functional_point", "reference")},
+    )  # fmt: skip
+
+
+def test_a_freedom_that_one_does_not_see_is_left_out(run, files, results):
+    datasets.save(without(results["probing"], "EX", "EA", "EB"), "blind.nc")
+    run("compare", "drift.nc", "blind.nc", "--out", "c.nc")
+    assert datasets.load("c.nc")["dof"].values.tolist() == ["EY", "EZ"]
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_a_singular_covariance_is_compared(run, results, rank):
+    """Values without any uncertainty, or in which all freedoms are one draw."""
+    for name, ds in results.items():
+        u = np.where(np.isfinite(ds.em.twist().values), 1e-6 * rank, np.nan)
+        one = ds.drop_dims("source").assign(covariance=(ds["covariance"].dims, u[:, :, None] * u[:, None, :]))
+        datasets.save(one, f"{name}.nc")
+    shown = run("compare", "drift.nc", "probing.nc", *FEW, "--report", "c.html")
+    assert "Traceback" not in shown.output
+    assert ("Nothing can be said" if rank == 0 else "datasets") in shown.stdout
 
 
 def test_files_are_compared_and_the_result_is_written(run, files):
@@ -90,6 +131,30 @@ def test_names_and_the_functional_point_can_be_given(run, files):
     np.testing.assert_allclose(found.attrs["functional_point"], [0, 0, -0.02])
 
 
+def silent(ds, attribute="start"):
+    return ds.drop_attrs(deep=False).assign_attrs({name: ds.attrs[name] for name in ds.attrs if name != attribute})
+
+
+ALTERED = {
+    "drift.nc": lambda drift, _: drift,
+    "probing.nc": lambda _, probing: probing,
+    "unknown.nc": lambda _, probing: silent(probing),
+    "later.nc": lambda _, probing: probing.assign_attrs(start="2027-03-02T07:00:00+00:00"),
+    "other.nc": lambda _, probing: probing.assign_attrs(machine="another"),
+    "elsewhere.nc": lambda _, probing: probing.assign_attrs(frame="table"),
+    "frameless.nc": lambda _, probing: silent(probing, "frame"),
+    "axis.nc": lambda _, probing: probing.assign_attrs(component="X"),
+    "blind.nc": lambda _, probing: without(probing, "EX"),
+    "turning.nc": lambda _, probing: without(probing, "EX", "EY", "EZ"),
+    "moving.nc": lambda drift, _: without(drift, "EA", "EB", "EC"),
+    "both-ways.nc": lambda _, probing: both_ways(probing),
+    "raw.nc": lambda drift, _: xr.Dataset({"a": 1.0}),
+    "c.nc": lambda drift, probing: compared({"a": drift, "b": probing}, freedoms=["EX"], causes=False),
+    "moment.nc": lambda _, probing: probing.isel(time=-1, drop=True).drop_vars("time_index"),
+}
+"""What a stranger may bring."""
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -103,15 +168,22 @@ def test_names_and_the_functional_point_can_be_given(run, files):
         (("drift.nc", "later.nc"), 1, "do not overlap"),
         (("drift.nc", "other.nc"), 1, "machine"),
         (("drift.nc", "empty"), 1, "expected a run folder"),
+        (("drift.nc", "elsewhere.nc"), 1, "different attributes 'frame' ('drift': machine; 'elsewhere': table)"),
+        (("drift.nc", "frameless.nc"), 1, "attribute 'frame': missing; expected coordinate system"),
+        (("drift.nc", "axis.nc"), 1, "different attributes 'component'"),
+        (("drift.nc", "blind.nc", "--freedoms", "EX"), 1, "'blind' does not state EX; it states EY"),
+        (("turning.nc", "moving.nc"), 1, "have no freedom in common: 'turning': EA, EB; 'moving': EX, EY, EZ"),
+        (("drift.nc", "both-ways.nc"), 1, "'both-ways': its errors depend on way, time; select one value"),
+        (("drift.nc", "raw.nc"), 1, "'raw': The dataset breaks its schema"),
+        (("drift.nc", "c.nc"), 1, "'c': '.em.names' belongs to error datasets"),
+        (("drift.nc", "probing.nc", "--since", "1e9"), 1, "since: expected a time from"),
+        (("drift.nc", "moment.nc"), 1, "depend on different things ('drift': time; 'moment': none)"),
     ],
 )
-def test_refusals_say_what_was_expected(run, files, results, arguments, code, message):
+def test_refusals_say_what_was_expected(run, results, arguments, code, message):
     Path("empty").mkdir()
-    probing = results["probing"]
-    datasets.save(probing.drop_attrs(deep=False).assign_attrs({k: v for k, v in probing.attrs.items() if k != "start"}),
-                  "unknown.nc")  # fmt: skip
-    datasets.save(probing.assign_attrs(start="2027-03-02T07:00:00+00:00"), "later.nc")
-    datasets.save(probing.assign_attrs(machine="another"), "other.nc")
+    for name in {"drift.nc", *(each for each in arguments if each.endswith(".nc"))} & set(ALTERED):
+        datasets.save(ALTERED[name](results["drift"], results["probing"]), name)
     result = run("compare", *arguments, code=code)
     assert message in result.stderr
     assert "Traceback" not in result.output

@@ -1,9 +1,11 @@
 """Whole comparisons: methods that agree, planted mistakes and their causes, bad input, the dataset of the result."""
 
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, kstest, ncx2
 
 from errormotion import datasets
 from errormotion.compare import compare
@@ -231,11 +233,65 @@ def test_three_datasets_have_a_consensus_and_the_wrong_one_is_named():
     assert found.sizes["pair"] == 3
 
 
-def test_ten_thousand_instants_are_compared_in_seconds():
-    rng = np.random.default_rng(11)
-    t = np.linspace(0, 7200, 10_000)
-    found = compare({"a": made(t, rng), "b": made(t, rng, name="b")}, causes=False)
-    assert found.sizes["time"] == 10_000
+def test_memory_grows_with_the_instants_and_not_with_their_square():
+    peaks, rng = [], np.random.default_rng(11)
+    for size in (2_000, 8_000):
+        t = np.linspace(0, 7200, size)
+        sets = {"a": made(t, rng), "b": made(t, rng, name="b")}
+        tracemalloc.start()
+        found = compare(sets, causes=False)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert found.sizes["time"] == size
+    assert peaks[1] < 5 * peaks[0]
+
+
+def test_many_datasets_are_compared_with_one_of_them():
+    rng, t = np.random.default_rng(13), np.arange(0, 1801, 600.0)
+    sets = {f"m{k}": made(t, rng, name=f"m{k}") for k in range(42)}
+    found = compare(sets, causes=False)
+    assert found.sizes["pair"] == 41
+    assert any("'m0' with each of the others" in note for note in found.attrs["notes"])
+    few = {name: sets[name] for name in ("m0", "m1", "m2")}
+    assert compare(few, causes=False, against="m2")["pair"].values.tolist() == ["m2 - m0", "m2 - m1"]
+    with pytest.raises(DatasetError, match="against: expected one of the datasets m0, m1, m2; found 'm9'"):
+        compare(few, against="m9")
+
+
+def test_no_two_interpolated_values_share_a_measured_one(monkeypatch):
+    """With shared neighbours the values are correlated, which no covariance of the result would hold."""
+    monkeypatch.setitem(globals(), "NOISE", 10 * NOISE)  # far more than what interpolation adds
+    rng, p, between = np.random.default_rng(14), [], T2[:-1] + 120.0
+    for _ in range(60):
+        found = compare({"a": made(T2, rng), "b": made(between, rng, name="b")}, causes=False)
+        p.append(found["p"].item())
+    assert found.sizes["time"] == 15
+    assert "14 of 29 instants are left out" in found.attrs["notes"][0]
+    assert kstest(p, "uniform").pvalue > 0.01
+
+
+class Exact:
+    """A generator of zeros: a dataset without noise."""
+
+    def normal(self, *_, size=None):
+        return np.zeros(size) if size is not None else 0.0
+
+
+def test_a_mistake_is_detected_as_often_as_its_non_centrality_predicts():
+    rng, changed = np.random.default_rng(15), {"functional_point": (0.0, 0.0, 0.010)}
+    exact = compare(two(Exact(), **changed), causes=False)
+    degrees, squares = int(exact["degrees"].item()), exact["chi2"].item()
+    predicted = ncx2.sf(chi2.isf(0.05, degrees), degrees, squares)
+    assert 0.8 < predicted < 0.97
+    found = np.mean([compare(two(rng, **changed), causes=False)["p"].item() < 0.05 for _ in range(40)])
+    assert abs(found - predicted) < 4 * np.sqrt(predicted * (1 - predicted) / 40)
+
+
+def test_causes_with_scores_that_are_close_are_named_together():
+    """A wrong unit of one of two datasets is the inverse one of the other."""
+    first = compare(two(np.random.default_rng(16), unit=4.8481368)).isel(pair=0, rank=0)
+    units = {"unit of 'probing': urad taken as arcsec", "unit of 'drift': arcsec taken as urad"}
+    assert units <= {first["cause"].item(), *first["alike"].item().split("; ")}
 
 
 def test_a_wrong_functional_point_is_named_where_only_displacements_are_compared():

@@ -6,6 +6,7 @@ from scipy.stats import kstest
 
 from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.low_rank import whitener
+from errormotion.compare.normal import Information, Reduced, short, solve
 from errormotion.compare.pairs import pair
 from errormotion.compare.stack import Estimate, gathered
 
@@ -158,6 +159,27 @@ def test_unknown_values_of_one_dataset_leave_those_of_the_others():
     assert found.fit.degrees == 2 * N * D - D
     assert np.isnan(pair(values[0], values[1]).en[2]).all()
     assert pair(values[0], values[1]).joint.degrees == N * D - D
+
+
+def test_datasets_that_are_left_out_together_are_those_left_out_one_by_one():
+    """Many short datasets: the sources of one dataset are eliminated first, and all are left out at once."""
+    rng = np.random.default_rng(9)
+    models = [model(rng, f"m{k}", ("bar", "thermometer") if k % 2 else ("bar",), sources=6) for k in range(9)]
+    values = drawn(rng, models, np.zeros((N, D)))
+    for each in values[1:]:  # one value is known to the first dataset alone
+        each.value[5, 1], each.own[5, 1], each.own[5, :, 1], each.influence[:, 5, 1] = np.nan, np.nan, np.nan, np.nan
+    keys = {key: k for k, key in enumerate(dict.fromkeys(key for each in values for key in each.source))}
+    parts = [Information.of(each, keys) for each in values]
+    assert short(parts, len(keys))
+    assert not short(parts[:2], len(keys))
+    whole, reduced = solve(parts, len(keys)), Reduced.of(parts, len(keys))
+    found = reduced.solution()
+    np.testing.assert_allclose(found.value, whole.value, atol=1e-9 * SCALE.max())
+    covariance = [each.own + np.einsum("sni,snj->nij", each.influence, each.influence) for each in (found, whole)]
+    np.testing.assert_allclose(*covariance, rtol=1e-7)
+    assert found.square == pytest.approx(whole.square, rel=1e-9)
+    left = [solve(parts[:i] + parts[i + 1 :], len(keys)).square for i in range(len(parts))]
+    np.testing.assert_allclose(whole.square - reduced.falls(), left, rtol=1e-9)
 
 
 def test_datasets_without_sources_have_a_consensus():

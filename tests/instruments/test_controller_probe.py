@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from armed import CONTROLLER, PROBE
 
 from errormotion.datasets.calibrations.pretravel import PretravelMap, assemble, terms_up_to, unit
 from errormotion.errors import DatasetError, InstrumentError, InstrumentTimeoutError, ProtocolError
@@ -45,7 +46,7 @@ def gathered(probe: ControllerProbe, items: Sequence[int] = (0,)) -> tuple[list[
 
 
 def test_contacts_are_where_the_twin_says() -> None:
-    with ControllerProbe(ADDRESS) as probe:
+    with ControllerProbe(ADDRESS, PROBE) as probe:
         machine = world("cframe", 3).machine
         orders = touches((0, 1))
         contacts = list(probe.measure(orders))
@@ -64,7 +65,7 @@ def test_contacts_are_where_the_twin_says() -> None:
 def test_more_repeats_scatter_less() -> None:
     spread = []
     for repeats in (1, 8):
-        settings = ControllerProbeSettings(repeats=repeats, agreement=5e-6)
+        settings = ControllerProbeSettings(arm=True, repeats=repeats, agreement=5e-6)
         with ControllerProbe(ADDRESS, settings) as probe:
             order = touches(normals=[(0, 0, 1)]) * 12
             heights = [contact.position[2] for contact in probe.measure(order)]
@@ -75,11 +76,11 @@ def test_more_repeats_scatter_less() -> None:
 
 
 def test_the_probe_says_who_and_what_it_is() -> None:
-    settings = ControllerProbeSettings(tip_radius=2e-3, noise=0.3e-6)
+    settings = ControllerProbeSettings(arm=True, tip_radius=2e-3, noise=0.3e-6)
     with ControllerProbe(ADDRESS, settings) as probe:
         assert probe.identify().model == "cframe touch probe"
         assert (probe.tip_radius, probe.noise, probe.pretravel) == (2e-3, 0.3e-6, None)
-    assert math.isnan(ControllerProbe(ADDRESS).noise)
+    assert math.isnan(ControllerProbe(ADDRESS, PROBE).noise)
 
 
 # ---------------------------------------------------------------------- pre-travel
@@ -113,14 +114,14 @@ def test_a_map_of_another_probe_is_refused_unless_allowed(tmp_path: Path) -> Non
     made.dataset.attrs["serial_number"] = "P1"
     path = str(made.save(tmp_path / "probe.nc"))
     with pytest.raises(DatasetError, match=r"serial number P1; the sensor in use has P2\. .*allow_other_sensor = true"):
-        ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=path, serial_number="P2")).open()
+        ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel=path, serial_number="P2")).open()
     for allowed in ({"serial_number": "P1"}, {"serial_number": "P2", "allow_other_sensor": True}, {}):
-        assert ControllerProbeSettings(pretravel=path, **allowed).pretravel_map() is not None
+        assert ControllerProbeSettings(arm=True, pretravel=path, **allowed).pretravel_map() is not None
 
 
 def test_a_map_without_a_serial_number_is_used_with_a_note(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = str(lobed(1e-6).save(tmp_path / "probe.nc"))
-    ControllerProbeSettings(pretravel=path, serial_number="P2").pretravel_map()
+    ControllerProbeSettings(arm=True, pretravel=path, serial_number="P2").pretravel_map()
     assert "holds no serial number" in caplog.text
 
 
@@ -129,7 +130,7 @@ def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -
     path = made.save(tmp_path / "probe.nc")
     results = []
     for pretravel in ("", str(path)):
-        with ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=pretravel)) as probe:
+        with ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel=pretravel)) as probe:
             results.append(np.array([contact.position for contact in probe.measure(touches())]))
     value, _ = made.length(NORMALS)
     np.testing.assert_allclose(results[1] - results[0], value[:, None] * np.array(NORMALS), atol=1e-15)
@@ -137,7 +138,7 @@ def test_a_map_takes_contacts_to_where_the_tip_met_the_surface(tmp_path: Path) -
 
 def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path) -> None:
     path = lobed(0.0, NORMALS[:4]).save(tmp_path / "probe.nc")
-    with ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel=str(path))) as probe:
+    with ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel=str(path))) as probe:
         with pytest.raises(InstrumentError, match=r"direction of touch 5 \(item 0\); it does not cover 1 of 5 touches"):
             next(probe.measure(touches()))
         assert world("cframe", 3).time == 0.0
@@ -145,7 +146,7 @@ def test_touches_beyond_the_map_are_refused_before_anything_moves(tmp_path: Path
 
 def test_a_map_that_is_not_there_is_told_on_opening() -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.nc.*no such file"):
-        ControllerProbe(ADDRESS, ControllerProbeSettings(pretravel="nowhere.nc")).open()
+        ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, pretravel="nowhere.nc")).open()
 
 
 # ---------------------------------------------------------------------- what goes wrong
@@ -164,7 +165,7 @@ def test_a_map_that_is_not_there_is_told_on_opening() -> None:
 def test_a_fault_in_the_middle_ends_the_cycle_and_keeps_the_contacts(
     fault: str, message: str, error: type[InstrumentError]
 ) -> None:
-    settings = ControllerProbeSettings(controller_settings={"timeout": 0.3})
+    settings = ControllerProbeSettings(arm=True, controller_settings={"timeout": 0.3})
     with ControllerProbe(f"{ADDRESS}&fault={fault}&fault_at=30", settings) as probe:
         here = world("cframe", 3)
         contacts, raised = gathered(probe)
@@ -177,7 +178,7 @@ def test_a_fault_in_the_middle_ends_the_cycle_and_keeps_the_contacts(
 
 
 def test_nothing_begins_in_alarm_or_emergency_stop() -> None:
-    with ControllerProbe(ADDRESS) as probe, VirtualController(ADDRESS) as control:
+    with ControllerProbe(ADDRESS, PROBE) as probe, VirtualController(ADDRESS, CONTROLLER) as control:
         control.press_estop()
         with pytest.raises(InstrumentError, match="in emergency stop; nothing was moved"):
             next(probe.measure(touches()))
@@ -188,7 +189,7 @@ def test_nothing_begins_in_alarm_or_emergency_stop() -> None:
 
 
 def test_a_probe_that_never_trips_is_found_at_the_second_ball() -> None:
-    with ControllerProbe(f"{ADDRESS}&fault=no_trip") as probe:
+    with ControllerProbe(f"{ADDRESS}&fault=no_trip", PROBE) as probe:
         contacts, raised = gathered(probe, (0, 1, 2))
         assert [contact.flag for contact in contacts] == ["no trip", *["not made"] * 4, "no trip"]
         assert all(math.isnan(x) for contact in contacts for x in contact.position)
@@ -199,20 +200,20 @@ def test_a_probe_that_never_trips_is_found_at_the_second_ball() -> None:
 
 def test_a_ball_that_is_not_there_costs_its_own_touches_only() -> None:
     orders = [Touch(tuple(np.add(t.start, (0, 0, 0.1))), tuple(np.add(t.target, (0, 0, 0.1))), 0) for t in touches()]
-    with ControllerProbe(ADDRESS) as probe:
+    with ControllerProbe(ADDRESS, PROBE) as probe:
         contacts = list(probe.measure([*orders, *touches((1,))]))
     assert [contact.flag for contact in contacts] == ["no trip", *["not made"] * 4, *[""] * 5]
 
 
 def test_a_stuck_probe_gives_its_flag_and_then_an_error() -> None:
-    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30") as probe:
+    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30", PROBE) as probe:
         contacts, raised = gathered(probe)
     assert [contact.flag for contact in contacts] == ["", "", "tripped at the start"]
     assert "Touch 3 of 5 (item 0): the probe is tripped before it moves, and remains so" in str(raised)
 
 
 def test_a_probe_that_sticks_for_a_moment_is_waited_for() -> None:
-    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30&fault_for=1") as probe:
+    with ControllerProbe(f"{ADDRESS}&fault=tripped&fault_at=30&fault_for=1", PROBE) as probe:
         contacts, raised = gathered(probe)
     assert raised is None
     assert [contact.flag for contact in contacts] == [""] * 5
@@ -220,7 +221,7 @@ def test_a_probe_that_sticks_for_a_moment_is_waited_for() -> None:
 
 def test_something_in_the_way_stops_the_machine_there() -> None:
     """Without clearance the straight way from one side of the ball to the other goes through it."""
-    settings = ControllerProbeSettings(clearance=0.0)
+    settings = ControllerProbeSettings(arm=True, clearance=0.0)
     with ControllerProbe(ADDRESS, settings) as probe:
         source = probe.measure([touches()[0], touches()[2]])
         assert next(source).flag == ""
@@ -232,14 +233,14 @@ def test_something_in_the_way_stops_the_machine_there() -> None:
 
 
 def test_a_turning_spindle_is_refused() -> None:
-    with ControllerProbe(ADDRESS) as probe, VirtualController(ADDRESS) as control:
+    with ControllerProbe(ADDRESS, PROBE) as probe, VirtualController(ADDRESS, CONTROLLER) as control:
         control.spindle(3000.0)
         with pytest.raises(InstrumentError, match="spindle turns at 3000"):
             next(probe.measure(touches()))
 
 
 def test_a_caller_who_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
-    with ControllerProbe(ADDRESS) as probe:
+    with ControllerProbe(ADDRESS, PROBE) as probe:
         source = probe.measure(touches())
         next(source)
         source.close()
@@ -247,7 +248,7 @@ def test_a_caller_who_stops_leaves_the_probe_at_the_start_of_a_touch() -> None:
 
 
 def test_an_interrupted_cycle_stops_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    with ControllerProbe(ADDRESS) as probe:
+    with ControllerProbe(ADDRESS, PROBE) as probe:
         source = probe.measure(touches())
         next(source)
         stopped = []
@@ -264,21 +265,21 @@ def test_an_interrupted_cycle_stops_the_machine(monkeypatch: pytest.MonkeyPatch)
 
 def test_controllers_that_cannot_probe_or_do_not_exist_are_refused() -> None:
     with pytest.raises(InstrumentError, match="'mtconnect' cannot probe"):
-        ControllerProbe("sim://cframe/x", ControllerProbeSettings(controller="mtconnect")).open()
+        ControllerProbe("sim://cframe/x", ControllerProbeSettings(arm=True, controller="mtconnect")).open()
     with pytest.raises(InstrumentError, match="No instrument plugin 'virtul_controller'"):
-        ControllerProbe(ADDRESS, ControllerProbeSettings(controller="virtul_controller")).open()
+        ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, controller="virtul_controller")).open()
     with pytest.raises(InstrumentError, match="colour"):
-        ControllerProbe(ADDRESS, ControllerProbeSettings(controller_settings={"colour": 1})).open()
+        ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, controller_settings={"colour": 1})).open()
     with pytest.raises(InstrumentError, match="is not open"):
-        ControllerProbe(ADDRESS).read()
+        ControllerProbe(ADDRESS, PROBE).read()
 
 
 def test_a_recorded_cycle_plays_back(tmp_path: Path) -> None:
     path = tmp_path / "probe.rec"
     orders = touches()
-    with ControllerProbe(ADDRESS, record=path) as probe:
+    with ControllerProbe(ADDRESS, PROBE, record=path) as probe:
         contacts = list(probe.measure(orders))
-    with ControllerProbe(f"replay://{path}") as probe:
+    with ControllerProbe(f"replay://{path}", PROBE) as probe:
         assert list(probe.measure(orders)) == contacts
 
 
@@ -321,7 +322,7 @@ def surface(begin: float, target: float) -> float | None:
 
 def touch(trips: Callable[[int, float, float], float | None], **settings: float) -> tuple[Contact, Controller]:
     control = Controller(trips)
-    return Toucher(control, ControllerProbeSettings(**settings).strategy).touch(WAY), control
+    return Toucher(control, ControllerProbeSettings(arm=True, **settings).strategy).touch(WAY), control
 
 
 def test_a_false_trip_on_the_way_is_not_taken_for_a_contact() -> None:
@@ -365,6 +366,6 @@ def test_a_place_off_the_way_is_an_error() -> None:
     control = Controller(lambda n, begin, target: surface(begin, target))
     control.aside = 0.2e-3
     with pytest.raises(InstrumentError, match=r"2\.000 mm along it and 0\.200 mm aside"):
-        Toucher(control, ControllerProbeSettings().strategy).touch(WAY)
+        Toucher(control, ControllerProbeSettings(arm=True).strategy).touch(WAY)
     with pytest.raises(InstrumentError, match="target differs from its start"):
-        Toucher(control, ControllerProbeSettings().strategy).touch(Touch((0, 0, 0), (0, 0, 0)))
+        Toucher(control, ControllerProbeSettings(arm=True).strategy).touch(Touch((0, 0, 0), (0, 0, 0)))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armed import CONTROLLER
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -294,7 +295,10 @@ def run(
     """Let the machine run a program, and return what the listening driver makes of it."""
     contacts: list[Contact] = []
     raised = None
-    with Dprnt(address, settings) as probe, VirtualController(f"sim://cframe/controller?seed=3{fault}") as control:
+    with (
+        Dprnt(address, settings) as probe,
+        VirtualController(f"sim://cframe/controller?seed=3{fault}", CONTROLLER) as control,
+    ):
         begun = control.run_program(program(ball_touches()))
         control.elapse(begun["duration"] + begun["longest_lead_in"])
         try:
@@ -410,7 +414,10 @@ def test_a_probe_that_never_trips_is_flagged() -> None:
 
 def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
     path = tmp_path / "printer.rec"
-    with Dprnt(ADDRESS, QUICK, record=path) as probe, VirtualController("sim://cframe/controller?seed=3") as control:
+    with (
+        Dprnt(ADDRESS, QUICK, record=path) as probe,
+        VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control,
+    ):
         begun = control.run_program(program(ball_touches()))
         control.elapse(begun["duration"] + begun["longest_lead_in"])
         orders = ball_touches()
@@ -420,7 +427,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
 
 
 def test_lines_from_before_the_driver_listened_are_gone() -> None:
-    with VirtualController("sim://cframe/controller?seed=3") as control:
+    with VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         begun = control.run_program(program(ball_touches()))
         control.elapse(begun["duration"] + begun["longest_lead_in"])
         with Dprnt(ADDRESS, QUICK) as probe, pytest.raises(InstrumentTimeoutError, match="Touch 1 of 5"):

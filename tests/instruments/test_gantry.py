@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from armed import CONTROLLER
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.controller.virtual import VirtualController
@@ -62,7 +63,7 @@ class Pass:
 
 @contextmanager
 def gantry(profiler: str = PERFECT, settings: LJXSettings = PATIENT) -> Iterator[tuple[VirtualController, KeyenceLJX]]:
-    with VirtualController(CONTROL) as controller, KeyenceLJX(profiler, settings) as device:
+    with VirtualController(CONTROL, CONTROLLER) as controller, KeyenceLJX(profiler, settings) as device:
         yield controller, device
 
 
@@ -146,7 +147,7 @@ def test_a_warm_pass_shows_the_true_error_of_each_line_at_its_own_moment() -> No
 
 
 def test_the_warm_up_begins_with_the_first_long_fast_move_and_then_counts_on() -> None:
-    with VirtualController(CONTROL) as controller:
+    with VirtualController(CONTROL, CONTROLLER) as controller:
         here = world("gantry", 3)
         controller.run_program("G1 Y-600 F1500\nG0 Y0\nG1 Y100 F3600\nM30")
         finish(controller)
@@ -398,7 +399,7 @@ def test_at_a_pace_the_machine_moves_in_real_time() -> None:
 
 
 def test_a_refused_program_moves_nothing() -> None:
-    with VirtualController(CONTROL) as controller:
+    with VirtualController(CONTROL, CONTROLLER) as controller:
         for text, message in [
             ("G1 Y100 F1500\nG1 Y901\nM30", r"refuses: Line 2 'G1 Y901': Y travels from -900 to 900 mm; found 901"),
             ("%\nG91\nM30", r"refuses: Line 2 'G91'"),
@@ -412,7 +413,7 @@ def test_a_refused_program_moves_nothing() -> None:
 
 
 def test_programs_wait_for_one_another() -> None:
-    with VirtualController(CONTROL) as controller:
+    with VirtualController(CONTROL, CONTROLLER) as controller:
         controller.run_program(forwards(0, 100))
         with pytest.raises(InstrumentError, match="still running; wait"):
             controller.run_program(forwards(0, 100))
@@ -426,7 +427,7 @@ def test_programs_wait_for_one_another() -> None:
 
 
 def test_a_new_schedule_stops_a_program_where_the_machine_is() -> None:
-    with VirtualController(CONTROL) as controller:
+    with VirtualController(CONTROL, CONTROLLER) as controller:
         controller.run_program("G1 X1000 F6000\nM30")
         controller.elapse(5.0)
         there = controller.state()["position"]

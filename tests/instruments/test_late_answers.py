@@ -34,7 +34,7 @@ def keyence(query: str) -> KeyenceLK:
 
 
 def controller(query: str) -> Any:
-    return VirtualController(f"sim://cframe/controller?seed=3&{query}", ControllerSettings(timeout=TIMEOUT))
+    return VirtualController(f"sim://cframe/controller?seed=3&{query}", ControllerSettings(arm=True, timeout=TIMEOUT))
 
 
 def read_all(driver: Any, count: int = READINGS) -> list[Any]:

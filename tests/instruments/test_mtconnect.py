@@ -5,6 +5,7 @@ from itertools import islice
 from pathlib import Path
 
 import pytest
+from armed import CONTROLLER
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.mtconnect import MTConnect, MTConnectSettings
@@ -21,7 +22,7 @@ def read_often(agent: MTConnect) -> None:
 
 
 def test_a_state_is_what_the_machine_does() -> None:
-    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3") as control:
+    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         assert agent.identify().model == "cframe"
         assert agent.identify().simulated
         control.spindle(6000.0)
@@ -43,7 +44,7 @@ def test_a_state_is_what_the_machine_does() -> None:
 
 def test_a_program_and_its_feed_show_while_it_runs() -> None:
     program = "(there and back)\nG1 X100 F600\nG1 X0\nM30\n"
-    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3") as control:
+    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         control.run_program(program)
         control.elapse(5.0)
         state = agent.state()
@@ -55,7 +56,7 @@ def test_a_program_and_its_feed_show_while_it_runs() -> None:
 
 
 def test_alarms_and_emergency_stop_are_told() -> None:
-    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3") as control:
+    with MTConnect(ADDRESS) as agent, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         control.press_estop()
         state = agent.state()
         assert state["estop"]

@@ -9,6 +9,7 @@ from urllib.parse import parse_qs, urlsplit
 from xml.etree import ElementTree
 
 import pytest
+from armed import CONTROLLER
 from wire_vectors import Vector, vectors
 
 from errormotion.errors import InstrumentError
@@ -230,7 +231,7 @@ def test_a_device_that_the_address_does_not_name_is_refused() -> None:
 @pytest.mark.parametrize("more", ["", "&series=1", "&next=0", "&offset=10,20,30"])
 def test_machine_coordinates_are_read_at_agents_of_each_style(style: str, more: str) -> None:
     address = f"sim://cframe/mtconnect?seed=3&style={style}{more}"
-    with MTConnect(address) as driver, VirtualController("sim://cframe/controller?seed=3") as control:
+    with MTConnect(address) as driver, VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control:
         control.move_to((0.1, 0.05, 0.2), 0.05)
         state, true = driver.state(), control.state()
         assert driver.sample().observations

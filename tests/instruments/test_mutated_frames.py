@@ -13,6 +13,7 @@ from wire_readers import Received, dprnt_line, opcua_lines
 
 from errormotion import plugins
 from errormotion.errors import ProtocolError, ReplayError
+from errormotion.instruments.controller import virtual
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.shdr import codec as shdr
 from errormotion.instruments.laser_tracker.leica_geocom import codec as geocom
@@ -128,6 +129,10 @@ def test_whole_numbers_beyond_a_float_are_errors_of_the_bridge() -> None:
         linuxcnc.decode(json.dumps({"id": 1, "beat": 1, "time": HUGE}).encode())
     with pytest.raises(ProtocolError, match="result of a touch"):
         linuxcnc.decode_touch({"tripped": True, "position": [0.1, HUGE, 0.0], "time": 1.0})
+    with pytest.raises(ProtocolError, match="an answer of the bridge"):
+        linuxcnc.decode(json.dumps({"id": 1, "ok": True, "result": {"travel": {"X": [0, HUGE]}}}).encode())
+    with pytest.raises(ProtocolError, match="an answer in JSON"):
+        virtual.decode_answer(json.dumps({"id": 1, "ok": True, "result": {"position": [0, HUGE, 0]}}).encode(), 1)
     numbers = {"time": HUGE, "position": [0.0] * 3, "commanded_position": [0.0] * 3}
     with pytest.raises(ProtocolError, match="state of LinuxCNC"):
         linuxcnc.decode_state({"mode": "mdi", **numbers, "spindle_speed": 1})

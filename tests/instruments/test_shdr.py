@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from armed import CONTROLLER
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.shdr import Shdr, ShdrSettings
@@ -106,7 +107,7 @@ def until(driver: Shdr, wanted: Callable[[Mapping[str, Any]], bool]) -> Mapping[
 def test_the_state_is_that_of_the_machine(query: str, settings: dict[str, Any]) -> None:
     with (
         Shdr(f"sim://cframe/shdr?seed=3&{query}", ShdrSettings(**settings)) as driver,
-        VirtualController("sim://cframe/controller?seed=3") as control,
+        VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control,
     ):
         assert driver.identify().simulated
         control.spindle(6000.0)
@@ -131,7 +132,7 @@ def test_a_feed_in_millimetres_a_minute() -> None:
     settings = ShdrSettings(items=OKUMA, feed_unit="mm/min")
     with (
         Shdr("sim://cframe/shdr?seed=3&style=okuma", settings) as driver,
-        VirtualController("sim://cframe/controller?seed=3") as control,
+        VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as control,
     ):
         control.run_program("G1 X100 F600\nG1 X0\nM30\n")
         control.elapse(5.0)

@@ -2,12 +2,14 @@
 
 import time
 
+from armed import CONTROLLER
+
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
 
 
 def test_time_stands_still_unless_it_is_asked_to_tick() -> None:
-    with VirtualController("sim://cframe/controller?seed=61") as control:
+    with VirtualController("sim://cframe/controller?seed=61", CONTROLLER) as control:
         before = control.state()["time"]
         time.sleep(0.05)
         assert control.state()["time"] == before
@@ -17,7 +19,7 @@ def test_a_watched_machine_warms_up_by_itself() -> None:
     """A tenth of a second at 36 000 simulated seconds a second is an hour; the front bearing warms by kelvins."""
     sensors = DconSettings(channels=("spindle_front",))
     with (
-        VirtualController("sim://cframe/controller?seed=62&clock=36000") as control,
+        VirtualController("sim://cframe/controller?seed=62&clock=36000", CONTROLLER) as control,
         DconTemperature("sim://cframe/t?seed=62&sensors=spindle_front", sensors) as thermometer,
     ):
         control.spindle(12000.0)
@@ -29,7 +31,7 @@ def test_a_watched_machine_warms_up_by_itself() -> None:
 
 
 def test_time_that_is_set_goes_on_from_there() -> None:
-    with VirtualController("sim://cframe/controller?seed=63&clock=1") as control:
+    with VirtualController("sim://cframe/controller?seed=63&clock=1", CONTROLLER) as control:
         control.elapse(5000.0)
         assert 5000.0 <= control.state()["time"] < 5100.0
         control.start([])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armed import CONTROLLER
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.virtual import (
@@ -19,7 +20,7 @@ from errormotion.instruments.spindle_frame.five_sensor_frame import FiveSensorFr
 from errormotion.twin import Event
 
 ADDRESS = "sim://cframe/controller?seed=3"
-QUICK = ControllerSettings(timeout=0.3)
+QUICK = ControllerSettings(arm=True, timeout=0.3)
 
 
 def test_a_request_is_a_line_of_json() -> None:
@@ -51,7 +52,7 @@ def test_what_is_no_event_is_refused(event: object) -> None:
 
 
 def test_the_state_follows_the_schedule() -> None:
-    with VirtualController(ADDRESS) as controller:
+    with VirtualController(ADDRESS, CONTROLLER) as controller:
         controller.start([Event(0.0, spindle_speed=15000.0), Event(60.0, compensation={"Z": False})])
         assert controller.state() == {
             "time": 0.0,
@@ -82,7 +83,7 @@ def test_the_state_follows_the_schedule() -> None:
 
 
 def test_the_identity_says_simulated() -> None:
-    with VirtualController(ADDRESS) as controller:
+    with VirtualController(ADDRESS, CONTROLLER) as controller:
         identity = controller.identify()
     assert (identity.model, identity.serial_number, identity.simulated) == ("cframe", "seed 3", True)
 
@@ -99,7 +100,7 @@ def test_the_identity_says_simulated() -> None:
     ],
 )
 def test_what_the_machine_cannot_do_is_refused_in_words(order: object, message: str) -> None:
-    with VirtualController(ADDRESS) as controller:
+    with VirtualController(ADDRESS, CONTROLLER) as controller:
         with pytest.raises(InstrumentError, match=message):
             order(controller)
         assert controller.state()["alarms"] == []
@@ -126,7 +127,7 @@ def step_in_front_of_x1(frame: FiveSensorFrame, controller: VirtualController, c
 def test_a_stepped_sphere_is_seen_after_a_lead_in_that_nobody_told() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
-        VirtualController(ADDRESS) as controller,
+        VirtualController(ADDRESS, CONTROLLER) as controller,
     ):
         readings = step_in_front_of_x1(frame, controller, 11)
         begin = world("cframe", 3).motion.begin
@@ -141,7 +142,7 @@ def test_a_stepped_sphere_is_seen_after_a_lead_in_that_nobody_told() -> None:
 
 
 def test_two_lead_ins_differ_and_a_second_program_waits_for_the_first() -> None:
-    with VirtualController(ADDRESS) as controller:
+    with VirtualController(ADDRESS, CONTROLLER) as controller:
         controller.mount("sphere")
         begins = []
         for _ in range(2):
@@ -158,7 +159,7 @@ def test_two_lead_ins_differ_and_a_second_program_waits_for_the_first() -> None:
 def test_a_sphere_that_is_mounted_but_not_placed_is_not_seen() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FrameSettings(rate=1500.0, timeout=10.0)) as frame,
-        VirtualController(ADDRESS) as controller,
+        VirtualController(ADDRESS, CONTROLLER) as controller,
     ):
         controller.mount("sphere")
         assert np.isnan(frame.read()).all()
@@ -184,7 +185,7 @@ def test_each_fault_becomes_a_typed_error(fault: str, error: type[InstrumentErro
 
 
 def test_split_answers_change_nothing() -> None:
-    with VirtualController(f"{ADDRESS}&fault=split") as controller:
+    with VirtualController(f"{ADDRESS}&fault=split", CONTROLLER) as controller:
         assert controller.state()["tool"] == "bar"
 
 
@@ -192,7 +193,7 @@ def test_a_recorded_session_plays_back(tmp_path: Path) -> None:
     path = tmp_path / "controller.rec"
 
     def session(address: str, record: Path | None) -> dict[str, object]:
-        with VirtualController(address, record=record) as controller:
+        with VirtualController(address, CONTROLLER, record=record) as controller:
             controller.mount("sphere")
             controller.elapse(5.0)
             return controller.state()

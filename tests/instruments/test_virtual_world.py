@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from armed import CONTROLLER
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments import simulators
@@ -29,8 +30,8 @@ def names() -> set[str]:
 def test_devices_of_one_machine_and_seed_share_a_world_and_others_do_not() -> None:
     with (
         OptoNCDT("sim://cframe/X1?seed=3", SLOW),
-        VirtualController("sim://cframe/controller?seed=3") as controller,
-        VirtualController("sim://cframe/controller?seed=4") as other,
+        VirtualController("sim://cframe/controller?seed=3", CONTROLLER) as controller,
+        VirtualController("sim://cframe/controller?seed=4", CONTROLLER) as other,
     ):
         controller.elapse(10.0)
         assert controller.state()["time"] == 10.0
@@ -67,7 +68,7 @@ def test_reset_ends_devices_that_were_left_open() -> None:
 def test_the_clock_shows_the_time_that_the_readers_have_seen() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
-        VirtualController("sim://cframe/c?seed=3") as controller,
+        VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
     ):
         controller.start([])
         stream = frame.stream()
@@ -83,7 +84,10 @@ def test_the_clock_shows_the_time_that_the_readers_have_seen() -> None:
 
 def test_the_same_orders_give_the_same_samples() -> None:
     def session() -> np.ndarray:
-        with FiveSensorFrame("sim://cframe?seed=5", FRAME) as frame, VirtualController("sim://cframe/c?seed=5") as c:
+        with (
+            FiveSensorFrame("sim://cframe?seed=5", FRAME) as frame,
+            VirtualController("sim://cframe/c?seed=5", CONTROLLER) as c,
+        ):
             frame.read()
             frame.read()
             c.start([Event(0.0, spindle_speed=9000.0)])
@@ -98,7 +102,7 @@ def test_a_schedule_is_kept_whatever_is_buffered() -> None:
     """The bar is seen to start to turn at 20 s, although the samples were made long before they were read."""
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
-        VirtualController("sim://cframe/c?seed=3") as controller,
+        VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
     ):
         controller.start([Event(20.0, spindle_speed=15000.0)])
         x1 = np.concatenate([block.values[0] for block in itertools.islice(frame.stream(["X1"]), 80)])
@@ -135,7 +139,7 @@ def fifty_blocks(sensor: OptoNCDT, size: int) -> list[Samples]:
 def test_temperatures_belong_to_the_last_sample_that_was_read() -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
-        VirtualController("sim://cframe/c?seed=3") as controller,
+        VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
         DconTemperature("sim://cframe/t?seed=3") as thermometer,
     ):
         controller.start([Event(0.0, spindle_speed=15000.0)])
@@ -150,7 +154,7 @@ def test_temperatures_belong_to_the_last_sample_that_was_read() -> None:
 def test_what_would_tear_a_stream_apart_is_refused(order: str) -> None:
     with (
         FiveSensorFrame("sim://cframe?seed=3", FRAME) as frame,
-        VirtualController("sim://cframe/c?seed=3") as controller,
+        VirtualController("sim://cframe/c?seed=3", CONTROLLER) as controller,
     ):
         stream = frame.stream()
         next(stream)

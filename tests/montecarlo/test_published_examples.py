@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from errormotion.montecarlo import intervals
 from errormotion.montecarlo.adaptive import numerical_tolerance, propagate
 from errormotion.montecarlo.validation import NOT_VALIDATED, VALIDATED, validate_linear
 
@@ -196,3 +197,28 @@ def test_end_gauge_of_the_gum():
     # H.1.7: with the second-order terms of the products, 34 nm instead of 32 nm
     assert found.uncertainty[0] == pytest.approx(34.0, abs=0.5)
     assert found.mean[0] == pytest.approx(838.0, abs=0.5)
+
+
+def test_another_package_gives_the_same_gauge_block():
+    """MetroloPy, linear and by Monte Carlo, on 9.5: u 32 nm and 36 nm, 99 % interval."""
+    metrolopy = pytest.importorskip("metrolopy", reason="the package MetroloPy, another implementation, is missing")
+    given = metrolopy.gummy
+    length = _gauge(
+        *(given(metrolopy.TDist(*each)) for each in ((50_000_623.0, 25.0, 18), (215.0, 6.0, 24))),
+        *(given(metrolopy.TDist(*each)) for each in ((0.0, 4.0, 5), (0.0, 7.0, 8))),
+        given(metrolopy.UniformDist(lower_limit=9.5e-6, upper_limit=13.5e-6)),
+        given(metrolopy.NormalDist(-0.1, 0.2)),
+        given(metrolopy.ArcSinDist(center=0.0, half_width=0.5)),
+        given(metrolopy.CurvlinearTrapDist(center=0.0, half_width=1e-6, limit_half_range=0.1e-6)),
+        given(metrolopy.CurvlinearTrapDist(center=0.0, half_width=0.050, limit_half_range=0.025)),
+    )
+    metrolopy.Distribution.set_seed(3)
+    length.sim(n=400_000)
+    theirs = np.sort(np.asarray(length.simdata, dtype=float))[:, None]
+    ours = propagate(_block(_gauge, *_GAUGE), probability=0.99, trials=400_000)
+    error = np.hypot(ours.standard_error[:, 0], np.array(intervals.standard_errors(theirs, 0.99))[:, 0])
+    assert length.u == pytest.approx(32.0, abs=0.5)
+    # 36 nm is known to 36 / sqrt(2 n) = 0.04 nm on either side, more for the tails of Student's distribution
+    assert ours.uncertainty[0] == pytest.approx(theirs.std(), abs=0.4)
+    ends = np.array(intervals.symmetric(theirs, 0.99))[:, 0]
+    np.testing.assert_array_less(np.abs(ours.symmetric[:, 0] - ends), 4 * error)

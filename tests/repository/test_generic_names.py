@@ -20,6 +20,7 @@ EXAMPLES = "errormotion/cli/demo/"
 #: defaults of published settings that name another plugin.
 OTHER_MEANINGS = {
     ("optoncdt", "errormotion/instruments/spindle_frame/"),
+    ("optoncdt", "errormotion/instruments/simulators/spindle_frame/"),
     ("virtual_controller", "errormotion/instruments/touch_probe/controller_probe.py"),
     ("beam_direction", "errormotion/methods/spindle_drift/"),
     ("beam_direction", "errormotion/instruments/"),

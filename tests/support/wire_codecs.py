@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache, partial
 from itertools import islice
 
@@ -10,6 +11,7 @@ from fuzzing import Codec
 from wire_readers import folder
 from wire_vectors import vectors
 
+from errormotion.errors import ProtocolError
 from errormotion.instruments.controller import virtual
 from errormotion.instruments.controller.linuxcnc import codec as linuxcnc
 from errormotion.instruments.controller.mtconnect import xml
@@ -224,6 +226,15 @@ def dprnt_lines() -> list[bytes]:
     return [printed.encode(), *(format_line(line).encode() + b"\r\n" for line in lines), b"B1 X1.0 Y2.0 Z3.\r\n"]
 
 
+def geocom_values(data: bytes) -> None:
+    """Read a reply and take each of its values for a number, a whole number and a text."""
+    reply = geocom.reply(data)
+    for index in range(len(reply.values)):
+        for take in (reply.number, reply.whole, reply.text):
+            with suppress(ProtocolError):
+                take(index)
+
+
 def tables() -> list[bytes]:
     text = "station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]\n"
     return [(text + "S1,1,1500.5,20.1,1013,40\nS1,2,,20.2,1013,40\nS2,1,900,20.3,1012,41\nS1,1,1500.6,,,\n").encode()]
@@ -280,7 +291,7 @@ CODECS: Sequence[Codec] = (
         *("leica_emscon", "commands", emscon.decode_command, lambda: rows("leica_emscon", "command")),
         emscon.MAX_PACKET_BYTES,
     ),
-    Codec("leica_geocom", "replies", geocom.reply, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
+    Codec("leica_geocom", "replies", geocom_values, lambda: rows("leica_geocom", "reply"), geocom.LONGEST_REPLY),
     Codec(
         "tracker_table", "files", readers.tracker_table, tables, table_reader.LONGEST_TABLE, tried=4096, per_byte=128
     ),

@@ -157,6 +157,11 @@ class SwallowsUnknownSettings(Sound):
         model_config = ConfigDict(extra="ignore")
 
 
+class WritesProgramsOfUnknownMoves(Sound):
+    def programs(self, settings, instruments):
+        return {"a.nc": "G1 X100 F100"}
+
+
 class ForgetsItsVersion(Sound):
     def result(self, *args):
         return super().result(*args).assign_attrs(method_version="0")
@@ -289,6 +294,7 @@ class ForgetsItsCalibration(Redrawn):
 BROKEN = [
     ("info_complete", CannotSayWhatItCannotSee),
     ("settings_strict", SwallowsUnknownSettings),
+    ("motions_stated", WritesProgramsOfUnknownMoves),
     ("schema", ForgetsItsVersion),
     ("joins_along_a_dimension", JoinsAlongNothing),
     ("deterministic", Rolls),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -44,5 +45,7 @@ class _Kept:
             return pickle.loads(path.read_bytes())
         found = self.function(task)
         self.folder.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(found))
+        part = path.with_suffix(f".{os.getpid()}")
+        part.write_bytes(pickle.dumps(found))
+        part.replace(path)
         return found

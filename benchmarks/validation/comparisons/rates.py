@@ -22,6 +22,8 @@ Z95 = 1.959964
 STEP, INTERVAL, DURATION = 20.0, 600.0, 7200.0
 AVERAGED = 400_000
 """Samples in the mean over one step at 20 kHz."""
+UNSEEN = 5e-6
+"""Rotation about the spindle axis that the bar does not show, as large as on this machine, rad."""
 POINT = {"functional_point": (0.0, 0.0, 0.0)}
 DISPLACEMENTS = ("EX", "EY", "EZ")
 
@@ -39,23 +41,32 @@ def warm_machine(seed: int) -> VirtualMachine:
     return machine
 
 
-def drift(machine: VirtualMachine, seed: int, first: float = STEP / 2) -> xr.Dataset:
+def drift(machine: VirtualMachine, seed: int, **settings: object) -> xr.Dataset:
     """Return what a bar before five sensors shows; the beams are those of the machine's calibration."""
     beams = drifting.calibrated_beams(machine, machine.seed)
-    times = np.arange(first, DURATION, STEP)
+    times = np.arange(STEP / 2, DURATION, STEP)
     raw = drifting.raw_drift(
         machine, times, seed=seed, beams=beams, averaged=AVERAGED, warm_up=False, radius_error=False
     )
-    return identified("spindle_drift", raw, noise="stated", **POINT)
+    return identified("spindle_drift", raw, noise="stated", **POINT, **settings)
 
 
 def methods(seed: int) -> dict:
-    """Compare a bar before sensors and probed balls."""
+    """Compare a bar before sensors and probed balls; the rotation that the bar does not show has its true size."""
+    return _methods(seed, unseen_rotation=UNSEEN)
+
+
+def cautious(seed: int) -> dict:
+    """Compare the same with the default for this rotation, which is larger than on this machine."""
+    return _methods(seed)
+
+
+def _methods(seed: int, **settings: object) -> dict:
     logging.getLogger("errormotion").setLevel(logging.ERROR)
     machine = warm_machine(seed)
     balls = probing.raw(machine, np.arange(0.0, DURATION - INTERVAL, INTERVAL), seed=seed)
     sets = {
-        "drift": drift(machine, seed),
+        "drift": drift(machine, seed, **settings),
         "probing": identified("normal_vector", balls, tool_axes="Z", **POINT),
     }
     return {"shared": _counted(sets, _truth(machine), {"freedoms": DISPLACEMENTS})}
@@ -119,6 +130,7 @@ def _counted(sets: Mapping[str, xr.Dataset], truth, options: Mapping) -> dict:
 
 CASES = (
     ("bar before sensors, probed balls", methods, None),
+    ("the same, rotation about the spindle: default", cautious, None),
     ("two records with the same beams", records, None),
     ("one bar and one thermometer in both", drawn, False),
     ("the same, seen inverted by one of them", drawn, True),
@@ -131,15 +143,17 @@ def section(seeds: int, pool: Pool) -> list[str]:
     for name, function, option in CASES:
         runs = pool.mapped(function, [seed if option is None else (seed, option) for seed in range(seeds)])
         rows += [_row(name, "as stated", [run["shared"] for run in runs])]
-        if function is not methods:
+        if "apart" in runs[0]:
             rows += [_row("", "left out", [run["apart"] for run in runs])]
     return [
-        f"{seeds} virtual machines each. The first two cases are results of methods on simulated raw data of one "
+        f"{seeds} virtual machines each. The first three cases are results of methods on simulated raw data of one "
         f"C-frame that warms up for two hours: a bar before five sensors (every {STEP:g} s) and four balls probed "
-        f"every {INTERVAL / 60:g} minutes; displacements at the origin. The last two are drawn from their own "
-        "covariance about the true errors of a gantry: six freedoms, a bar whose radius scales the displacements by "
-        "5 % (k = 1), and a thermometer. `correlation`: whether sources with the same identity are one draw (as "
-        "stated) or counted as two (left out). Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
+        f"every {INTERVAL / 60:g} minutes; displacements at the origin. The rotation about the spindle axis, "
+        f"which the bar does not show, is stated as {UNSEEN * 1e6:g} urad, its size on this machine; the default of 20 "
+        "urad makes intervals wider. The last two cases are drawn from their own covariance about the true errors of a "
+        "gantry: six freedoms, a bar whose radius scales the displacements by 5 % (k = 1), and a thermometer. "
+        "`correlation`: whether sources with the same identity are one draw (as stated) or counted as two (left out). "
+        "Of datasets that agree 95.4 % of the |En| are below 1 (k = 2), p is "
         "uniform, and 95 % intervals of the consensus hold the true errors in 95 %. Behind ± the standard error of "
         "the mean over machines, since the instants of one machine share their sources.",
         "",

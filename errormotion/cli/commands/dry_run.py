@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from errormotion.campaign.files import CampaignPlan, load_campaign
-from errormotion.campaign.limits import AXES, Extent, Limits, extent, steps_of
+from errormotion.campaign.limits import AXES, NO_MOTIONS, Extent, Limits, extent, steps_of
 from errormotion.cli.output import show, show_json, table
 from errormotion.errors import BenchError
 from errormotion.plugins import Step
@@ -27,15 +27,14 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
     Raises
     ------
     BenchError
-        The campaign cannot be read, or leaves the limits of its bench.
+        The campaign cannot be read, leaves the limits of its bench, or a method does not state what moves.
     """
     plan = load_campaign(campaign)
     found_tests: list[dict[str, Any]] = []
     for test in plan.tests:
         steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
         if steps is None:
-            found_tests.append({"test": test.name, "motions": None})
-            continue
+            raise BenchError(f"{campaign}: {test.name}: {NO_MOTIONS.format(test.method.info.id)}. Nothing has moved.")
         found = extent(steps)
         picture = None if out is None else _picture(plan, test.name, steps, out)
         found_tests.append(
@@ -48,9 +47,6 @@ def run(campaign: Path, out: Path | None, as_json: bool) -> None:
     if as_json:
         show_json({"ok": True, "tests": found_tests})
         return
-    for entry in found_tests:
-        if entry["motions"] is None:
-            show(f"{entry['test']}: the method does not report its motions")
     show("Nothing has moved.")
 
 
@@ -60,12 +56,18 @@ def _text(name: str, found: Extent, limits: Limits) -> str:
     for k, axis in enumerate(AXES):
         span = getattr(limits, axis)
         bounds = "-" if span is None else f"{span[0] * MM:.1f} to {span[1] * MM:.1f}"
-        rows.append([f"{axis}/mm", f"{found.low[k] * MM:.1f} to {found.high[k] * MM:.1f}", bounds])
+        known = not math.isnan(found.low[k])
+        planned = f"{found.low[k] * MM:.1f} to {found.high[k] * MM:.1f}" if known else "stays"
+        rows.append([f"{axis}/mm", planned, bounds])
     feed = "-" if limits.feed is None else f"{limits.feed * MM * MINUTE:.0f}"
     speed = "-" if limits.spindle_speed is None else f"{limits.spindle_speed:.0f}"
-    rows.append(["feed/(mm/min)", f"up to {found.feed * MM * MINUTE:.0f}", feed])
+    rapid = f"rapid in {found.rapid} moves" if found.rapid else ""
+    stated = f"up to {found.feed * MM * MINUTE:.0f}" if found.feed or not rapid else ""
+    rows.append(["feed/(mm/min)", ", ".join(filter(None, [stated, rapid])), feed])
     rows.append(["spindle/(1/min)", f"up to {found.spindle_speed:.0f}", speed])
-    head = f"{name}: {_duration(found.seconds)}, {found.moves} moves over {found.path:.1f} m, {found.touches} touches"
+    untimed = f" and {found.untimed} steps of unknown duration" if found.untimed else ""
+    motions = f"{found.moves} moves over {found.path:.1f} m, {found.touches} touches"
+    head = f"{name}: {_duration(found.seconds)}{untimed}, {motions}"
     return "\n".join([head, table(["", "planned", "limits"], rows)])
 
 
@@ -110,7 +112,7 @@ def _view(axes: Axes, steps: list[Step], limits: Limits, first: int, second: int
 
 
 def _speeds(axes: Axes, steps: list[Step]) -> None:
-    ends = np.cumsum([step.seconds for step in steps]) / MINUTE
+    ends = np.nancumsum([step.seconds for step in steps]) / MINUTE
     speeds = np.array([step.spindle_speed for step in steps])
     times = np.concatenate([[0.0], ends])
     axes.stairs(speeds, times, color="tab:blue")

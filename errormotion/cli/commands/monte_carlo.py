@@ -10,8 +10,10 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.cli.output import show, table
 from errormotion.cli.progress import Bars
+from errormotion.cli.summary import notes_of
 from errormotion.errors import DatasetError, MethodError
 from errormotion.montecarlo.result import lines
+from errormotion.montecarlo.store import Store
 
 EVALUATION = ".monte_carlo.nc"
 """Ending of the file of an evaluation, beside that of the errors."""
@@ -28,8 +30,10 @@ def trials_of(text: str) -> int | None:
 
 
 def beside(out: Path) -> Path:
-    """Return the file of the evaluation of a result; MethodError where it exists."""
+    """Return the file of the evaluation of a result; DatasetError where it exists or cannot be written."""
     file = out.with_suffix(EVALUATION)
+    if not out.parent.is_dir():
+        raise DatasetError(f"{out.parent}: expected a folder for the result of --out; there is none")
     if file.exists():
         raise DatasetError(f"{file}: exists already, and a result is never overwritten; give another name to --out")
     return file
@@ -56,11 +60,12 @@ def evaluate(
     try:
         found = montecarlo.evaluate(
             raw, method_id, settings, errors, folder, trials=trials, digits=digits, seed=seed,
-            scheduler=scheduler or "threads", workers=workers, progress=bars,
+            scheduler=scheduler or "threads", workers=workers, progress=bars, keep=True,
         )  # fmt: skip
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"The trials are kept in {folder}; repeat the command to continue.") from error
     datasets.save(found, beside(out))
+    Store(folder, {}).remove()
     return found
 
 
@@ -90,6 +95,5 @@ def show_evaluation(found: xr.Dataset, file: Path) -> None:
         f"{percent:g} % intervals"
     )
     show(table(*texts(found)))
-    for note in found.attrs["notes"]:
-        if note:
-            show(f"  note: {note}")
+    for note in notes_of(found):
+        show(f"  note: {note}")

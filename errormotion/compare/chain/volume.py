@@ -2,20 +2,21 @@
 
 The errors of the tool at a commanded position q are ``e = J(q) p + g(q) d``: p the errors of all axes, polynomials of
 their positions and squareness; d the six motions of the whole, in which the datum of a volume is free. Generalised
-least squares gives p as far as the volume determines it, and so the errors of one axis at chosen positions. What
+least squares gives p as far as the volume determines it, and so the errors of one axis at chosen positions. A prior
+that falls off with the order, of greatest evidence, stands for what the targets do not show. What
 squareness, datum and the other axes share with an axis is taken off on both sides: positioning and rotations count
 from one position, straightness from the line through two. The derivation is in the explanation of comparisons.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
+from scipy import linalg
 from scipy.stats import chi2
 
 from errormotion.arrays import Array
@@ -29,8 +30,20 @@ from errormotion.kinematics.twists import cross_matrix
 
 SAME = 1e-6
 """Distance below which two positions of an axis are the same, m."""
-ORDERS = range(2, 9)
-"""Orders of the polynomials among which the volume chooses, by Schwarz's criterion."""
+HIGHEST = 12
+"""Highest order of the polynomials; what lies above adds to the uncertainty."""
+TAIL = 60
+"""Highest order that adds to it."""
+FALLOFFS = (1.0, 2.0, 3.0, 5.0)
+"""Exponents p of the prior n^-p of coefficients of order n."""
+SEEN_BY = 2
+"""Highest order that decides whether a freedom is determined."""
+PASSES, SETTLED = 30, 0.05
+"""Passes of the search for the size of the prior, and the change of its logarithm that ends it."""
+ROUNDING = 1e-13
+"""Added to the diagonal of a scaled matrix before it is inverted."""
+FLAT = 1e-13
+"""Weight of the prior of terms that have none, in units of one column's information."""
 FALSE_ALARM = 1e-3
 """Probability of residuals at which uncertainties are raised to match them."""
 UNDETERMINED = 1e-10
@@ -72,14 +85,14 @@ def predict(
     Raises
     ------
     DatasetError
-        Fewer values than errors of the axes to be determined.
+        Targets that do not determine any of them.
     """
     positions = np.asarray(positions, dtype=float)
     model = Machine(str(volume.attrs["chain"]), {axis: point})
     fit = _fitted(volume, model, name)
     k = model.axis_names.index(axis)
     S = np.zeros((positions.size, 6, len(fit.terms)))
-    P = legendre.legvander(fit.scaled(positions, k), max(ORDERS))
+    P = legendre.legvander(fit.scaled(positions, k), HIGHEST)
     for column, (error, order) in enumerate(fit.terms):
         if order >= 0 and error // 6 == k:
             S[:, error % 6, column] = P[:, order]
@@ -88,9 +101,14 @@ def predict(
     left = (S @ fit.open) ** 2
     size = np.einsum("nkp->k", (S * fit.size) ** 2)
     seen = (size > 0) & (np.einsum("nkp->k", left) <= LEAKAGE * size)
+    if not seen.any():
+        raise DatasetError(f"'{name}': its targets do not determine the errors of {axis}; measure more targets")
     shared = np.moveaxis(S @ fit.shared, 2, 0)
     if notes is not None:
-        notes.append(f"'{name}': polynomials of order {fit.order}, chosen by Schwarz's criterion.")
+        notes.append(
+            f"'{name}': error motions as polynomials up to order {HIGHEST}, whose coefficients fall off with the order "
+            f"n as n^-{fit.falloff:g} (greatest evidence)."
+        )
         if fit.factor > 1:
             notes.append(
                 f"'{name}': the errors of the axes leave {np.sqrt(fit.factor):.2g} times as much as its uncertainty "
@@ -98,7 +116,9 @@ def predict(
             )
     F = np.concatenate([shared, np.moveaxis(root, 2, 0)])
     value[:, ~seen], F[:, :, ~seen] = np.nan, np.nan
-    own = np.zeros((positions.size, 6, 6))
+    own = fit.tail(positions, k)[:, None, None] * np.eye(6)
+    own[:, :3, :3] *= fit.tau.get(2 * k, 0.0) ** 2
+    own[:, 3:, 3:] *= fit.tau.get(2 * k + 1, 0.0) ** 2
     own[:, ~seen], own[:, :, ~seen] = np.nan, np.nan
     number = volume.sizes.get("source", 0)
     source, group, identity = sources_of(volume)
@@ -113,21 +133,30 @@ def predict(
 class _Fit:
     """Errors of all axes of a volume.
 
-    Terms are (number of the error, order); order -1 is squareness. ``root`` (term, part) of their covariance without
-    the sources, ``shared`` (term, source), ``open`` (term, direction) what is not determined, ``size`` (term,) the
-    typical size of a term, ``factor`` by which the covariance was raised.
+    Terms are (number of the error, order); order -1 is squareness; ``flat`` ones have no prior. ``root`` (term, part)
+    of their covariance without the sources, ``shared`` (term, source), ``open`` (term, direction) what is not
+    determined, ``size`` (term,) the typical size of a term that decides this, ``tau`` and ``falloff`` of the prior by
+    group, ``factor`` by which the covariance was raised.
     """
 
     terms: list[tuple[int, int]]
+    flat: list[bool]
     value: Array
     root: Array
     shared: Array
     open: Array
     size: Array
-    order: int
+    tau: dict[int, float]
+    falloff: float
     factor: float
     low: Array
     high: Array
+
+    def tail(self, q: Array, k: int) -> Array:
+        """Return the variance of what lies above the highest order at positions of axis k, for a prior of size 1."""
+        P = legendre.legvander(self.scaled(q, k), TAIL)[:, HIGHEST + 1 :]
+        found: Array = (P**2) @ np.arange(HIGHEST + 1.0, TAIL + 1.0) ** (-2 * self.falloff)
+        return found
 
     def scaled(self, q: Array, k: int) -> Array:
         """Return positions of axis k in -1 to 1."""
@@ -145,16 +174,15 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
     known = np.isfinite(y)
     turns = bool(known[:, 3:].any())
     low, high = q.min(axis=0), q.max(axis=0)
-    levels = [np.unique(np.round(column / SAME)).size for column in q.T]
-    terms = _terms(model, levels, max(ORDERS))
+    terms, flat = _terms(model)
     none = np.zeros(0)
-    blank = _Fit(terms, none, none, none, none, none, 0, 1.0, low, high)
+    blank = _Fit(terms, flat, none, none, none, none, none, {}, 0.0, 1.0, low, high)
     columns, s = len(terms) + (9 if turns else 6), len(F)
     N, b, square = np.zeros((columns + s, columns + s)), np.zeros(columns + s), 0.0
     tool = np.asarray(volume.attrs["functional_point"], dtype=float)
     for first in range(0, len(q), BLOCK):
         part = slice(first, first + BLOCK)
-        P = [legendre.legvander(blank.scaled(q[part, k], k), max(ORDERS)) for k in range(q.shape[1])]
+        P = [legendre.legvander(blank.scaled(q[part, k], k), HIGHEST) for k in range(q.shape[1])]
         J = model.jacobian(q[part], tool)
         A = np.stack([J[:, :, e] * (P[e // 6][:, [o]] if o >= 0 else 1.0) for e, o in terms], axis=2)
         A = np.concatenate([A, _whole(model, q[part], tool, turns), np.moveaxis(F[:, part], 0, 2)], axis=2)
@@ -166,58 +194,98 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         square += float(np.einsum("ti,tij,tj->", data, W, data))
     N[columns:, columns:] += np.eye(s)
     M, right = N[columns:, columns:], N[:columns, columns:]
-    gain: Array = np.linalg.solve(M, right.T).T if s else np.zeros((columns, 0))
+    gain: Array = np.zeros((columns, 0))
+    if s:
+        gain = np.asarray(np.linalg.solve(M, right.T).T)
     square -= float(b[columns:] @ np.linalg.solve(M, b[columns:])) if s else 0.0
     b, N = b[:columns] - gain @ b[columns:], N[:columns, :columns] - gain @ right.T
-    return _chosen(blank, N, b, gain, square, int(known.sum()), name)
+    return _most_evident(blank, N, b, gain, square, int(known.sum()))
 
 
-def _chosen(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int, name: str) -> _Fit:
-    """Return the fit of the order with the least of chi-square plus ln(count) for each parameter."""
-    best, least, n = None, np.inf, len(blank.terms)
-    for order in ORDERS:
-        kept = np.array([k for k, (_, o) in enumerate(blank.terms) if o <= order] + list(range(n, len(N))))
-        size = np.sqrt(np.diag(N)[kept])
-        unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
-        power, vectors = np.linalg.eigh(N[np.ix_(kept, kept)] * np.outer(unit, unit))
-        good = power > UNDETERMINED * power[-1]
-        rank = int(good.sum())
-        if rank >= count:
+def _most_evident(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int) -> _Fit:
+    """Return the coefficients under the prior of greatest evidence, with their covariance."""
+    n = len(blank.terms)
+    order = np.concatenate([[o for _, o in blank.terms], np.full(len(N) - n, -1)]).astype(float)
+    group = np.concatenate([[-1 if flat else _group(e) for (e, _), flat in zip(blank.terms, blank.flat, strict=True)],
+                            np.full(len(N) - n, -1)]).astype(int)  # fmt: skip
+    size = np.sqrt(np.diag(N))
+    unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
+    found = [_with_falloff(N * np.outer(unit, unit), b * unit, unit, order, group, p) for p in FALLOFFS]
+    best = max(found, key=lambda each: each.evidence)
+    C, value = best.covariance * np.outer(unit, unit), best.value * unit
+    rest, degrees = max(square - float(b @ value), 0.0), max(count - int((group < 0).sum()), 1)
+    factor = rest / degrees if chi2.sf(rest, degrees) < FALSE_ALARM else 1.0
+    shared = C @ gain
+    own = np.sqrt(factor) * factor_of(C - shared @ shared.T, np.sqrt(np.diag(C)))
+    low = np.flatnonzero((order <= SEEN_BY) | (group < 0))
+    power, vectors = np.linalg.eigh((N * np.outer(unit, unit))[np.ix_(low, low)])
+    lost = np.zeros((len(N), int((power <= UNDETERMINED * power[-1]).sum())))
+    lost[low] = unit[low, None] * vectors[:, power <= UNDETERMINED * power[-1]]
+    weight = np.where((order <= SEEN_BY) | (group < 0), unit, 0.0)
+    return replace(
+        blank, value=value[:n], root=own[:n], shared=shared[:n], open=lost[:n], size=weight[:n], tau=best.tau,
+        falloff=best.falloff, factor=factor,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Evident:
+    """Coefficients in scaled units with their covariance; size of each group's prior (its falloff is that of n^-p)."""
+
+    value: Array
+    covariance: Array
+    tau: dict[int, float]
+    falloff: float
+    evidence: float
+
+
+def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p: float) -> _Evident:
+    """Return the coefficients for priors ``tau n^-p``, tau of each group by expectation and maximisation."""
+    shape = np.where(group >= 0, np.maximum(order, 1.0) ** -p, 1.0)
+    groups = {int(g): np.flatnonzero(group == g) for g in np.unique(group[group >= 0])}
+    least = {g: 1e-3 * float(np.median(unit[members])) for g, members in groups.items()}
+    tau = {g: 3e4 * each for g, each in least.items()}
+    for _ in range(PASSES):
+        prior = np.full(len(N), FLAT)
+        for g, members in groups.items():
+            prior[members] = (unit[members] / (tau[g] * shape[members])) ** 2
+        C, log_det = _inverse(N + np.diag(prior))
+        x = C @ b
+        before = dict(tau)
+        for g, members in groups.items():
+            second = (x[members] ** 2 + np.diag(C)[members]) * (unit[members] / shape[members]) ** 2
+            tau[g] = max(float(np.sqrt(second.mean())), least[g])
+        if all(abs(np.log(tau[g] / before[g])) < SETTLED for g in groups):
             break
-        root = unit[:, None] * vectors[:, good] / np.sqrt(power[good])
-        value = root @ (root.T @ b[kept])
-        rest = max(square - float(b[kept] @ value), 0.0)
-        if rest + rank * np.log(count) >= least:
-            continue
-        least = rest + rank * np.log(count)
-        shared = root @ (root.T @ gain[kept])
-        factor = rest / (count - rank) if chi2.sf(rest, count - rank) < FALSE_ALARM else 1.0
-        own = np.sqrt(factor) * factor_of(root @ root.T - shared @ shared.T, unit)
-        terms = kept[kept < n]
-
-        def whole(part: Array, terms: Array = terms) -> Array:
-            full = np.zeros((n, *part.shape[1:]))
-            full[terms] = part[: terms.size]
-            return full
-
-        best = replace(
-            blank, value=whole(value), root=whole(own), shared=whole(shared), size=whole(unit), order=order,
-            open=whole(unit[:, None] * vectors[:, ~good]), factor=factor,
-        )  # fmt: skip
-    if best is None:
-        raise DatasetError(f"'{name}': {count} values do not determine the errors of its axes; measure more targets")
-    return best
+    evidence = float(b @ x) - log_det + float(np.log(prior).sum())
+    return _Evident(x, C, tau, p, evidence)
 
 
-def _terms(model: Machine, levels: Sequence[int], highest: int) -> list[tuple[int, int]]:
-    """Return all terms: squareness, and polynomials from the first order that belongs to an error alone."""
+def _inverse(matrix: Array) -> tuple[Array, float]:
+    """Return the inverse of a positive matrix, and the logarithm of its determinant; scaled, against rounding."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    factor = linalg.cholesky(matrix * np.outer(scale, scale) + ROUNDING * np.eye(len(matrix)), lower=True)
+    half = linalg.solve_triangular(factor, np.diag(scale), lower=True)
+    found: Array = half.T @ half
+    return found, 2 * float(np.log(np.diag(factor) / scale).sum())
+
+
+def _group(error: int) -> int:
+    """Return the number of the group of an error motion: displacements or rotations of one axis."""
+    return 2 * (error // 6) + (error % 6 >= 3)
+
+
+def _terms(model: Machine) -> tuple[list[tuple[int, int]], list[bool]]:
+    """Return all terms, squareness and polynomials from the first order of each error, and which have no prior."""
     motions = 6 * len(model.axis_names)
     terms = [(error, -1) for error in range(motions, len(model.error_names))]
+    flat = [True] * len(terms)
     for k, axis in enumerate(model.axis_names):
         for dof in range(6):
             first = 2 if is_straightness(dof, axis) else 1
-            terms += [(6 * k + dof, order) for order in range(first, min(highest, levels[k] - 1) + 1)]
-    return terms
+            terms += [(6 * k + dof, order) for order in range(first, HIGHEST + 1)]
+            flat += [order == 1 and dof < 3 for order in range(first, HIGHEST + 1)]
+    return terms, flat
 
 
 def _whole(model: Machine, q: Array, tool: Array, turns: bool) -> Array:

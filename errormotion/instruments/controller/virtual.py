@@ -7,6 +7,7 @@ A request is ``{"id": 1, "op": "mount", "tool": "bar"}``, its answer ``{"id": 1,
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -14,11 +15,15 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.instruments.door import ArmedSettings, Door
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, PluginSettings
+from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, MachineLimits
 
 LINE_END = b"\n"
+MOST_DIGITS = 300
+"""Of a whole number."""
 LONGEST_LINE = 1 << 16
 """Longest answer, bytes."""
 
@@ -41,7 +46,7 @@ def decode_answer(line: bytes, number: int) -> Any:
         The controller refuses.
     """
     try:
-        answer = json.loads(line)
+        answer = json.loads(line, parse_int=_whole)
         matches, ok = answer["id"] == number, answer["ok"]
         content = answer["result"] if ok else answer["error"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -51,6 +56,13 @@ def decode_answer(line: bytes, number: int) -> Any:
     if not ok:
         raise InstrumentError(f"The controller refuses: {content}")
     return content
+
+
+def _whole(text: str) -> int:
+    """Return a whole number; ValueError beyond the range of a float."""
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
 
 
 def event_fields(event: Any) -> dict[str, Any]:
@@ -65,17 +77,19 @@ def event_fields(event: Any) -> dict[str, Any]:
     return fields
 
 
+_READING = ("identify", "state")
+
 # ---------------------------------------------------------------------- driver
 
 
-class ControllerSettings(PluginSettings):
+class ControllerSettings(ArmedSettings):
     """Settings of the virtual controller."""
 
     timeout: Time = Field(default=2.0, description="time limit of an answer", gt=0)
 
 
 class VirtualController(Driver):
-    """The control of the virtual machine.
+    """The control of the virtual machine. Without ``arm`` in its settings it reads, and stops the machine.
 
     Parameters
     ----------
@@ -96,6 +110,10 @@ class VirtualController(Driver):
     Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
     settings: ControllerSettings
     _number = 0
+
+    def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
+        super().__init__(address, settings, record=record)
+        self._door = Door(self.info.id, address)
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
@@ -118,6 +136,10 @@ class VirtualController(Driver):
     def configure(self, settings: ControllerSettings) -> None:
         """Use other settings from now on."""
         self.settings = settings
+
+    def bound(self, limits: MachineLimits) -> None:
+        """Hold limits for every order from now on."""
+        self._door.limits = limits
 
     def read(self) -> dict[str, Any]:
         """Return the state now."""
@@ -144,7 +166,7 @@ class VirtualController(Driver):
 
         The probe is mounted automatically for a probing move, and replaced by the bar before the spindle turns.
         """
-        self._call("mount", tool=tool)
+        self._change("mount", tool=tool)
 
     def start(self, schedule: Iterable[Any]) -> None:
         """Start again, cold, at time 0 with a schedule of events.
@@ -157,7 +179,10 @@ class VirtualController(Driver):
         InstrumentError
             A stream is running, or the machine cannot follow the schedule.
         """
-        self._call("start", schedule=[event_fields(event) for event in schedule])
+        events = [event_fields(event) for event in schedule]
+        for event in events:
+            self._door.speed(event.get("spindle_speed", 0.0))
+        self._change("start", schedule=events)
 
     def follow(self, schedule: Iterable[Any], time: float) -> None:
         """Warm up by a schedule from time 0 on, and set the clock to a time, s, also back.
@@ -207,6 +232,10 @@ class VirtualController(Driver):
         dict
             ``duration`` of the motion and ``longest_lead_in`` before it, s.
         """
+        goal = [x + step * (count - 1) * u for x, u in zip(start, direction, strict=True)]
+        self._door.position(start, "start")
+        self._door.position(goal, "end")
+        self._door.feed(step / travel if travel > 0 else math.nan)
         return self._facts(
             "run_steps",
             "duration",
@@ -242,6 +271,7 @@ class VirtualController(Driver):
             Another program runs, a word is unknown or a position out of travel: nothing moves, and the message
             names the line.
         """
+        check_program(str(text), self._door)
         return self._facts("run_program", "duration", text=str(text))
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
@@ -267,8 +297,10 @@ class VirtualController(Driver):
         InstrumentError
             The position is out of travel, or another motion runs: nothing moves.
         """
-        goal = [float(x) for x in position]
-        return self._facts("move_to", "duration", position=goal, feed=None if feed is None else float(feed))
+        goal, limit = self._door.position(position), self._door.limits.feed
+        held = {} if feed is not None or limit is None else {"feed_limit": limit}
+        feed = None if feed is None else self._door.feed(feed)
+        return self._facts("move_to", "duration", position=goal, feed=feed, **held)
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move the touch probe in a straight line until it trips; the machine then rests there, or at the target.
@@ -291,8 +323,8 @@ class VirtualController(Driver):
             The probe is tripped before it moves, the spindle turns, the target is out of travel, alarm or emergency
             stop: nothing moves.
         """
-        goal = [float(x) for x in target]
-        found = self._facts("probe", "tripped", "position", "time", target=goal, feed=float(feed))
+        goal, feed = self._door.position(target, "target"), self._door.feed(feed)
+        found = self._facts("probe", "tripped", "position", "time", target=goal, feed=feed)
         try:
             position = None if found["position"] is None else [float(x) for x in found["position"]]
         except (TypeError, ValueError):
@@ -307,7 +339,7 @@ class VirtualController(Driver):
         InstrumentError
             The spindle cannot turn that fast, alarm or emergency stop.
         """
-        self._call("spindle", speed=float(speed))
+        self._change("spindle", speed=self._door.speed(speed))
 
     def stop(self, *, spindle: bool = False) -> None:
         """Abort all motion of the axes, and with ``spindle`` stop the spindle, too; always allowed."""
@@ -319,7 +351,7 @@ class VirtualController(Driver):
 
     def reset(self) -> None:
         """Leave alarm and emergency stop; nothing starts to move by itself."""
-        self._call("reset")
+        self._change("reset")
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
         """Put a target in front of the point sensors, which are then mounted on the stage.
@@ -337,7 +369,7 @@ class VirtualController(Driver):
             A sensor streams, or the target is unknown.
         """
         angles = {"inclination": inclination, "rotation": rotation}
-        self._call("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
+        self._change("set_target", kind=kind, **{name: float(x) for name, x in angles.items() if x is not None})
 
     def set_station(self, position: Sequence[float]) -> None:
         """Carry the laser tracker to a position in machine coordinates, m, to within some millimetres.
@@ -347,15 +379,21 @@ class VirtualController(Driver):
         InstrumentError
             No tracker is open, or a sensor streams.
         """
-        self._call("set_station", position=[float(x) for x in position])
+        self._change("set_station", position=[float(x) for x in position])
 
     def _facts(self, op: str, *needed: str, **arguments: Any) -> dict[str, Any]:
         """Return the result of a request, a mapping that has the needed keys."""
-        found = self._call(op, **arguments)
+        found = self._call(op, **arguments) if op in _READING else self._change(op, **arguments)
         if not isinstance(found, dict) or (missing := [key for key in needed if key not in found]):
             what = ", ".join(missing) if isinstance(found, dict) else "everything"
             raise ProtocolError(f"The answer to '{op}' lacks {what}; found {str(found)[:200]}")
         return found
+
+    def _change(self, op: str, **arguments: Any) -> Any:
+        """Send an order that moves or changes the machine."""
+        words = ", ".join(f"{name} {value}" for name, value in arguments.items())
+        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
+        return self._call(op, **arguments)
 
     def _call(self, op: str, **arguments: Any) -> Any:
         with self.exchange() as line:

@@ -16,7 +16,7 @@ from errormotion import plugins
 from errormotion.datasets.calibrations.pretravel import PretravelMap
 from errormotion.datasets.units import Length, Time, Velocity
 from errormotion.errors import InstrumentError, PluginError
-from errormotion.instruments.door import ArmedSettings
+from errormotion.instruments.door import ArmedSettings, Door
 from errormotion.instruments.touch_probe.settings import ProbeSettings, corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.touching import (
     NO_TRIP,
@@ -110,7 +110,7 @@ class ControllerProbe:
         self._control: Any = None
         self._map: PretravelMap | None = None
         self._contacts = 0
-        self._limits: MachineLimits | None = None
+        self._door = Door(self.info.id, address)
 
     # ------------------------------------------------------------------ opening and closing
 
@@ -138,8 +138,8 @@ class ControllerProbe:
                 f"The controller '{self.settings.controller}' cannot probe; choose one with probing moves"
             )
         control = cls(self.address, settings, record=self._record)
-        if self._limits is not None and hasattr(control, "bound"):
-            control.bound(self._limits)
+        if hasattr(control, "bound"):
+            control.bound(self._door.limits)
         control.open()
         self._control = control
 
@@ -199,7 +199,7 @@ class ControllerProbe:
 
     def bound(self, limits: MachineLimits) -> None:
         """Hold limits for every move from now on; the controller holds them for each single order."""
-        self._limits = limits
+        self._door.limits = limits
         if self._control is not None and hasattr(self._control, "bound"):
             self._control.bound(limits)
 
@@ -241,6 +241,7 @@ class ControllerProbe:
             controller is connected.
         """
         touches = list(touches)
+        self._door.admit(self.settings.arm, f"{len(touches)} touches")
         refuse_unmapped(self._map, touches)
         self._refuse_unfit()
         missed: list[int] = []  # items without a contact since the last contact

@@ -16,6 +16,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
+from errormotion.methods.beam_direction.motions import search_start, stage_path
 from errormotion.methods.beam_direction.planning import design
 from errormotion.methods.beam_direction.schema import SCHEMA
 
@@ -98,24 +99,13 @@ class Stand:
         self.beam = u / np.linalg.norm(u)
         self.sign = 1.0 if settings.moves == "sensor" else -1.0
         self.normals = design.plane_normals(np.array([(face.inclination, face.rotation) for face in settings.planes]))
-        self.paths = [self._path(normal) for normal in self.normals]
+        self.paths = [stage_path(settings, normal, self.range) for normal in self.normals]
         self.invalid: Counter[str] = Counter()
 
     @property
     def range(self) -> float:
         """Length of the sensor's range, m."""
         return self.high - self.low
-
-    def _path(self, normal: Array) -> Array:
-        if self.layout.path:
-            return np.array(self.layout.path, np.float64)
-        if self.layout.strokes == "longest":
-            lengths = design.longest_strokes(normal[None], design.limits_of(self.settings, self.range))[0]
-        else:
-            lengths = np.array(self.layout.strokes, np.float64)
-        counts = np.full(3, self.layout.readings // 3)
-        counts[: self.layout.readings % 3] += 1
-        return design.stroke_points(lengths, counts)
 
     def set_face(self, number: int) -> None:
         """Set the gauge to a face; the sensor is moved away before."""
@@ -137,15 +127,7 @@ class Stand:
         MethodError
             The settings state none.
         """
-        p = self.layout
-        if p.start is not None:
-            return np.array(p.start)
-        if p.pivot is None or p.nominal_origin is None:
-            raise MethodError(
-                "The start position of the search is unknown. Expected layout.start (a position of the stage), or both "
-                "layout.pivot and layout.nominal_origin; found neither."
-            )
-        return np.asarray(self.sign * (np.array(p.pivot) - np.array(p.nominal_origin) - self.middle * self.beam))
+        return search_start(self.settings, self.middle)
 
     def move(self, position: Array) -> Array:
         """Move the stage and return the position reported by the control, m."""

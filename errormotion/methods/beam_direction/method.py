@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -51,6 +51,12 @@ class BeamDirection:
         from errormotion.methods.beam_direction import acquisition
 
         return acquisition.measure_planes(bench, settings, inputs, done)
+
+    def motions(self, settings: BeamSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+        """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.beam_direction.motions import steps
+
+        return steps(settings, instruments)
 
     def check(self, settings: BeamSettings) -> dict[str, str]:
         """Return why the calibration of the settings cannot be used; empty where it can."""

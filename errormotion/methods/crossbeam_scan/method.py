@@ -9,7 +9,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -107,6 +107,16 @@ class CrossbeamScan:
         from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
 
         return program_texts(settings)
+
+    def motions(
+        self,
+        settings: ScanSettings,
+        instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
+    ) -> list[Step]:
+        """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.crossbeam_scan.acquisition.motions import steps
+
+        return steps(settings)
 
     def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance. See ``planning``."""

@@ -20,6 +20,7 @@ from errormotion.plugins import Redraw, Redrawing
 
 if TYPE_CHECKING:
     from numpy.random import Generator
+    from numpy.typing import NDArray
 
     from errormotion.arrays import Array
     from errormotion.methods.crossbeam_scan.identification.carriage import Rig
@@ -62,19 +63,20 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
 def _scans(raw: xr.Dataset) -> xr.Dataset:
     """Return the scans of a campaign in memory, cut out of a record where it is one."""
     scans = Scans(raw)
-    cut: dict[tuple[int, int], tuple[Array, Array, float]] = {}
-    for place in np.ndindex(scans.cycles, scans.artefacts):
+    cut: dict[tuple[int, int], tuple[NDArray[np.float32], Array, float]] = {}
+    for cycle, artefact in np.ndindex(scans.cycles, scans.artefacts):
         try:
-            height, _, y, time = scans.scan(*place)
+            surface, _, along, moment = scans.scan(cycle, artefact)
         except MethodError:
             continue
-        cut[place] = height, y, time
-    lines = max(len(y) for _, y, _ in cut.values())
+        cut[cycle, artefact] = surface, along, moment
+    lines = max(len(along) for _, along, _ in cut.values())
     shape = (scans.cycles, scans.artefacts, lines)
     height = np.full((*shape, raw.sizes["point"]), np.nan, dtype=np.float32)
     y, time = np.full(shape, np.nan), np.full(shape[:2], np.nan)
-    for place, (h, along, when) in cut.items():
-        height[(*place, slice(len(along)))], y[(*place, slice(len(along)))], time[place] = h, along, when
+    for place, (surface, along, moment) in cut.items():
+        rows = slice(len(along))
+        height[(*place, rows)], y[(*place, rows)], time[place] = surface, along, moment
     known = np.isfinite(time).any(axis=1)
     when = np.arange(scans.cycles, dtype=float)
     when[known] = [float(np.nanmean(row)) for row in time[known]]

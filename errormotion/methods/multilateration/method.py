@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import xarray as xr
 
@@ -10,7 +10,7 @@ from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -55,6 +55,16 @@ class Multilateration:
         from errormotion.methods.multilateration.acquisition import measure as acquisition
 
         return acquisition.measure_stations(bench, settings, inputs, done)
+
+    def motions(
+        self,
+        settings: MultilaterationSettings,
+        instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
+    ) -> list[Step]:
+        """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.multilateration.acquisition.motions import steps
+
+        return steps(settings)
 
     def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
         """Return the chain of the axes that move."""

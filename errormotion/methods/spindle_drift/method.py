@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -61,6 +61,12 @@ class SpindleDrift:
         if settings.procedure == "beam_detection":
             return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, given_beams(inputs), done)
+
+    def motions(self, settings: DriftSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+        """Return every step of the machine, for the check of its limits and for a dry run."""
+        from errormotion.methods.spindle_drift.acquisition.motions import steps
+
+        return steps(settings, instruments)
 
     def check_machine(self, settings: DriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
         """Return what contradicts the machine: a spindle along another axis than Z of the measuring frame."""

@@ -9,7 +9,7 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.kinematics.beams import beam_errors
-from errormotion.methods.spindle_drift.acquisition.beams import machine_axes
+from errormotion.methods.spindle_drift.acquisition.motions import machine_axes
 from errormotion.methods.spindle_drift.identification.beams import fisher_bound
 from errormotion.methods.spindle_drift.identification.drift import identify_drift
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from armed import CONTROLLER
 
 from errormotion import datasets
 from errormotion.campaign.store import RawStore
@@ -422,7 +423,7 @@ def gantry(seed, parameters=""):
     """Return control and profiler of a virtual gantry."""
     places = ",".join(map(str, PLACES))
     address = f"sim://gantry/profiler?seed={seed}&points=64&pitch=5e-4&artefacts={places}{parameters}"
-    return VirtualController(f"sim://gantry/controller?seed={seed}"), KeyenceLJX(address)
+    return VirtualController(f"sim://gantry/controller?seed={seed}", CONTROLLER), KeyenceLJX(address)
 
 
 def test_on_the_virtual_gantry_times_and_places_are_those_of_the_twin(tmp_path):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from armed import CONTROLLER
 from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
@@ -39,7 +40,7 @@ class Bench:
 def gantry(seed, parameters=""):
     """Return the instruments of a virtual gantry with a pocket on its table."""
     address = f"sim://gantry/profiler?seed={seed}&points=800&pitch=5e-5&artefacts=none&pocket=0.1{parameters}"
-    return VirtualController(f"sim://gantry/controller?seed={seed}"), KeyenceLJX(address)
+    return VirtualController(f"sim://gantry/controller?seed={seed}", CONTROLLER), KeyenceLJX(address)
 
 
 def joined(chunks):

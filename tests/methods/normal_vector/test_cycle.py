@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from armed import CONTROLLER
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -52,7 +53,7 @@ def test_the_steps_are_what_the_machine_does(monkeypatch, moves) -> None:
         schedule=[{"at": 0.0, "spindle_speed": 9000.0}, {"at": 900.0, "spindle_speed": 0.0}], moves=moves,
         moves_feed=1 / MINUTE,
     )  # fmt: skip
-    probe = ControllerProbeSettings(approach_feed=0.2, search_feed=0.01, repeats=2)
+    probe = ControllerProbeSettings(arm=True, approach_feed=0.2, search_feed=0.01, repeats=2)
     log = []
     usual = VirtualController._call
 
@@ -65,7 +66,7 @@ def test_the_steps_are_what_the_machine_does(monkeypatch, moves) -> None:
     virtual = world("gantry", 5)
     monkeypatch.setattr(VirtualController, "_call", logged)
     address = "sim://gantry/controller?seed=5"
-    with VirtualController(address) as control, ControllerProbe(address, probe) as touching:
+    with VirtualController(address, CONTROLLER) as control, ControllerProbe(address, probe) as touching:
         chunks = list(NormalVector().acquire(Bench(controller=control, touch_probe=touching), chosen, inputs={}))
         state = control.state()
     reset()

@@ -728,8 +728,11 @@ class Bridge:
             client.program.clear()
             raise RefusedError(f"expected a program of at most {MAX_PROGRAM_BYTES} bytes")
 
-    async def run_program(self, client: Client, text: Any) -> dict[str, Any]:
-        """Run an NC program, after its earlier parts; return when it has started."""
+    async def run_program(self, client: Client, text: Any, machine_coordinates: Any = False) -> dict[str, Any]:
+        """Run an NC program, after its earlier parts; return when it has started.
+
+        With ``machine_coordinates`` it is refused while an offset of work or tool, or a rotation, is in force.
+        """
         parts = client.program.copy()
         client.program.clear()
         await self._demand()
@@ -738,6 +741,11 @@ class Bridge:
         text = "".join([*parts, text])
         if not text.strip():
             raise RefusedError("expected the text of a program")
+        s = self.stat
+        if machine_coordinates and any([*s.g5x_offset, *s.g92_offset, *s.tool_offset, s.rotation_xy]):
+            raise RefusedError(
+                "an offset of work or tool is in force: the program would not run in machine coordinates"
+            )
         self._written += 1
         file = self.programs / f"errormotion-{self._written}.ngc"
         file.write_text(text if text.endswith("\n") else text + "\n")

@@ -13,6 +13,8 @@ from errormotion.errors import InstrumentError, ProtocolError
 LINE_END = b"\n"
 LONGEST_LINE = 1 << 16
 """Longest line of the bridge, and of a request, bytes."""
+MOST_DIGITS = 300
+"""Of a whole number."""
 PROTOCOL = 2
 PART = 1 << 12
 """Longest part of a program in a request, characters: at most twelve bytes each."""
@@ -81,7 +83,7 @@ def decode(line: bytes) -> Answer | Beat:
         Neither an answer nor a sign of life.
     """
     try:
-        message = json.loads(line)
+        message = json.loads(line, parse_int=_whole)
         if "beat" in message:
             return Beat(message["id"], float(message["time"]))
         if message["ok"] is True:
@@ -134,6 +136,13 @@ def decode_touch(result: Any) -> dict[str, Any]:
         return {"tripped": tripped, "position": position, "time": _known(result, "time")}
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ProtocolError(f"Expected the result of a touch; found {str(result)[:200]} ({error!r})") from None
+
+
+def _whole(text: str) -> int:
+    """Return a whole number; ValueError beyond the range of a float."""
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
 
 
 def _number(value: Any) -> float:

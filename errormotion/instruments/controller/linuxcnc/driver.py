@@ -18,6 +18,7 @@ from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSettings
 from errormotion.instruments.door import Door
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.instruments.transports.recording import Recorder, RecordingTransport
 from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
@@ -233,12 +234,14 @@ class LinuxCNC(Driver):
         dict
             ``program``, the name of its file, and ``longest_lead_in``, 0 s.
         """
+        check_program(str(text), self._door)
+        held = {"machine_coordinates": True} if self._door.limits.spans else {}
         *parts, last = codec.parts_of(str(text))
         for number, part in enumerate(parts):
             if number == 0:
                 self._change("program_part", text="")
             self._change("program_part", text=part)
-        return dict(self._change("run_program", text=last))
+        return dict(self._change("run_program", text=last, **held))
 
     def finish(self) -> dict[str, Any]:
         """Wait for the end of the program.
@@ -275,7 +278,7 @@ class LinuxCNC(Driver):
     def _change(self, op: str, **arguments: Any) -> Any:
         """Send an order that moves or changes the machine."""
         words = ", ".join(f"{name} {value}" for name, value in arguments.items())
-        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}".strip()[:200])
+        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
         return self._order(op, **arguments)
 
     def _order(self, op: str, **arguments: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from errormotion.errors import ErrormotionError
@@ -57,7 +56,7 @@ class SimulatedController(SimulatedDevice):
             how: Literal["open", "closed"] = "open" if self.fault.kind == "no_trip" else "closed"
             self.world.stuck = how if broken else None
 
-    def _execute(self, op: str, arguments: Mapping[str, Any]) -> Any:
+    def _execute(self, op: str, arguments: dict[str, Any]) -> Any:
         world = self.world
         match op:
             case "identify":
@@ -79,6 +78,9 @@ class SimulatedController(SimulatedDevice):
                 path = world.run_program(**arguments)
                 return {"duration": path.duration, "longest_lead_in": LEAD_IN[1]}
             case "move_to":
+                limit = arguments.pop("feed_limit", None)
+                if arguments.get("feed") is None and limit is not None and limit < world.machine.rapid:
+                    arguments = {**arguments, "feed": limit}
                 return {"duration": world.move_to(**arguments)}
             case "probe":
                 return world.probe(**arguments)

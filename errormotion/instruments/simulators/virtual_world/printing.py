@@ -2,7 +2,7 @@
 
 Sources: Haas 96-8000 rev. AC, May 2010, p. 116 (text, formats, rounding, leading spaces, growing fields); NCT
 2000M/99M Programmer's Manual, p. 193 (digits before and behind the point, ISO code with even parity, line feed). The
-form of FANUC is from memory; see ``docs/reference/devices/dprnt.md``.
+form of FANUC is from memory; the page of the device that reads the lines lists what is assumed.
 """
 
 from __future__ import annotations

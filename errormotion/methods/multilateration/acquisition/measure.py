@@ -18,9 +18,9 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.clock import steady
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.acquisition.motions import stations, tour
 from errormotion.methods.multilateration.acquisition.scales import Scales
 from errormotion.methods.multilateration.names import station_names, target_names
-from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.schema import SCHEMA
 
 if TYPE_CHECKING:
@@ -139,19 +139,10 @@ class Stand:
                 "Expected an instrument of kind 'controller' that can move the machine to a position (move_to); the "
                 "bench has none. Add it, or import a table of the tracker."
             )
-        position, target = layout.grid(settings.layout)
-        self.order = layout.route(settings.layout)
-        again = self.order[: len(self.order) // 2 + 1]
-        again = [again[int(k)] for k in np.linspace(0, len(again) - 1, min(measuring.returns, len(again)))]
-        self.order = [*self.order, *range(len(target), len(target) + len(again))]
-        self.position = np.concatenate([position, position[again]])
-        self.target = np.concatenate([target, target[again]])
+        self.position, self.target, self.order = tour(settings, measuring.returns)
         self.station = np.array(settings.layout.stations, np.float64)
         self.names = station_names(len(self.station))
-        wanted = measuring.sequence or tuple(range(1, len(self.station) + 1))
-        if strange := [k for k in wanted if not 1 <= k <= len(self.station)]:
-            raise MethodError(f"expected numbers of stations from 1 to {len(self.station)}; found {strange}")
-        self.sequence = [k - 1 for k in wanted]
+        self.sequence = stations(settings, measuring)
         self.air_reported: bool | None = None  # not known before the first set-up
         self.scales = Scales(bench, measuring.scale_sensors)
 

@@ -14,8 +14,8 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.kinematics.beams import across
 from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_DURATION
+from errormotion.methods.spindle_drift.acquisition.motions import sphere_centres
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench
@@ -72,18 +72,11 @@ def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
 def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
     """Return a beam detection without its samples."""
     g = frame.geometry
-    offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
-    scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in g.nominal_direction])
-    ahead = np.repeat(settings.depths, 2) + settings.sphere_radius
-    middle = g.nominal_origin[:, None] + ahead[:, None] * g.nominal_direction[:, None]
+    centres, scans = sphere_centres(settings, g.nominal_origin, g.nominal_direction)
     m = {"units": "m"}
     return xr.Dataset(
         {
-            "sphere_centre": (
-                ("channel", "profile", "step", "direction"),
-                middle[:, :, None] + offsets[:, None] * scans[:, :, None],
-                m,
-            ),
+            "sphere_centre": (("channel", "profile", "step", "direction"), centres, m),
             "scan_direction": (("channel", "profile", "direction"), scans, {"units": "1"}),
             "nominal_origin": (("channel", "direction"), g.nominal_origin, m),
             "nominal_direction": (("channel", "direction"), g.nominal_direction, {"units": "1"}),
@@ -99,14 +92,6 @@ def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
             "dwell": settings.dwell,
         },
     )
-
-
-def machine_axes(direction: Array) -> Array:
-    """Return the two machine axes across a beam; for a beam oblique to all axes, two vectors across it."""
-    axis = int(np.argmax(np.abs(direction)))
-    if abs(direction[axis]) < 0.9:
-        return across(direction)
-    return np.delete(np.eye(3), axis, axis=0)
 
 
 def _record_scan(

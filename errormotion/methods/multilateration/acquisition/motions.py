@@ -1,0 +1,47 @@
+"""Targets of a set-up in their order, and the steps of the machine in a test."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.methods.multilateration.planning import layout
+from errormotion.plugins import Step
+
+if TYPE_CHECKING:
+    from errormotion.methods.multilateration.settings import Measuring, Settings
+
+
+def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
+    """Return axis positions and places of the reflector, both (m, 3), m, returns last, and the order of visits."""
+    position, target = layout.grid(settings.layout)
+    order = layout.route(settings.layout)
+    again = order[: len(order) // 2 + 1]
+    again = [again[int(k)] for k in np.linspace(0, len(again) - 1, min(returns, len(again)))]
+    order = [*order, *range(len(target), len(target) + len(again))]
+    return np.concatenate([position, position[again]]), np.concatenate([target, target[again]]), order
+
+
+def stations(settings: Settings, measuring: Measuring) -> list[int]:
+    """Return the stations in the order of their set-ups, from 0; MethodError for one that does not exist."""
+    count = len(settings.layout.stations)
+    wanted = measuring.sequence or tuple(range(1, count + 1))
+    if strange := [k for k in wanted if not 1 <= k <= count]:
+        raise MethodError(f"expected numbers of stations from 1 to {count}; found {strange}")
+    return [k - 1 for k in wanted]
+
+
+def steps(settings: Settings) -> list[Step]:
+    """Return every step of all set-ups, without repetitions: moves in rapid, and rests."""
+    position, _, order = tour(settings, settings.measuring.returns)
+    found: list[Step] = []
+    for _ in stations(settings, settings.measuring):
+        for i in (order[0], *order):
+            x, y, z = (float(each) for each in position[i])
+            found.append(Step("move", (x, y, z), math.nan, math.nan))
+            found.append(Step("rest", None, math.nan, settings.measuring.settle))
+    return found

@@ -1,0 +1,82 @@
+"""Covariances with directions that have no variance of their own, against dense pseudo-inverses."""
+
+import numpy as np
+import pytest
+
+from errormotion.compare.low_rank import whitener
+
+N, D = 7, 3
+SCALE = np.array([1e-6, 3e-6, 2e-5])
+
+
+def covariance(own, influence):
+    """Return the dense covariance and a root: what the covariance can produce."""
+    n, d = own.shape[:2]
+    V = np.zeros((n * d, n * d))
+    for i, block in enumerate(own):
+        V[i * d : (i + 1) * d, i * d : (i + 1) * d] = block
+    F = influence.reshape(len(influence), -1)
+    return V + F.T @ F
+
+
+def bound(rng, sources):
+    """Return root and product of an own covariance, without variance at its first point, and sources."""
+    A = rng.normal(0, 1, (N, D, D)) * SCALE[:, None]
+    A[0] = 0.0
+    A[2, :, 2] = A[2, :, 1]  # two directions of three
+    return A, A @ np.swapaxes(A, 1, 2), rng.normal(0, 1, (sources, N, D)) * SCALE
+
+
+def produced(rng, root, influence, count):
+    """Draw vectors of a covariance."""
+    noise = np.einsum("nij,pnj->pni", root, rng.normal(size=(count, N, D)))
+    return noise + np.tensordot(rng.normal(size=(count, len(influence))), influence, axes=1)
+
+
+@pytest.mark.parametrize("sources", [1, 3, 6])
+def test_products_are_those_of_the_dense_pseudo_inverse(sources):
+    rng = np.random.default_rng(1)
+    root, own, F = bound(rng, sources)
+    scale = np.tile(SCALE, N)
+    V = covariance(own, F) / np.outer(scale, scale)
+    rank = np.linalg.matrix_rank(V, tol=1e-10)
+    white = whitener(own, F)
+    assert white.degrees == rank
+    a, b = produced(rng, root, F, 2), produced(rng, root, F, 2)
+    dense = (a.reshape(2, -1) / scale) @ np.linalg.pinv(V, rcond=1e-10) @ (b.reshape(2, -1) / scale).T
+    np.testing.assert_allclose(white.product(a, b), dense, rtol=1e-7)
+
+
+def test_sources_alone_are_a_covariance():
+    rng = np.random.default_rng(2)
+    F = rng.normal(0, 1, (4, N, D)) * SCALE
+    z = rng.normal(size=4)
+    white = whitener(np.zeros((N, D, D)), F)
+    assert white.degrees == 4
+    assert white.square(np.tensordot(z, F, axes=1)) == pytest.approx(z @ z, rel=1e-9)
+
+
+def test_a_direction_with_little_variance_of_its_own_is_no_direction_without():
+    own = np.tile(np.diag([1.0, 1e-9, 1.0]), (N, 1, 1)) * np.outer(SCALE, SCALE)
+    rng = np.random.default_rng(3)
+    F = rng.normal(0, 1, (2, N, D)) * SCALE
+    V = covariance(own, F)
+    x = rng.normal(size=(N, D)) * SCALE * [1, 3e-5, 1]
+    white = whitener(own, F)
+    assert white.degrees == N * D
+    assert white.square(x) == pytest.approx(x.ravel() @ np.linalg.solve(V, x.ravel()), rel=1e-5)
+
+
+def test_the_determinant_is_the_dense_one():
+    rng = np.random.default_rng(4)
+    A = rng.normal(0, 1, (N, D, D)) * SCALE[:, None]
+    own, F = A @ np.swapaxes(A, 1, 2), rng.normal(0, 1, (2, N, D)) * SCALE
+    assert whitener(own, F).log_determinant == pytest.approx(np.linalg.slogdet(covariance(own, F))[1], rel=1e-9)
+
+
+def test_squares_of_differences_to_an_exact_reference_are_a_chi_square():
+    rng = np.random.default_rng(5)
+    root, own, F = bound(rng, 2)
+    squares = [whitener(own, F).square(x) for x in produced(rng, root, F, 400)]
+    degrees = whitener(own, F).degrees
+    assert np.mean(squares) == pytest.approx(degrees, abs=4 * np.sqrt(2 * degrees / 400))

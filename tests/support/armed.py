@@ -1,0 +1,7 @@
+"""Settings of drivers that may move the virtual machine."""
+
+from errormotion.instruments.controller.virtual import ControllerSettings
+from errormotion.instruments.touch_probe.controller_probe import ControllerProbeSettings
+
+CONTROLLER = ControllerSettings(arm=True)
+PROBE = ControllerProbeSettings(arm=True)
