@@ -30,6 +30,7 @@ rate = "1.5 kHz"
 CONTROL = """
 [instruments.control]
 driver = "virtual_controller"
+arm = true
 address = "sim://cframe/controller?seed=3"
 """
 HEAD = """

@@ -195,7 +195,10 @@ class VirtualController(Driver):
         InstrumentError
             A stream is running, alarm, or the machine cannot follow the schedule.
         """
-        self._call("follow", schedule=[event_fields(event) for event in schedule], time=float(time))
+        events = [event_fields(event) for event in schedule]
+        for event in events:
+            self._door.speed(event.get("spindle_speed", 0.0))
+        self._change("follow", schedule=events, time=float(time))
 
     def elapse(self, seconds: float) -> None:
         """Let simulated time pass without samples."""
