@@ -128,3 +128,28 @@ def test_mistakes_of_a_timeline_are_found_when_the_campaign_is_read(
 ) -> None:
     with pytest.raises(BenchError, match=message):
         load_campaign(write(drift("drift", "10 min"), **change))
+
+
+class Interrupting(runner.Quiet):
+    """Interrupts a measurement after its first chunk."""
+
+    def advance(self, done: float) -> None:
+        """Interrupt."""
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_test_goes_on_at_its_time(write: Write) -> None:
+    longer = drift("drift", "10 min", FROM_REST).replace('"20 s"', '"4 min"')
+    plan = load_campaign(write(longer))
+    runs = plan.source.parent / "runs"
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(plan, runs=runs, progress=Interrupting())
+    (stored,) = runs.glob("*/raw.zarr")
+    with datasets.load(stored) as part:
+        assert 0 < part.sizes["time"] < 240 * 1500
+    reset()  # the next process finds a machine that is at time 0
+    (folder,) = runner.resume(plan, runs=runs)
+    with datasets.load(folder.errors or "") as errors, datasets.load(folder.raw) as raw:
+        assert raw.sizes["time"] == 240 * 1500
+        found = compare({"errors": errors, "truth": truth_of(folder)}, freedoms=("EA", "EB"))
+    assert float(found["p"].min()) > 1e-3
