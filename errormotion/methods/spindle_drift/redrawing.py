@@ -10,7 +10,7 @@ import xarray as xr
 from errormotion.datasets.files.hashing import DatasetHasher
 from errormotion.methods.spindle_drift.identification.detection import segmented
 from errormotion.methods.spindle_drift.identification.drift import UNSEEN, beams_of
-from errormotion.methods.spindle_drift.identification.frame_expansion import frame_warming, temperature_knots
+from errormotion.methods.spindle_drift.identification.frame_expansion import FrameWarming, frame_warming
 from errormotion.methods.spindle_drift.identification.record import (
     average_record,
     noise,
@@ -68,8 +68,8 @@ def _drift(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing
         sources["frame expansion"] = _frame_expansion(settings.frame_expansion_uncertainty)
         index = sensors(raw).index(settings.frame_temperature)
         reduced["temperature"][:, index] = warming.temperature
-        knots = temperature_knots(warming, averages.time, settings.frame_smoothing)
-        sources["frame temperature"] = _frame_temperature(knots, index)
+        if warming.noise > 0:
+            sources["frame temperature"] = _frame_temperature(warming, index)
     if settings.unseen_rotation > 0:
         sources[UNSEEN] = _unseen_rotation(errors)
     return Redrawing(reduced, settings.model_copy(update=stated), sources)
@@ -145,16 +145,16 @@ def _frame_expansion(relative: float) -> Redraw:
     return Redraw(draw, groups=("frame expansion",))
 
 
-def _frame_temperature(knots: Array, index: int) -> Redraw:
-    """Return the smoothed temperature of the frame; ``knots`` (knot, instant), K, are one draw each."""
+def _frame_temperature(warming: FrameWarming, index: int) -> Redraw:
+    """Return the temperature of the frame: the noise of each mean, smoothed as the temperature was."""
 
     def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
         temperature = raw["temperature"].transpose("time", "sensor")
         changed = temperature.values.copy()
-        changed[:, index] += generator.normal(size=len(knots)) @ knots
+        changed[:, index] += warming.smoothing(warming.noise * generator.normal(size=len(changed)))
         return raw.assign(temperature=temperature.copy(data=changed)), settings
 
-    return Redraw(draw, groups=("frame temperature",))
+    return Redraw(draw, groups=("frame temperature",), own=True)
 
 
 def _unseen_rotation(errors: xr.Dataset) -> Redraw:

@@ -86,7 +86,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     bar = _bar(raw, settings, notes)
     coming_up = settling(record, settings.spin_up)
     reference = reference_windows(averages, settings, coming_up, notes)
-    mean, effects = _compensated(raw, record, bar, reference, settings, notes)
+    mean, effects, single = _compensated(raw, record, bar, reference, settings, notes)
     state, then = _fit(mean, bar), _fit(mean[:, reference].mean(axis=1, keepdims=True), bar)
     if not np.isfinite(then.E).all():
         raise MethodError(
@@ -103,7 +103,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
     ]
     frame = Frame(bar.origin, bar.direction, bar.levels, point)
-    independent, influence = propagate(state, then, frame, sigma, sources, [change for *_, change in effects])
+    independent, influence = propagate(state, then, frame, sigma, sources, [change for *_, change in effects], single)
     # Errors inside the reference state share its noise: the share 1 - 1/m of each mean remains.
     independent[reference] *= 1.0 - 1.0 / reference.size
     influence[:, reference] = 0.0
@@ -194,23 +194,24 @@ def _check_senses(then: State, bar: Bar) -> None:
 
 def _compensated(
     raw: xr.Dataset, record: Record, bar: Bar, reference: NDArray[np.int64], settings: Settings, notes: list[str]
-) -> tuple[Array, list[tuple[str, str, Array]]]:
-    """Return the mean readings corrected for the expansion of the frame, and disturbances as (name, group, change).
+) -> tuple[Array, list[tuple[str, str, Array]], Array]:
+    """Return the mean readings corrected for the expansion of the frame, disturbances, and one of each instant alone.
 
-    The correction acts along the surface normals of a first fit.
+    A disturbance that instants share is (name, group, change). The correction acts along the surface normals of a first
+    fit.
     """
     mean = record.averages.mean
     effects = run_out_at_rest(record, reference, float(raw["distance_noise"]))
     warming = frame_warming(raw, record, settings, notes)
     if warming is None:
-        return mean, effects
+        return mean, effects, np.zeros(mean.shape)
     per_kelvin = readings_per_kelvin(warming, _fit(mean, bar), bar.origin, bar.direction, bar.levels)
     change = per_kelvin * (warming.temperature - warming.temperature[reference].mean())
     effects.append(("frame expansion", "frame expansion", change * settings.frame_expansion_uncertainty))
-    unknown = smoothing_sources(warming, record.averages.time, settings.frame_smoothing, reference)
+    unknown, own = smoothing_sources(warming.smoothing, warming.noise, record.averages.time, reference)
     for k, u in enumerate(unknown, start=1):
         effects.append((f"frame temperature, part {k}", "frame temperature", per_kelvin * u))
-    return mean + change, effects
+    return mean + change, effects, per_kelvin * own
 
 
 def _unseen(effect: Array, time: Array, reference: NDArray[np.int64]) -> Array:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
 
 
-_MOST_KNOTS = 32
-"""Largest number of knots of the unknown temperature."""
+_MOST_PARTS = 48
+"""Largest number of parts of a record in each of which the mean noise of the temperature is a source."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,17 @@ class FrameWarming:
     ----------
     temperature : ndarray (instant,)
         Smoothed temperature of the frame, degC.
-    uncertainty : ndarray (instant,)
-        Standard uncertainty from resolution and noise, K.
+    noise : float
+        Standard deviation of one measured temperature from resolution and noise, K.
+    smoothing : LocalLine
+        What the measured temperatures were smoothed with.
     per_kelvin : ndarray (5, 3)
         Shift of each beam's origin, m/K.
     """
 
     temperature: Array
-    uncertainty: Array
+    noise: float
+    smoothing: LocalLine
     per_kelvin: Array
 
 
@@ -65,65 +68,124 @@ def frame_warming(raw: xr.Dataset, record: Record, settings: Settings, notes: li
             f"The temperature of the frame is unknown in {int(np.isnan(measured).sum())} means; the errors there are "
             "NaN."
         )
-    smooth, uncertainty = local_line(measured, record.averages.time, settings.frame_smoothing)
+    smoothing = LocalLine(record.averages.time, np.isfinite(measured), settings.frame_smoothing)
+    smooth = measured if smoothing.known.sum() < 3 else smoothing(measured)
     per_kelvin = np.asarray(raw["frame_expansion"].transpose("channel", "direction").values, np.float64)
-    return FrameWarming(smooth, uncertainty, per_kelvin)
+    return FrameWarming(smooth, smoothing.noise(measured, smooth), smoothing, per_kelvin)
 
 
-def local_line(values: Array, time: Array, length: float) -> tuple[Array, Array]:
-    """Fit a straight line within half of ``length`` on both sides of each instant; return its value and uncertainty.
+class LocalLine:
+    """Straight lines through the known values within half of ``length`` on both sides of each instant.
 
-    A line keeps a steady rise unbiased where one side is missing; a mean would not. The noise is the scatter about the
-    lines; repeated values of a slow logger are taken into account through their autocorrelation. NaN where the value
-    is NaN.
+    A line keeps a steady rise unbiased where one side is missing; a mean would not. The smoothed values are linear in
+    the values: ``smooth = S values``.
+
+    Attributes
+    ----------
+    length : float
+        Of a window, s.
+    known : ndarray, bool (instant,)
+        Where there is a value; smoothed values are NaN elsewhere.
+    gain : ndarray (instant,)
+        Variance of a smoothed value for values of unit variance, the diagonal of ``S S'``.
     """
-    known = np.isfinite(values)
-    if known.sum() < 3:
-        return values, np.zeros_like(values)
-    level, zero = values[known].mean(), time.mean()
-    x, y = np.where(known, time - zero, 0.0), np.where(known, values - level, 0.0)
-    sums = [np.concatenate([[0.0], np.cumsum(part)]) for part in (known.astype(float), x, y, x * x, x * y)]
-    i = np.searchsorted(time, time - 0.5 * length - 1e-9)
-    j = np.searchsorted(time, time + 0.5 * length + 1e-9, side="right")
-    n, sx, sy, sxx, sxy = (total[j] - total[i] for total in sums)
-    n = np.maximum(n, 1.0)
-    at = time - zero - sx / n
-    spread = sxx - sx * sx / n
-    steep = np.where(spread > 1e-9 * np.maximum(sxx, 1e-30), (sxy - sx * sy / n) / np.maximum(spread, 1e-30), 0.0)
-    smooth = level + sy / n + steep * at
-    residual = (values - smooth)[known]
-    lags = [float(residual[k:] @ residual[: residual.size - k]) for k in range(min(50, residual.size))]
-    repeats = 1.0
-    if lags[0] > 0:
-        for lag in lags[1:]:
-            if lag < 0.1 * lags[0]:
-                break
-            repeats += 2.0 * lag / lags[0]
-    variance = float(np.mean(residual**2)) * repeats
-    if np.median(np.diff(time[known])) <= length:
-        # In a window with few values, second differences give the noise; at longer intervals they would include the
-        # warming.
-        variance = max(variance, float(np.mean(np.diff(values[known], 2) ** 2)) / 6.0)
-    weight = 1.0 / n + np.where(spread > 0, at * at / np.maximum(spread, 1e-30), 0.0)
-    uncertainty = np.sqrt(variance * np.minimum(weight, 1.0))
-    return np.where(known, smooth, np.nan), np.where(known, uncertainty, np.nan)
+
+    def __init__(self, time: Array, known: NDArray[np.bool_], length: float) -> None:
+        self.known = known
+        self._time, self.length = time, length
+        self._x = np.where(known, time - time.mean(), 0.0)
+        self._first = np.searchsorted(time, time - 0.5 * length - 1e-9)
+        self._end = np.searchsorted(time, time + 0.5 * length + 1e-9, side="right")
+        n, sx, sxx = (self._sums(part) for part in (known.astype(float), self._x, self._x**2))
+        self._n = np.maximum(n, 1.0)
+        self._middle = sx / self._n
+        spread = sxx - sx * self._middle
+        sloped = spread > 1e-9 * np.maximum(sxx, 1e-30)
+        self._slope = np.where(sloped, (time - time.mean() - self._middle) / np.where(sloped, spread, 1.0), 0.0)
+        self.gain = np.where(known, 1.0 / self._n + self._slope**2 * np.where(sloped, spread, 0.0), np.nan)
+
+    def _sums(self, values: Array) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray(total[self._end] - total[self._first])
+
+    def __call__(self, values: Array) -> Array:
+        """Return the smoothed values (instant,)."""
+        level = values[self.known].mean()
+        y = np.where(self.known, values - level, 0.0)
+        sy = self._sums(y)
+        smooth = level + sy / self._n + self._slope * (self._sums(self._x * y) - self._middle * sy)
+        return np.where(self.known, smooth, np.nan)
+
+    def weights(self, combination: Array) -> Array:
+        """Return the weight (instant,) of each value in a linear combination of smoothed values, ``S' combination``."""
+        slope = combination * self._slope
+        found = []
+        for part in (combination / self._n - slope * self._middle, slope):
+            steps = np.zeros(part.size + 1)
+            np.add.at(steps, self._first, part)
+            np.subtract.at(steps, self._end, part)
+            found.append(np.cumsum(steps)[:-1])
+        return np.where(self.known, found[0] + found[1] * self._x, 0.0)
+
+    def noise(self, values: Array, smooth: Array) -> float:
+        """Return the standard deviation of one value: white noise that gives the smoothed values their variance.
+
+        The noise is the scatter about the lines; repeated values of a slow logger are taken into account through their
+        autocorrelation.
+        """
+        if self.known.sum() < 3:
+            return 0.0
+        residual = (values - smooth)[self.known]
+        lags = [float(residual[k:] @ residual[: residual.size - k]) for k in range(min(50, residual.size))]
+        repeats = 1.0
+        if lags[0] > 0:
+            for lag in lags[1:]:
+                if lag < 0.1 * lags[0]:
+                    break
+                repeats += 2.0 * lag / lags[0]
+        variance = float(np.mean(residual**2)) * repeats
+        if np.median(np.diff(self._time[self.known])) <= self.length:
+            # In a window with few values, second differences give the noise; at longer intervals they would include
+            # the warming.
+            variance = max(variance, float(np.mean(np.diff(values[self.known], 2) ** 2)) / 6.0)
+        return float(np.sqrt(variance))
 
 
-def smoothing_sources(warming: FrameWarming, time: Array, length: float, reference: NDArray[np.int64]) -> list[Array]:
-    """Return the uncertainty of the smoothed temperature as shared sources, each a change over time (instant,), K.
+def smoothing_sources(
+    smoothing: LocalLine, noise: float, time: Array, reference: NDArray[np.int64]
+) -> tuple[list[Array], Array]:
+    """Return the uncertainty of the smoothed temperature relative to the reference state, K.
 
-    Instants within the length of the smoothing share the error of their temperature, more distant ones do not. It is
-    modelled by knots at this distance (at most ``_MOST_KNOTS``), each one draw, with weights whose squares add up to
-    one. The changes are relative to the reference state.
+    White noise of the measured temperatures has the covariance ``noise^2 S S'`` after smoothing: instants within the
+    length of the smoothing share it, more distant ones do not. The noise is split exactly into its means over parts of
+    the record, half as long as the smoothing or longer (at most ``_MOST_PARTS``), each one draw, and the rest. Of the
+    rest, what the reference state shares with every instant is one more draw. What remains at each instant is shared
+    over less than a part or the length of the smoothing, and is stated as independent from instant to instant.
+
+    Returns
+    -------
+    sources : list of ndarray (instant,)
+        Each one draw, relative to the reference state; none without noise.
+    own : ndarray (instant,)
+        Standard uncertainty of each instant alone.
     """
-    effects = temperature_knots(warming, time, length)
-    return list(effects - effects[:, reference].mean(axis=1, keepdims=True))
-
-
-def temperature_knots(warming: FrameWarming, time: Array, length: float) -> Array:
-    """Return the uncertainty (knot, instant) of the smoothed temperature, K: each knot is one draw."""
-    knots = int(np.clip(np.ceil(np.ptp(time) / max(length, 1e-9)), 1, _MOST_KNOTS)) + 1
-    return np.asarray(hats(time, knots) * np.nan_to_num(warming.uncertainty))
+    if not noise > 0:
+        return [], np.zeros(time.size)
+    parts = int(np.clip(np.ceil(np.ptp(time) / max(0.5 * smoothing.length, 1e-9)), 1, _MOST_PARTS))
+    part = np.minimum(((time - time[0]) / max(float(np.ptp(time)), 1e-9) * parts).astype(int), parts - 1)
+    rest = smoothing.weights(np.bincount(reference, minlength=time.size) / reference.size)
+    rows = []
+    for k in range(parts):
+        inside = (part == k) & smoothing.known
+        if inside.any():
+            rows.append(smoothing(inside / np.sqrt(inside.sum())))
+            rest[inside] -= rest[inside].mean()
+    size = float(np.linalg.norm(rest))
+    if size > 1e-9:
+        rows.append(smoothing(rest / size))
+    shared = noise * np.nan_to_num(np.array(rows))
+    variance = noise**2 * np.nan_to_num(smoothing.gain) - np.sum(shared**2, axis=0)
+    return list(shared - shared[:, reference].mean(axis=1, keepdims=True)), np.sqrt(np.maximum(variance, 0.0))
 
 
 def hats(time: Array, knots: int) -> Array:

@@ -91,8 +91,9 @@ def propagate(
     sigma: Array,
     sources: Sequence[Source],
     scaled: Sequence[Array],
+    single: Array,
 ) -> tuple[Array, Array]:
-    """Return the covariance from the noise of the readings, and the influence of the shared sources.
+    """Return the covariance of each instant alone, and the influence of the shared sources.
 
     Parameters
     ----------
@@ -106,11 +107,13 @@ def propagate(
         Shared by all instants.
     scaled : sequence of ndarray (5, instant)
         Effects of further shared sources as changes of the readings, m, in each instant.
+    single : ndarray (5, instant)
+        Effect of a quantity that is one draw for each instant alone, as a change of the readings, m.
 
     Returns
     -------
     independent : ndarray (instant, 6, 6)
-        Covariance from the noise of the readings.
+        Covariance from the noise of the readings and from the single draws.
     influence : ndarray (source, instant, 6)
         Of ``sources``, then of ``scaled``.
     """
@@ -130,7 +133,8 @@ def propagate(
         # The noise of the readings acts on the instant alone.
         dw = _cross(a0, da[:, :, :5])
         J = np.concatenate([dE[:, :, :5] + _cross(-arm, dw), dw], axis=1)
-        independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J)
+        alone = np.einsum("tip,pt->ti", J, single[:, part])
+        independent[part] = np.einsum("tip,pt,tjp->tij", J, sigma[:, part] ** 2, J) + alone[:, :, None] * alone[:, None]
         for k, change in enumerate(scaled):
             influence[len(sources) + k, part] = np.einsum("tip,pt->ti", J, change[:, part])
         # Shared sources act on the instant and on the reference state.
