@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.compare.low_rank import whitener
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
@@ -325,6 +326,29 @@ def test_the_smoothed_frame_temperature_is_known_together_not_apart(machine, met
         stated.append(np.sqrt(np.asarray(change[1])[1, 1]))
     # The readings' noise is the same in all seeds; of the spread of 40 draws 11 % is chance.
     assert np.std(found) == pytest.approx(np.mean(stated), rel=0.4)
+
+
+def test_a_whole_curve_agrees_with_the_truth_where_the_frames_thermometer_is_noisy(method):
+    """Jointly, on the grid of the method: errors that neighbours do not share must be in their own covariance."""
+    t = np.arange(0, 7200.0, 20.0)
+    square, degrees = 0.0, 0
+    for seed in range(4):
+        machine = VirtualMachine("cframe", seed=seed)
+        machine.start([Event(0.0, 15000.0)])
+        beams = simulation.calibrated_beams(machine, seed)
+        raw = simulation.raw_drift(machine, t, seed=seed, beams=beams, expansion=True, warm_up=False)
+        raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
+        column = list(raw["sensor"].values).index("frame")
+        raw["temperature"][:, column] += np.random.default_rng(seed).normal(0, 0.02, t.size)
+        errors = method.identify(raw, Settings(noise="stated"))
+        truth = np.asarray(machine.truth_spindle(t, errors.attrs["functional_point"]).em.twist())
+        influence = errors["influence"].transpose("source", "time", "dof").values[..., SEEN]
+        own = errors["covariance"].values[:, SEEN, SEEN] - np.einsum("sti,stj->tij", influence, influence)
+        white = whitener(own, influence)
+        square += white.square(np.asarray(errors.em.twist())[:, SEEN] - (truth - truth[0])[:, SEEN])
+        degrees += white.degrees
+    # Of 7200 degrees of freedom 1 % is chance; the independent share errs on the safe side by a few per cent.
+    assert np.sqrt(square / degrees) == pytest.approx(1.0, abs=0.1)
 
 
 # ------------------------------------------------------------------ what a lab does wrong

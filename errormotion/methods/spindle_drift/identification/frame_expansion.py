@@ -118,6 +118,7 @@ class LocalLine:
 
     def weights(self, combination: Array) -> Array:
         """Return the weight (instant,) of each value in a linear combination of smoothed values, ``S' combination``."""
+        combination = np.where(self.known, combination, 0.0)
         slope = combination * self._slope
         found = []
         for part in (combination / self._n - slope * self._middle, slope):
