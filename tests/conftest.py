@@ -3,7 +3,7 @@
 Property tests have no time limit an example, since machines differ. In CI their examples are the same each time;
 elsewhere they are drawn anew, and so find more.
 
-Every worker keeps its linear algebra to one thread: as many workers as processors are at work.
+Every worker keeps its linear algebra to one thread: there are more workers than processors.
 """
 
 import os
@@ -21,6 +21,11 @@ hypothesis.settings.register_profile(
     "errormotion", deadline=None, derandomize=IN_CI, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("errormotion")
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Use two workers for each processor: many tests wait for a device that is late, silent or slow on purpose."""
+    return 2 * (os.cpu_count() or 1)
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

@@ -366,6 +366,12 @@ def compare(
     at: Annotated[
         str | None, typer.Option(help="Functional point 'x,y,z', mm; default: that of the first dataset.")
     ] = None,
+    over: Annotated[
+        str | None, typer.Option(metavar="DIM", help="What the errors are compared over: time, position or target.")
+    ] = None,
+    select: Annotated[
+        list[str] | None, typer.Option(help="One element of another dimension, counted from 0: position=3.")
+    ] = None,
     freedoms: Annotated[str | None, typer.Option(help="Which are compared: EX,EZ; default: all known ones.")] = None,
     since: Annotated[
         float | None, typer.Option(help="Common reference state, s after the start of the first dataset.")
@@ -401,7 +407,7 @@ def compare(
         own, _, text = each.rpartition("=")
         origins[own] = _millimetres(f"--origin {own}", text)
     chosen = [part.strip() for part in freedoms.split(",")] if freedoms else []
-    stated = command.Stated(name or [], change or [], origins, chain, by)
+    stated = command.Stated(name or [], change or [], origins, chain, by, over, select or [])
     command.compare(results or [], stated, point, chosen, since, same_start, out, report, json_)
 
 

@@ -182,7 +182,7 @@ def _check_dimensions(name: str, ds: xr.Dataset) -> None:
     if len(ds["EX"].dims) > 1:
         raise DatasetError(
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
-            "in ds.isel(position=3)"
+            "in ds.isel(position=3) or --over time --select position=3"
         )
 
 

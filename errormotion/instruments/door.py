@@ -78,7 +78,7 @@ class Door:
 
     def extent(self, way: Sequence[float], what: str) -> None:
         """Raise InstrumentError unless a way, (3,) m, is finite and no longer than the distance of the limits."""
-        if len(way) != 3 or not all(isinstance(x, int | float) and abs(x) < 1e300 for x in way):
+        if len(way) != 3 or not all(map(math.isfinite, way)):
             raise InstrumentError(f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {way!r}")
         for axis, x in zip("XYZ", way, strict=True):
             span = self.limits.spans.get(axis)

@@ -193,3 +193,22 @@ def test_a_failure_is_json_too(run, files):
     said = json.loads(run("compare", "drift.nc", "--json", code=1).stdout)
     assert said["ok"] is False
     assert said["error"]["exit_code"] == 1
+
+
+def test_results_over_two_dimensions_are_compared_over_one(tmp_path, run):
+    first = datasets.load(Path(__file__).parents[1] / "data" / "datasets" / "crossbeam_scan_scan.nc").load()
+    other = first.copy(deep=True)
+    other["EX"].values[...] += 1e-8
+    other["EX"].values[0] = first["EX"].values[0]
+    for name, ds in (("a", first), ("b", other)):
+        datasets.save(ds, tmp_path / f"{name}.nc")
+    assert "select one value" in run("compare", "a.nc", "b.nc", code=1).output
+    assert "--select position=0 (0 to 2)" in run("compare", "a.nc", "b.nc", "--over", "time", code=1).output
+    found = json.loads(
+        run("compare", "a.nc", "b.nc", "--over", "time", "--select", "position=2", "--same-start", "--json").output
+    )
+    assert found["ok"]
+    assert "'a' has position 0 to 2" in run("compare", "a.nc", "b.nc", "--select", "position=3", code=1).output
+    assert "--select 3" in run("compare", "a.nc", "b.nc", "--select", "3", code=1).output
+    words = run("compare", "a.nc", "b.nc", "--over", "target", "--select", "position=0", "--same-start", code=1).output
+    assert "compared over time" in words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +22,15 @@ from errormotion.errors import DatasetError
 
 @dataclass(frozen=True)
 class Stated:
-    """What the command line states of the results: names, changes, origins of frames (m), chain, and grouping."""
+    """What the command line states of the results: names, changes, origins of frames (m), chain, grouping, dims."""
 
     names: list[str]
     changes: list[str]
     origins: dict[str, tuple[float, float, float]]
     chain: str | None
     by: str | None = None
+    over: str | None = None
+    select: Sequence[str] = ()
 
 
 def compare(
@@ -53,8 +56,11 @@ def compare(
             raise DatasetError(f"{path}: exists already, and a result is never overwritten; give another name")
     results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
     results = _completed(results, stated)
+    results = {name: _over(name, ds, stated) for name, ds in results.items()}
     groups = _groups(results, stated.by)
     found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
+    if stated.over is not None and stated.over not in found["value"].dims:
+        raise DatasetError(f"--over {stated.over}: the results are compared over {_common(found) or 'nothing'}")
     if left_out:
         found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
     if out is not None:
@@ -100,6 +106,31 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
     if stated.chain is not None:
         found = {name: ds.assign_attrs({"chain": stated.chain} | ds.attrs) for name, ds in found.items()}
     return found
+
+
+def _over(name: str, ds: xr.Dataset, stated: Stated) -> xr.Dataset:
+    """Return a result at the selected element of each dimension but that of the comparison."""
+    for each in stated.select:
+        dim, _, index = each.partition("=")
+        if not dim or not re.fullmatch("[0-9]{1,9}", index):
+            raise DatasetError(f"--select {each}: expected DIM=NUMBER, as in --select position=3")
+        if dim in ds["EX"].dims:
+            if int(index) >= ds.sizes[dim]:
+                raise DatasetError(f"--select {each}: '{name}' has {dim} 0 to {ds.sizes[dim] - 1}")
+            ds = ds.isel({dim: int(index)})
+    others = map(str, ds["EX"].dims) if stated.over is not None and len(ds["EX"].dims) > 1 else ()
+    for dim in others:
+        if dim != stated.over and ds.sizes[dim] > 1:
+            raise DatasetError(
+                f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one {dim}, "
+                f"as in --select {dim}=0 (0 to {ds.sizes[dim] - 1})"
+            )
+        ds = ds if dim == stated.over else ds.isel({dim: 0})
+    return ds
+
+
+def _common(found: xr.Dataset) -> str:
+    return ", ".join(str(dim) for dim in found["value"].dims if dim not in ("dataset", "dof"))
 
 
 def _groups(results: dict[str, xr.Dataset], by: str | None) -> dict[str, str] | None:

@@ -333,8 +333,8 @@ def day(monkeypatch):
         def sleep(seconds):
             machine.t += seconds
 
-        clock = SimpleNamespace(time=lambda: machine.start_of_day + machine.t, sleep=sleep)
-        monkeypatch.setattr(moving, "time", clock)
+        monkeypatch.setattr(moving, "time", SimpleNamespace(sleep=sleep))
+        monkeypatch.setattr(moving, "steady", lambda: machine.start_of_day + machine.t)
         return machine
 
     return use

@@ -391,7 +391,10 @@ def test_extras_of_nothing_but_nan_are_no_values(page, small):
 
 
 def test_a_freedom_that_is_never_seen_says_so(page, small):
-    errors = small.assign(EB=small["EB"] * np.nan)
+    errors = small.assign(EB=small["EB"] * np.nan).copy(deep=True)
+    k = list(errors["dof"].values).index("EB")
+    errors["covariance"].values[..., k, :] = errors["covariance"].values[..., :, k] = np.nan
+    errors["influence"].values[..., k] = np.nan
     html = page(errors)
     assert "Not observed by this test: EBY." in words_of(html)
     assert html.count(">not determined<") == 3
