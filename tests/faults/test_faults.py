@@ -2,6 +2,10 @@
 
 import errno
 import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import fault_trials as trials
@@ -68,3 +72,39 @@ def test_half_files_and_lost_samples_are_found(tmp_path: Path, undisturbed: Path
     (half.parent / "report.html").write_text("<html><body>")
     assert len(trials.half_files(tmp_path)) == 2
     assert trials.differences(tmp_path, undisturbed) == [f"{TEST}: not finished"]
+
+
+@pytest.mark.timeout(120)
+def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
+    waiting = tmp_path / "waiting"
+    script = tmp_path / "work.py"
+    script.write_text(
+        "import sys, time, pathlib\n"
+        "from errormotion.parallel import Workers\n"
+        "def wait(name):\n"
+        "    pathlib.Path(name).touch()\n"
+        "if __name__ == '__main__':\n"
+        "    with Workers('processes', 2, '') as pool:\n"
+        "        pool.run(wait, [(sys.argv[1],)], print, print)\n"
+        "        time.sleep(100)\n"
+    )
+    process = subprocess.Popen([sys.executable, script, waiting], stdout=subprocess.DEVNULL, start_new_session=True)
+    trials.kill_when(process, waiting.exists, 0.2)
+    assert waiting.exists()
+    try:
+        until = time.monotonic() + 30.0
+        while time.monotonic() < until and group_exists(process.pid):
+            time.sleep(0.05)
+        assert not group_exists(process.pid)
+    finally:
+        if group_exists(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def group_exists(group: int) -> bool:
+    """Return whether a process of a group is left."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
