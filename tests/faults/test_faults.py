@@ -2,10 +2,8 @@
 
 import errno
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import fault_trials as trials
@@ -91,20 +89,4 @@ def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, script, waiting], stdout=subprocess.DEVNULL, start_new_session=True)
     trials.kill_when(process, waiting.exists, 0.2)
     assert waiting.exists()
-    try:
-        until = time.monotonic() + 30.0
-        while time.monotonic() < until and group_exists(process.pid):
-            time.sleep(0.05)
-        assert not group_exists(process.pid)
-    finally:
-        if group_exists(process.pid):
-            os.killpg(process.pid, signal.SIGKILL)
-
-
-def group_exists(group: int) -> bool:
-    """Return whether a process of a group is left."""
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return False
-    return True
+    assert trials.ends(process.pid)

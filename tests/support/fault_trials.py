@@ -100,6 +100,19 @@ def kill_when(process: subprocess.Popen[str], ready: Callable[[], bool], delay: 
     return instant if running else np.nan
 
 
+def ends(group: int, within: float = 30.0) -> bool:
+    """Return whether all processes of a group end within a time, s; those that do not are killed."""
+    until = time.monotonic() + within
+    try:
+        while time.monotonic() < until:
+            os.killpg(group, 0)
+            time.sleep(0.05)
+        os.killpg(group, signal.SIGKILL)
+    except ProcessLookupError:
+        return True
+    return False
+
+
 def stage_of(runs: Path, test: str) -> str:
     """Return the stage that a test of the only campaign in a folder has reached; empty before its first."""
     for folder in list_runs(runs):
