@@ -1,7 +1,7 @@
 # Every target sets up what it needs, once: .venv is made and filled when it is missing or a lock has changed.
 # demo needs only the packages of errormotion itself; test, lint and docs need the rest as well.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz lock
+.PHONY: help setup demo test test-all lint docs wheel bench validate fuzz faults lock
 
 BIN := .venv/bin
 ARGS ?=
@@ -42,6 +42,9 @@ validate: .venv/.dev  ## run the Monte Carlo validation and write docs/validatio
 
 fuzz: .venv/.dev  ## try 1e6 damaged frames of every codec (ARGS="--frames 1e5") and write docs/reliability.md
 	$(BIN)/python tools/fuzz.py $(ARGS)
+
+faults: .venv/.dev  ## kill runs, fill their disks and resume them, 10 minutes, and write docs/reliability.md
+	$(BIN)/python tools/faults.py $(ARGS)
 
 lock:  ## resolve pyproject.toml anew into the two lock files (needs uv)
 	uv pip compile -q --universal --python-version 3.11 pyproject.toml --all-extras --group build --group dev \

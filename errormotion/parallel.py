@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -164,8 +165,17 @@ class Workers:
 
 def _start_process(threads: int) -> None:
     """Set up a process: its number of threads; Ctrl-C is handled by the parent process."""
+    threading.Thread(target=_end_with_parent, name="errormotion-parent", daemon=True).start()
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent was killed: the other workers keep open the queue that it waits at."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _connected(address: str, version: str) -> Client:

@@ -9,7 +9,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -76,15 +76,22 @@ def log_file() -> Path:
     return base / "errormotion" / "errormotion.log"
 
 
+class _LogHandler(RotatingFileHandler):
+    """Ignores write errors: a full disk must not end a command because of its log."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+
 @contextmanager
 def _log() -> Iterator[None]:
     """Send warnings and errors to the log file, 1 MB and one older file at most, and not to the terminal."""
     path = log_file()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handler = RotatingFileHandler(path, maxBytes=2**20, backupCount=1, encoding="utf-8", delay=True)
+        handler = _LogHandler(path, maxBytes=2**20, backupCount=1, encoding="utf-8", delay=True)
     except OSError:
-        handler = RotatingFileHandler(Path(tempfile.gettempdir()) / "errormotion.log", encoding="utf-8", delay=True)
+        handler = _LogHandler(Path(tempfile.gettempdir()) / "errormotion.log", encoding="utf-8", delay=True)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     handler.setLevel(logging.WARNING)
     logger = logging.getLogger("errormotion")
@@ -96,7 +103,8 @@ def _log() -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = before
-        handler.close()
+        with suppress(OSError):
+            handler.close()
 
 
 @contextmanager

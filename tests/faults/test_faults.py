@@ -1,0 +1,92 @@
+"""A quick form of ``make faults``: real processes with one example, a kill in each of two stages, and a full disk."""
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import fault_trials as trials
+import pytest
+
+from errormotion.campaign import runner
+from errormotion.campaign.files import load_campaign
+from errormotion.campaign.folder import list_runs
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "virtual_beam" / "campaign.toml"
+TEST = "beam"
+LIMIT = 12_000
+"""Of the size of a file: enough for run.json at the start, not for the whole run, bytes."""
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    runner.run(load_campaign(EXAMPLE), runs=folder)
+    return folder
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("stage", trials.STAGES[:2])
+def test_run_that_was_killed_finishes_with_the_raw_data_of_an_undisturbed_one(
+    tmp_path: Path, undisturbed: Path, stage: str
+) -> None:
+    process = trials.start(["run", EXAMPLE, "--runs", tmp_path], tmp_path / "journal")
+    instant = trials.kill_when(process, lambda: trials.stage_of(tmp_path, TEST) == stage, 0.1)
+    assert process.returncode == -9, "the run ended before the kill"
+    ended = trials.examined(tmp_path, tmp_path / "journal", instant)
+    assert ended.faults == []
+    assert ended.lost < 1.0
+    (folder,) = runner.resume(runs=tmp_path)
+    assert folder.finished
+    assert trials.half_files(tmp_path) == []
+    assert trials.differences(tmp_path, undisturbed) == []
+
+
+@pytest.mark.timeout(120)
+def test_run_on_a_full_disk_ends_with_a_sentence_and_finishes_with_space(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "errormotion" / "errormotion.log"  # of the commands: the same disk is full for it
+    log.parent.mkdir()
+    log.write_bytes(b"\n" * LIMIT)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    ended = trials.finish(trials.start(["run", EXAMPLE, "--runs", tmp_path / "runs"], tmp_path / "journal", LIMIT))
+    assert ended.faults == []
+    assert ended.code not in (0, trials.INTERNAL_ERROR)
+    assert os.strerror(errno.EFBIG) in ended.message
+    assert trials.half_files(tmp_path / "runs") == []
+    (folder,) = runner.resume(runs=tmp_path / "runs")
+    assert folder.finished
+    assert trials.differences(tmp_path / "runs", undisturbed) == []
+
+
+def test_half_files_and_lost_samples_are_found(tmp_path: Path, undisturbed: Path) -> None:
+    (folder,) = list_runs(undisturbed)
+    assert folder.errors is not None
+    half = tmp_path / "run" / "errors.nc"
+    half.parent.mkdir()
+    half.write_bytes(folder.errors.read_bytes()[:2000])
+    (half.parent / "report.html").write_text("<html><body>")
+    assert len(trials.half_files(tmp_path)) == 2
+    assert trials.differences(tmp_path, undisturbed) == [f"{TEST}: not finished"]
+
+
+@pytest.mark.timeout(120)
+def test_workers_of_a_killed_process_end(tmp_path: Path) -> None:
+    waiting = tmp_path / "waiting"
+    script = tmp_path / "work.py"
+    script.write_text(
+        "import sys, time, pathlib\n"
+        "from errormotion.parallel import Workers\n"
+        "def wait(name):\n"
+        "    pathlib.Path(name).touch()\n"
+        "if __name__ == '__main__':\n"
+        "    with Workers('processes', 2, '') as pool:\n"
+        "        pool.run(wait, [(sys.argv[1],)], print, print)\n"
+        "        time.sleep(100)\n"
+    )
+    process = subprocess.Popen([sys.executable, script, waiting], stdout=subprocess.DEVNULL, start_new_session=True)
+    trials.kill_when(process, waiting.exists, 0.2)
+    assert waiting.exists()
+    assert trials.ends(process.pid)
