@@ -17,8 +17,12 @@ The packages, from the bottom up (imports run one way, enforced by a contract):
 """
 
 import logging
+import os
 
 __version__ = "0.1.0"
 
 # Without a handler, Python prints the warnings of a library whose user has configured no logging.
 logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+# Numba would take the TBB that another package has brought into the process, and warn where it is too old.
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")

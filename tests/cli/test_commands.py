@@ -267,12 +267,6 @@ def test_bench_probe_reads_a_profiler_that_waits_for_its_encoder(run: Run) -> No
     assert control.count("alarms none") == 1
 
 
-def test_example_is_the_campaign_that_the_demo_runs() -> None:
-    for name in ("bench.toml", "campaign.toml"):
-        example = ROOT / "examples" / "virtual_cframe" / name
-        assert example.read_text() == (ROOT / "errormotion" / "cli" / "demo" / name).read_text()
-
-
 def test_log_falls_back_where_the_state_folder_cannot_be_made(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ def controller(controllers: list[ScriptedController]) -> ScriptedController:
 
 
 def sensor(controller: ScriptedController, **settings: Any) -> CapaNCDT:
-    return CapaNCDT(controller.address, CapaSettings(**{"timeout": 0.5, **settings}))
+    return CapaNCDT(controller.address, CapaSettings(**{"timeout": 1.5, **settings}))
 
 
 def test_opening_asks_for_what_the_controller_has(controller: ScriptedController) -> None:

@@ -80,9 +80,9 @@ class ScriptedController:
         text = f"{echo}$UNKNOWN COMMAND\r\n" if known is None else f"{echo}{known}OK\r\n"
         self.command.send(text.encode("latin-1"))
         reading = self.readings.pop(0) if command == "GMD" and self.readings else self.always
-        if command == "GMD" and reading and self.data.await_connection(1.0):
+        if command == "GMD" and reading and self.data.await_present_client(1.0):
             self.data.send(reading)
-        if command == "TRG0" and self.data.await_connection(1.0):
+        if command == "TRG0" and self.data.await_present_client(1.0):
             for block in self.blocks:
                 self.data.send(block)
 
