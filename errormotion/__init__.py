@@ -7,12 +7,16 @@ The packages, from the bottom up (imports run one way, enforced by a contract):
 ``plugins``       contracts of instruments, methods and kinds of dataset; the registry
 ``datasets``      raw and error datasets: schemas, units, provenance, reading and writing
 ``twin``          virtual machines with known errors
+``tolerances``    limits of results, and decisions on them
 ``report``        what chapters are made of
 ``instruments``   transports, codecs, drivers and their simulators
 ``methods``       from raw datasets to error datasets
+``montecarlo``    uncertainty by trials, beside the linear one
 ``testing``       the conformance kit that every plugin passes
+``compare``       several results of one machine: agreement, consensus, diagnosis
 ``compensation``  thermal models
 ``campaign``      bench and campaign files, the runner, run folders
+``record``        all runs of a machine: list, history, notes
 ``cli``           the command ``errormotion``
 """
 

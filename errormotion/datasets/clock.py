@@ -158,24 +158,8 @@ class RecordClock:
         return found | ({JOINS: json.dumps([asdict(join) for join in self._joins])} if self._joins else {})
 
 
-@dataclass(frozen=True)
-class Age:
-    """Time since the start of an interrupted record.
-
-    Attributes
-    ----------
-    seconds : float
-        Now, s; NaN where the duration of the interruption is unknown.
-    stored : float
-        At the last commit, s; NaN in data of versions that did not store their clocks.
-    """
-
-    seconds: float
-    stored: float
-
-
-def age(done: xr.Dataset) -> Age:
-    """Return the time since the attribute ``start`` of an interrupted record.
+def age(done: xr.Dataset) -> float:
+    """Return the time since the attribute ``start`` of an interrupted record, s; NaN if that is unknown.
 
     Raises
     ------
@@ -189,9 +173,8 @@ def age(done: xr.Dataset) -> Age:
     before, now = _stored(done.attrs), read()
     if before is None:  # written by a version that did not store its clocks
         seconds = now.wall - start
-        return Age(seconds if 0 <= seconds <= LONGEST else math.nan, math.nan)
-    stored = before.began + before.elapsed - start
-    return Age(stored + interval(before, now)[0], stored)
+        return seconds if 0 <= seconds <= LONGEST else math.nan
+    return before.began + before.elapsed - start + interval(before, now)[0]
 
 
 def _stored(attrs: Mapping[Any, Any]) -> Reading | None:

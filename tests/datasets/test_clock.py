@@ -83,20 +83,19 @@ def test_record_counts_its_duration_over_several_interruptions(at):
 def test_age_of_a_record_is_that_of_its_own_clock(at):
     done = xr.Dataset(attrs={"start": START, clock.CLOCK: json.dumps(asdict(STORED))})
     at(STORED.wall - HOUR, STORED.steady + 20.0, "a")
-    assert clock.age(done).seconds == pytest.approx(120.0)
+    assert clock.age(done) == pytest.approx(120.0)
     at(STORED.wall - HOUR, 20.0, "b")
-    assert math.isnan(clock.age(done).seconds)
-    assert clock.age(done).stored == pytest.approx(100.0)
+    assert math.isnan(clock.age(done))
 
 
 @pytest.mark.parametrize("stored", ["", "{}", "[]", '{"wall": "x"}', "no JSON", '{"wall": NaN, "steady": 1}'])
 def test_record_without_a_readable_clock_has_the_age_that_the_wall_clock_states(at, stored):
     done = xr.Dataset(attrs={"start": START, clock.CLOCK: stored, clock.JOINS: "[1]"})
     at(AT_START + 60.0, 1.0, "a")
-    assert clock.age(done).seconds == pytest.approx(60.0)
+    assert clock.age(done) == pytest.approx(60.0)
     assert clock.joins(done.attrs) == []
     at(AT_START - 60.0, 1.0, "a")
-    assert math.isnan(clock.age(done).seconds)
+    assert math.isnan(clock.age(done))
 
 
 @pytest.mark.parametrize("start", ["", "yesterday", "0001-01-01T00:00:00+14:00"])

@@ -173,7 +173,7 @@ class _Campaign:
         if self.move.virtual:
             return
         try:
-            age = clock.age(done).seconds
+            age = clock.age(done)
         except ValueError as error:
             raise MethodError(
                 f"The interrupted record does not state when it started ({error}; expected UTC such as "

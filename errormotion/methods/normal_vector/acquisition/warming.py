@@ -215,7 +215,7 @@ def age(done: xr.Dataset) -> float:
         The run does not state its start.
     """
     try:
-        seconds = record_age(done).seconds
+        seconds = record_age(done)
     except ValueError:
         raise MethodError("The interrupted run does not state its start (attribute start); start a new run.") from None
     return float(_ends(done)[-1]) if math.isnan(seconds) else seconds

@@ -115,7 +115,7 @@ def _missed(done: xr.Dataset, rate: float) -> int:
     Its single row of NaN separates what was recorded before and after.
     """
     try:
-        seconds = clock.age(done).seconds
+        seconds = clock.age(done)
     except ValueError as error:
         raise MethodError(
             f"The interrupted record cannot be continued: {error}; expected UTC such as 2025-03-01T08:00:00+00:00. "
