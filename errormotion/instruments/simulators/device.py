@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-import threading
-
 import numpy as np
 
 from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_bytes
+from errormotion.instruments.simulators.late import LateAnswer
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import make_server
@@ -42,8 +40,7 @@ class SimulatedDevice:
         self._line_end = line_end
         self._buffer = b""
         self._answers = 0
-        self._held: tuple[object, bytes] | None = None  # the connection and the answer that is late
-        self._releasing: threading.Timer | None = None
+        self._late = LateAnswer()
         seed = int(address.number("seed", 0))
         self._rng = np.random.default_rng([abs(seed), *self.name.encode()])
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
@@ -69,9 +66,7 @@ class SimulatedDevice:
 
     def close(self) -> None:
         """End the device; with the last one of its world the world ends."""
-        if self._releasing is not None:
-            self._releasing.cancel()
-            self._releasing.join()
+        self._late.close()
         self._server.close()
         self.world.detach(self)
 
@@ -98,27 +93,12 @@ class SimulatedDevice:
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
         if fault.kind == "late" and number == fault.at:
-            self._hold(data)
+            self._late.hold(self._server, data, self.fault.delay)
             return
         with self._server.lock:
-            self._release()
+            self._late.release(self._server)
             for piece in fault.pieces(data):
                 self._server.send(piece)
-
-    def _hold(self, data: bytes) -> None:
-        """Hold an answer back; see `simulators.faults`."""
-        self._held = self._server.connection, data
-        if math.isfinite(self.fault.delay):
-            self._releasing = threading.Timer(self.fault.delay, self._release)
-            self._releasing.daemon = True
-            self._releasing.start()
-
-    def _release(self) -> None:
-        """Send the answer that was held back, if its connection is still open."""
-        with self._server.lock:
-            held, self._held = self._held, None
-            if held is not None and held[0] is self._server.connection:
-                self._server.send(held[1])
 
     def _silent(self) -> bool:
         return self._answers > self.fault.at

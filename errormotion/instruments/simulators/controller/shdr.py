@@ -23,7 +23,6 @@ lines, those of ``late`` too.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -45,6 +44,7 @@ from errormotion.instruments.simulators.controller.mtconnect.machine import (
 from errormotion.instruments.simulators.controller.mtconnect.styles import STYLES, series
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
 from errormotion.instruments.simulators.faults import parse_fault, stray_bytes
+from errormotion.instruments.simulators.late import LateAnswer
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.serving import TcpServer
@@ -96,8 +96,7 @@ class SimulatedAdapter:
         self._lines = 0
         self._pinged: tuple[object, float] = (None, 0.0)  # connection and time of the last one
         self._received = b""
-        self._held: tuple[object, bytes] | None = None  # the connection and the line that is late
-        self._releasing: threading.Timer | None = None
+        self._late = LateAnswer()
         self._ended = threading.Event()
         self.world = world(address.host or DEFAULT_MACHINE, seed, warm=bool(address.number("warm", 1)))
         self.world.attach(self, address.number("pace", 0.0) or None)
@@ -121,9 +120,7 @@ class SimulatedAdapter:
     def close(self) -> None:
         """End the adapter; with the last device of its world the world ends."""
         self._ended.set()
-        if self._releasing is not None:
-            self._releasing.cancel()
-            self._releasing.join()
+        self._late.close()
         self._server.close()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -195,27 +192,12 @@ class SimulatedAdapter:
         if fault.hits("garbage", number):
             data = stray_bytes(self._rng) + data
         if fault.kind == "late" and number == fault.at:
-            self._hold(data)
+            self._late.hold(self._server, data, self.fault.delay)
             return
         with self._server.lock:
-            self._release()
+            self._late.release(self._server)
             for piece in fault.pieces(data):
                 self._server.send(piece)
-
-    def _hold(self, data: bytes) -> None:
-        """Hold a line back; see `simulators.faults`."""
-        self._held = self._server.connection, data
-        if math.isfinite(self.fault.delay):
-            self._releasing = threading.Timer(self.fault.delay, self._release)
-            self._releasing.daemon = True
-            self._releasing.start()
-
-    def _release(self) -> None:
-        """Send the line that was held back, if its connection is still open."""
-        with self._server.lock:
-            held, self._held = self._held, None
-            if held is not None and held[0] is self._server.connection:
-                self._server.send(held[1])
 
     def _on_connection(self) -> None:
         """Forget an unfinished line of the previous connection."""

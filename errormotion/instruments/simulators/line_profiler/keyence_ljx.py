@@ -157,10 +157,10 @@ class SimulatedLJX(SimulatedDevice):
         if self.fault.kind == "silence" and self._mute:
             return
         if self.fault.kind == "late" and number == self.fault.at:
-            self._hold(data)
+            self._late.hold(self._server, data, self.fault.delay)
             return
         with self._server.lock:
-            self._release()
+            self._late.release(self._server)
             for piece in self.fault.pieces(data):
                 self._server.send(piece)
 

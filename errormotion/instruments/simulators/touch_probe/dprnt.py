@@ -118,10 +118,10 @@ class SimulatedPrinter(SimulatedDevice):
         if fault.hits("garbage", number):
             line = b"\xff" + stray_bytes(self._rng) + line
         if fault.kind == "late" and number == fault.at:
-            self._hold(line)
+            self._late.hold(self._server, line, self.fault.delay)
             return
         with self._server.lock:
-            self._release()
+            self._late.release(self._server)
             for piece in fault.pieces(line * (2 if fault.hits("duplicate", number) else 1)):
                 self._server.send(piece)
 

@@ -157,9 +157,9 @@ class SimulatedCapaNCDT(DataPortDevice):
     def _reply(self, data: bytes) -> None:
         number, self._answers = self._answers, self._answers + 1
         if self.fault.kind == "late" and number == self.fault.at:
-            self._hold(data)
+            self._late.hold(self._server, data, self.fault.delay)
             return
-        self._release()
+        self._late.release(self._server)
         self._send(data)
 
     def _new_averaging(self) -> Averaging:
