@@ -68,6 +68,7 @@ class Measuring:
         self._before = 0  # profiles of the stream before the run
         self._unsent: tuple[int, int] | None = None  # batch and number of the first profile not sent yet
         self._thread: threading.Thread | None = None
+        self._notifying: threading.Thread | None = None  # ends a stream that nothing feeds
         self._starting, self._ending = threading.Lock(), threading.Lock()
         self._ended, self._stopping = threading.Event(), threading.Event()
 
@@ -132,7 +133,8 @@ class Measuring:
             return
         self._stopping.set()
         if not self.measuring:
-            threading.Thread(target=self._end_stream, name=f"sim-{self._name}-end", daemon=True).start()
+            self._notifying = threading.Thread(target=self._end_stream, name=f"sim-{self._name}-end", daemon=True)
+            self._notifying.start()
         elif not batches:
             self._ended.set()
             self.feed.end()
@@ -163,6 +165,8 @@ class Measuring:
         self._ended.set()
         self._line.disconnect()
         self.join()
+        if self._notifying is not None:
+            self._notifying.join()
 
     def reset(self) -> None:
         """End measurement and stream without a notice, and clear the memory."""
