@@ -139,8 +139,8 @@ class Trial:
     def summary(self) -> str:
         """What was found, in words."""
         return (
-            f"{self.tried} mutants, {self.refused} of them refused; a session takes up to "
-            f"{1e3 * self._longest:.0f} ms, a frame {1e3 * self._work:.1f} ms of processor time and {self._memory / 1024:.0f} KiB"
+            f"{self.tried} mutants, {self.refused} of them refused; at most {1e3 * self._longest:.0f} ms a session, "
+            f"{1e3 * self._work:.1f} ms of processor time and {self._memory / 1024:.0f} KiB a frame"
         )
 
     def _replayed(self, *, measured: bool = False) -> _Replayed:
