@@ -512,7 +512,7 @@ def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
     mutants: Annotated[
-        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+        int | None, typer.Option(min=0, help="Changed frames to try: default 300 in 6 s; of more, all.")
     ] = None,
     json_: Json = False,
 ) -> None:
