@@ -1,4 +1,4 @@
-"""Run tests with the lowest versions of the packages that pyproject.toml allows: python tools/lowest.py [pytest's words].
+"""Run tests with the lowest versions of packages that pyproject.toml allows: python tools/lowest.py [words of pytest].
 
 The environment (--venv) is made with uv where it is installed, else with pip. Packages that pyproject.toml names have
 exactly their lower bounds; what they need in turn is the newest version that fits, and the tools of the tests are those

@@ -24,7 +24,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
-from errormotion.campaign.folder import RunFolder, list_runs, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, list_runs, now
 from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.limits import NO_MOTIONS, announcement, steps_of
 from errormotion.campaign.recorder import DiskFullError, Recorder
@@ -409,6 +409,13 @@ def _failures(folder: RunFolder) -> Iterator[None]:
         folder.step("stop", "interrupted")
         _mark(folder, "interrupted", "stopped by the operator")
         raise KeyboardInterrupt(f"{_kept(folder)} in {folder.path}.\n{_continuation(folder)}") from error
+    except FolderGoneError as error:  # nothing is written where it was: this would look like a run
+        log.exception("failed")
+        first = "First remove what a write under way has left there. " if folder.path.exists() else ""
+        raise FolderGoneError(
+            f"Test '{folder.data['test']}' failed: {error}\n{_kept(folder)} in it. Move it back to {folder.path}. "
+            f"{first}{_continuation(folder)}"
+        ) from error
     except Exception as error:
         reason = cause_of(error)
         log.exception("failed")
