@@ -52,7 +52,7 @@ class Reader:
         self, offsets: Offsets, *, unit: str = "mm", start: Triple | None = None, deleted: bool | None = None
     ) -> None:
         self._offsets = offsets
-        self._deleted = deleted
+        self.deleted = deleted
         self._systems = offsets.systems.copy()
         self._rotations = offsets.rotations.copy()
         self._system = offsets.system
@@ -94,9 +94,9 @@ class Reader:
 
     def _item(self, block: Block) -> Item:
         if block.skippable:
-            if self._deleted is None:
+            if self.deleted is None:
                 raise refusal(block.line, block.text, "'/' (block delete): state whether such blocks are skipped")
-            if self._deleted:
+            if self.deleted:
                 return Text(block.text)
             block = split(block.line, block.text.replace("/", "", 1))
         codes: list[int] = []
