@@ -114,7 +114,7 @@ def interpolated(t: Array, E: Array, total: Array, F: Array, new: Array) -> tupl
     return values, covariance, influence, q
 
 
-def intensity(t: Array, values: Array, own: Array) -> Array:
+def intensity(t: Array, values: Array, own: Array, *, together: bool = False) -> Array:
     """Return the intensity q of each interval, (n - 1, ..., 6), by the moments of second differences; NaN below three.
 
     Parameters
@@ -123,6 +123,8 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     values : ndarray, (n, ..., 6)
     own : ndarray, (n, ..., 6, 6)
         Covariance of what is drawn anew at every value.
+    together : bool
+        One intensity for all that lies between the first and the last axis; those have the length 1 then.
     """
     if len(t) < 3:
         return np.full((max(len(t) - 1, 1), *values.shape[1:]), np.nan)
@@ -135,6 +137,9 @@ def intensity(t: Array, values: Array, own: Array) -> Array:
     unit = np.broadcast_to((h**2 * g**2 / (3 * (h + g))).reshape(shape), bend.shape)
     known = np.isfinite(bend) & np.isfinite(noise)
     excess, scale = np.where(known, bend**2 - noise, 0.0), np.where(known, unit, 0.0)
+    if together:
+        others = tuple(range(1, excess.ndim - 1))
+        excess, scale = excess.sum(axis=others, keepdims=True), scale.sum(axis=others, keepdims=True)
     # Beside the interval from value k to k + 1 are the second differences at k and at k + 1.
     none = np.zeros((1, *excess.shape[1:]))
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
