@@ -62,3 +62,7 @@ class PluginError(ErrormotionError):
 
 class PluginWarning(UserWarning):
     """A part of a plugin does not load and is ignored."""
+
+
+class ProgramError(ErrormotionError):
+    """An NC program cannot be read, or what it does is not determined."""
