@@ -126,6 +126,11 @@ class Follower:
         self._last = self._invalid_since = self._valid_since = None
         self._stopping = False
 
+    def fail(self) -> None:
+        """Write nothing until it is armed again: the machine did not take an offset."""
+        if self.state is not State.OFF:
+            self.state = State.FAULT
+
     def stop(self) -> None:
         """Ramp to zero, then end."""
         self._stopping = True
@@ -144,7 +149,7 @@ class Follower:
         if self.state in (State.OFF, State.FAULT):
             return Step(self.state, self.offset.copy(), conditions.fault)
         if conditions.fault:
-            self.state = State.FAULT
+            self.fail()
             return Step(self.state, self.offset.copy(), conditions.fault)
         target, cause = self._valid(conditions)
         self._note(now, target is not None)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from errormotion.compensation.online import AuditLog, verify
+from errormotion.compensation.online.audit import AuditLog, verify
 from errormotion.errors import CompensationError
 
 

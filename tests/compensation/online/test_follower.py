@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from errormotion.compensation.online import Conditions, Follower, Limits, State
+from errormotion.compensation.online.follower import Conditions, Follower, State
+from errormotion.compensation.online.settings import Limits
 from errormotion.errors import CompensationError
 
 LIMITS = Limits(limit="50 um", slew="1 um/s", period="1 s", hold="5 s", settle="3 s")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.compensation.online import Prediction, Predictor
+from errormotion.compensation.online.predictor import Prediction, Predictor
 from errormotion.compensation.thermal_model import Settings, ThermalModel, fit
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import CompensationError
