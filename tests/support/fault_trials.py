@@ -25,7 +25,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.store import committed_length
 
 if TYPE_CHECKING:
-    from fault_processes import Forked
+    pass
 
 Process = "subprocess.Popen[str] | Forked"
 POLL_INTERVAL = 0.02
