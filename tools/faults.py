@@ -118,12 +118,16 @@ class Programme:
         ]
         for (fault, what), row in sorted(self.rows.items()):
             loss = f"{row.lost:.2f} s, {row.samples} samples" if fault.startswith("kill -9, acq") else "-"
-            loss = f"{row.lost:.2f} s, {row.samples} rows" if what == "errormotion monitor" and "kill" in fault else loss
+            loss = (
+                f"{row.lost:.2f} s, {row.samples} rows" if what == "errormotion monitor" and "kill" in fault else loss
+            )
             same = f"{row.identical} of {row.compared}" if row.compared else "-"
             lines.append(
                 f"| {fault} | {what} | {row.trials} | {row.survived} | {loss} | {same} | {row.sentences or '-'} |"
             )
-        failures = ["Failures:", "", *(f"* {text[:400]}" for text in self.failures)] if self.failures else ["No failure."]
+        failures = (
+            ["Failures:", "", *(f"* {text[:400]}" for text in self.failures)] if self.failures else ["No failure."]
+        )
         lines += ["", *failures]
         without = "" if self.kinds.shimmed else " Without a C compiler: the faults of disks and clocks were left out."
         return "\n".join([*lines, "", f"`make faults`, seed {self.seed}, {self.seconds:.0f} s of processors.{without}"])
