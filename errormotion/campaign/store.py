@@ -161,7 +161,15 @@ class RawStore:
         self._add_counts(chunk.attrs)
 
     def commit(self) -> None:
-        """Write every sample to disk, then make all visible to readers."""
+        """Write every sample to disk, then make all visible to readers.
+
+        Raises
+        ------
+        RunError
+            The store was moved or deleted.
+        OSError
+            The data cannot be written.
+        """
         if self.count % self.block:
             self._write_block()
         for path in self._unsynced:
@@ -173,6 +181,7 @@ class RawStore:
             "must_understand": False,
             "metadata": self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()},
         }
+        self._refuse_missing()
         replace_text(self.path / "zarr.json", json.dumps(root, indent=1))
         self.committed = self.count
 
@@ -183,9 +192,15 @@ class RawStore:
 
     def _write_block(self) -> None:
         """Write the current block of every array."""
+        self._refuse_missing()
         start = (self.count - 1) // self.block * self.block
         for column in self._arrays.values():
             self._unsynced.add(column.write(start, self.count))
+
+    def _refuse_missing(self) -> None:
+        """Refuse to write where the store no longer is: zarr would create its folders again, with a part of it."""
+        if not (self.path / "zarr.json").exists():
+            raise RunError(f"{self.path} is gone: it was moved or deleted while data were written to it")
 
     def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
         if name not in self._arrays:

@@ -10,7 +10,6 @@ import ctypes
 import math
 import multiprocessing
 import os
-import resource
 import shutil
 import signal
 import struct
