@@ -151,6 +151,11 @@ class RunFolder:
         self.data.setdefault("steps", []).append({"step": name, "outcome": outcome, "time": now(), **details})
 
     @property
+    def present(self) -> bool:
+        """Whether the folder is still where it was created or opened."""
+        return (self.path / "run.json").exists()
+
+    @property
     def raw(self) -> Path:
         """The raw store."""
         return self.path / "raw.zarr"
