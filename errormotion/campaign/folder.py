@@ -131,7 +131,7 @@ class RunFolder:
             data = json.loads(file.read_text(encoding="utf-8"))
         except OSError as error:
             raise RunError(f"{path}: expected a run folder with a run.json; {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RunError(
                 f"{file}: is not valid JSON ({error}); restore it from a copy, "
                 "or identify raw.zarr with 'errormotion identify'"
