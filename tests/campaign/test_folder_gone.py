@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan, parse_bench
 from errormotion.campaign.monitor.watch import Monitor
