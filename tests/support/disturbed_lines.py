@@ -1,4 +1,4 @@
-"""TCP lines of simulated devices that are disturbed on request, all served by one thread, on a clock of their own rate."""
+"""TCP lines of simulated devices that are disturbed on request, all served by one thread, by a clock of any rate."""
 
 import random
 import selectors

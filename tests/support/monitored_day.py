@@ -120,8 +120,12 @@ class _Choice:
 
     def __init__(self, lines: list[Line], clock: FastClock, seed: int) -> None:
         self._lines, self._clock, self._random = lines, clock, random.Random(seed)
-        self.wall = 0.0
+        self._time, self.wall = time.time, 0.0
         self.made: list[Disturbance] = []
+
+    def wall_clock(self) -> float:
+        """Return the time of the wall clock, s."""
+        return self._time() + self.wall
 
     def __call__(self, now: float) -> None:
         """Start one after the row of a time of the log, s."""
@@ -143,7 +147,7 @@ class _Choice:
 
 def watch(runs: Path, hours: float, speed: float, seed: int = 1) -> tuple[RunFolder, Day]:
     """Monitor for some hours at a multiple of the computer's time; return the run folder and what was found."""
-    clock, real = FastClock(speed, THREADS), time.time
+    clock = FastClock(speed, THREADS)
     day = Day(speed=speed)
     began = time.monotonic()
     with ExitStack() as stack:
@@ -158,14 +162,15 @@ def watch(runs: Path, hours: float, speed: float, seed: int = 1) -> tuple[RunFol
         lines = [Line(name, clock, device, seed) for name, device in devices.items()]
         stack.enter_context(Lines(lines))
         choice = _Choice(lines, clock, seed)
-        stack.enter_context(mock.patch("time.time", lambda: real() + choice.wall))
+        stack.enter_context(mock.patch("time.time", choice.wall_clock))
         with Monitor(_bench(lines, speed), runs, INTERVAL, clock) as monitor:
-            start, due, sample = np.inf, FAULT_INTERVAL, 0.0
+            often = min(3600.0 * hours / 8, 3600.0)
+            start, due, sample = np.inf, FAULT_INTERVAL, often
             for last in monitor.watch(3600.0 * hours):
                 start = min(start, clock.now() - last.time)
-                if last.time >= sample and not last.silent and last.time > min(3600.0, 900.0 * hours):
+                if last.time >= sample and not last.silent:
                     day.resources.append(resources(last.time))
-                    sample = (last.time // 3600.0 + 1) * 3600.0
+                    sample = (last.time // often + 1) * often
                 if last.time >= due:
                     choice(last.time)
                     due = last.time + FAULT_INTERVAL
@@ -222,7 +227,9 @@ def _examine(day: Day, log: xr.Dataset, folder: RunFolder, sent: dict[str, np.nd
             k = int(np.searchsorted(at, each.start, side="right"))
             day.suspended += int(number[k] - number[k - 1] - 1)
             if at[k] - at[k - 1] < each.end - each.start:
-                day.errors.append(f"suspended at {each.start:.0f} s for {each.end - each.start:.0f} s: not in the times")
+                day.errors.append(
+                    f"suspended at {each.start:.0f} s for {each.end - each.start:.0f} s: not in the times"
+                )
     counts = folder.data["samples"]["invalid"]
     for k, name in enumerate(sources):
         day.gap_rows[name] = int(gap[:, k].sum())
@@ -269,9 +276,7 @@ def _examine_gaps(day: Day, name: str, at: np.ndarray, gap: np.ndarray, slack: f
     day.unplanned += int((gap & ~explained).sum())
 
 
-def _examine_values(
-    day: Day, name: str, at: np.ndarray, values: np.ndarray, sent: np.ndarray, slack: float
-) -> None:
+def _examine_values(day: Day, name: str, at: np.ndarray, values: np.ndarray, sent: np.ndarray, slack: float) -> None:
     """Check that each value was sent, shortly before its row, and that no value comes back."""
     known = np.isfinite(values).all(axis=1)
     if not (known == np.isfinite(values).any(axis=1)).all() or (values[known, 0] != values[known, 1]).any():
