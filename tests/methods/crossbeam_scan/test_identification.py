@@ -330,6 +330,13 @@ def test_scans_on_disk_give_the_same_bits(campaigns, found, tmp_path):
         np.testing.assert_array_equal(again[name].values, found["free"][0][name].values)
 
 
+def test_the_origin_of_the_carriage_is_stated_where_it_is_known(thin, thin_by_maps):
+    assert "frame_origin" not in thin_by_maps.attrs
+    placed = identify(thin[1], strain="rigid", carriage_origin=("0 mm", "-900 mm", "1200 mm"))
+    assert placed.attrs["frame_origin"].tolist() == [0.0, -0.9, 1.2]
+    assert datasets.violations(placed) == []
+
+
 # ---------------------------------------------------------------- other registrations
 
 
