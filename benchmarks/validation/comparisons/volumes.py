@@ -53,6 +53,7 @@ def axis(task: tuple[str, str, int]) -> dict:
     noise = U_AXIS * np.random.default_rng([seed, k]).normal(size=(POSITIONS, 6))
     measured = truth.assign({each: truth[each] + noise[:, i] for i, each in enumerate(DOF)})
     measured["covariance"] = truth["covariance"] + np.diag(U_AXIS**2)
+    truth["covariance"] = truth["covariance"] + 1e-9 * np.diag(U_AXIS**2)
     found = compare({"axis": measured, "volume": volume}, causes=False)
     exact = common_ground({"axis": truth, "volume": volume}, freedoms=[str(each) for each in found["dof"].values])
     return against(found, exact.estimates[0].value)
