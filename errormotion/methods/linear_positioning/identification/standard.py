@@ -65,7 +65,7 @@ class Statistics:
     def repeatability(self) -> Array:
         """Bidirectional repeatability at each target, (..., target)."""
         both = 2.0 * self.s.sum(axis=-2) + np.abs(self.reversal)
-        return np.maximum(both, self.unidirectional_repeatability.max(axis=-2))
+        return np.asarray(np.maximum(both, self.unidirectional_repeatability.max(axis=-2)))
 
 
 def statistics(x: Array) -> Statistics:
