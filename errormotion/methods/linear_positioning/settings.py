@@ -15,8 +15,8 @@ TemperatureStep = Annotated[float, Quantity("a difference of temperatures", "K",
 Ratio = Annotated[float, Quantity("a ratio", "1", "0.5 um/m")]
 Point = tuple[Length, Length, Length]
 
-FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
 Freedom = Literal["EX", "EY", "EZ", "EA", "EB", "EC"]
+FREEDOMS: tuple[Freedom, ...] = ("EX", "EY", "EZ", "EA", "EB", "EC")
 MINUTE = 60.0
 
 

@@ -13,7 +13,8 @@ Its distribution given the readings follows by simulation (JCGM 101). In each tr
 
 The figure of the standard exceeds the median of the trials by the ``bias``. How large it is depends on how alike the
 targets are taken to be, so half of it counts as its own standard uncertainty, beside the standard deviation of the
-trials. The mean reversal error is no extreme value and has no bias. ``docs/validation.md`` shows the share of intervals that hold the true figure, for several kinds of axes.
+trials. The mean reversal error is no extreme value and has no bias. ``docs/validation.md`` shows the share of intervals
+that hold the true figure, for several kinds of axes.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from errormotion.datasets.timing import start_of
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.methods.linear_positioning.identification import budget, extremes, standard
 from errormotion.methods.linear_positioning.identification.expansion import Shared, expansion
-from errormotion.methods.linear_positioning.identification.reading import Readings, read
+from errormotion.methods.linear_positioning.identification.reading import Readings, per_freedom, read
 from errormotion.methods.linear_positioning.identification.scatter import Scatter, scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.schema import APPROACHES
@@ -159,7 +159,7 @@ def evaluate(raw: xr.Dataset, settings: Settings, notes: list[str], *, planned: 
     variance = budget.independent(raw, readings, spreads)
     systematic = [*budget.instrument_sources(raw, readings, settings, mean), *warm.sources]
     sources = [*budget.drift_sources(readings, spreads), *systematic]
-    at_target = budget.per_freedom(raw, "target_uncertainty", len(spreads))
+    at_target = per_freedom(raw, "target_uncertainty", len(spreads))
     temperature = f"{settings.reference_temperature:g} degC" if warm.complete else "the temperature of the test"
     found = Evaluated(
         readings=readings,

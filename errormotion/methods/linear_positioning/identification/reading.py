@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
@@ -78,7 +79,7 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     freedoms = _freedoms(raw, axis)
     position = np.asarray(raw["target_position"].values, dtype=float)
     _check_positions(position)
-    order = np.argsort(position)
+    order = np.asarray(np.argsort(position), dtype=np.int64)
     measured = np.asarray(raw["deviation"].transpose("freedom", "approach", "run", "target").values, dtype=float)
     x = _by_approach(measured[..., order], approaches, axis=1)
     if not np.isfinite(x).any(axis=(1, 2, 3)).all():
@@ -155,7 +156,7 @@ def _by_approach(values: Array, approaches: list[str], axis: int) -> Array:
     return np.moveaxis(full, 0, axis)
 
 
-def _temperatures(raw: xr.Dataset, approaches: list[str], order: Array) -> dict[str, Array]:
+def _temperatures(raw: xr.Dataset, approaches: list[str], order: NDArray[np.int64]) -> dict[str, Array]:
     if "temperature" not in raw:
         return {}
     labels = _labels(raw, "sensor") or [str(k + 1) for k in range(raw.sizes["sensor"])]

@@ -18,7 +18,7 @@ FIGURES = (
     *("R", "R_forward", "R_backward", "M", "B", "B_mean"),
 )
 MEANINGS = {
-    "A": "bidirectional accuracy of positioning",
+    "A": "bidirectional accuracy",
     "A_forward": "unidirectional accuracy, forward",
     "A_backward": "unidirectional accuracy, backward",
     "E": "bidirectional systematic error",
