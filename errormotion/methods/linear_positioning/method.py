@@ -43,17 +43,16 @@ class LinearPositioning:
 
     def acquire(
         self,
-        bench: Bench,  # noqa: ARG002 - part of the protocol
-        settings: PositioningSettings,  # noqa: ARG002
+        bench: Bench,
+        settings: PositioningSettings,
         *,
-        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002
-        done: xr.Dataset | None = None,  # noqa: ARG002
+        inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
+        done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
-        """Refuse: readings come as a table, written by the software of the instrument."""
-        raise MethodError(
-            "linear_positioning does not acquire. Run its NC program, write the readings to a table of schema "
-            f"{SCHEMA}, and use 'errormotion identify FILE'."
-        )
+        """Measure; yield one raw dataset a run, or a target of a pendulum cycle. See ``acquisition``."""
+        from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
+
+        return measure_axis(bench, settings, done)
 
     def motions(
         self,
@@ -89,13 +88,15 @@ class LinearPositioning:
             }
         return {}
 
-    def append_dim(self, settings: PositioningSettings) -> str:  # noqa: ARG002 - part of the protocol
-        """Return ``run``."""
-        return "run"
+    def append_dim(self, settings: PositioningSettings) -> str:
+        """Return ``run``, or ``target`` for pendulum cycles."""
+        return "run" if settings.cycle == "linear" else "target"
 
     def progress(self, settings: PositioningSettings) -> float:
-        """Return the number of runs."""
-        return float(settings.runs)
+        """Return the number of runs, or of targets for pendulum cycles."""
+        from errormotion.methods.linear_positioning.planning.targets import positions
+
+        return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of an axis over ``position``.

@@ -92,6 +92,16 @@ class Settings(PluginSettings):
     feed: Velocity = Field(default=1.0 / MINUTE, gt=0, description="feed of the approaches")
     dwell: Time = Field(default=4.0, ge=0, description="rest at a target, during which it is read")
     settle: Time = Field(default=2.0, ge=0, description="part of the rest before the reading")
+    channels: dict[Freedom, str] = Field(
+        default_factory=dict,
+        description="channel of the interferometer for each freedom, with '-' ahead where it counts down; default its "
+        "only channel",
+    )
+    average: int = Field(default=10, ge=1, le=10_000, description="readings averaged at each target")
+    arrival: Length = Field(
+        default=0.1e-3, gt=0, description="distance from a target within which the axis has arrived, by the control"
+    )
+    timeout: Time = Field(default=120.0, gt=0, description="time limit of a move")
     functional_point: Point | None = Field(
         default=None, description="point whose displacement is measured, with the axis at zero; that of the data first"
     )

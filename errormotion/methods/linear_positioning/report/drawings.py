@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.methods.linear_positioning.report.view import View
@@ -51,8 +52,8 @@ def over_position(view: View, key: str) -> Figure:
 
     caption = (
         f"{view.name}: deviations over the target position, thin: each run; bold: mean unidirectional deviations; "
-        "band: mean ± 2 s; dashed: mean bidirectional deviation; dotted: largest mean + 2 s and smallest mean − 2 s, whose "
-        "distance is A. Below: reversal error at each target."
+        "band: mean ± 2 s; dashed: mean bidirectional deviation; dotted: largest mean + 2 s and smallest mean − 2 s, "
+        "whose distance is A. Below: reversal error at each target."
     )
     if view.straight:
         caption += " The least-squares line of the mean bidirectional deviations is removed."
@@ -64,7 +65,7 @@ def over_position(view: View, key: str) -> Figure:
     return Figure(canvas.draw(paint, key, canvas.stack_height(HEIGHTS)), caption, f"{view.name}: {alt}.")
 
 
-def _levels(axes: canvas.Axes, view: View) -> None:
+def _levels(axes: Axes, view: View) -> None:
     """Draw the limits of A."""
     known = np.isfinite(view.s)
     if known.any():
