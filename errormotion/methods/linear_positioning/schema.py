@@ -18,7 +18,7 @@ RAW_SCHEMAS = (
         (
             Row(
                 "deviation",
-                READINGS,
+                (*READINGS[1:], "freedom"),  # last: a map of a log gives each freedom a column with its own unit
                 "",
                 -0.1,
                 0.1,

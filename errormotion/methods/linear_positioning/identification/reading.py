@@ -72,7 +72,7 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     MethodError
         An unknown axis, freedom or approach; fewer than three targets, targets twice, nothing measured.
     """
-    axis = _axis(raw, settings)
+    axis = _axis(raw)
     approaches = _labels(raw, "approach")
     if not approaches or set(approaches) - set(APPROACHES) or len(set(approaches)) < len(approaches):
         raise MethodError(f"approach: expected the labels forward, backward; found {', '.join(approaches) or 'none'}")
@@ -113,8 +113,10 @@ def per_freedom(raw: xr.Dataset, name: str, count: int) -> Array:
     return values
 
 
-def _axis(raw: xr.Dataset, settings: Settings) -> str:
-    axis = str(raw.attrs.get("axis", settings.axis))
+def _axis(raw: xr.Dataset) -> str:
+    """Return the axis by its attribute, else by the names of the freedoms."""
+    by_names = {label[-1:] for label in _labels(raw, "freedom")}
+    axis = str(raw.attrs.get("axis", by_names.pop() if len(by_names) == 1 else ""))
     if axis not in LINEAR_AXES:
         raise MethodError(f"attribute axis: expected one of {', '.join(LINEAR_AXES)}; found '{axis}'")
     return axis
