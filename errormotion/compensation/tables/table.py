@@ -71,7 +71,7 @@ class AxisTable:
     def step(self) -> float:
         """Distance between points, m; NaN where it is not constant."""
         steps = np.diff(self.positions)
-        return float(steps.mean()) if np.ptp(steps) <= 1e-9 else float("nan")
+        return float(steps.mean()) if np.ptp(steps) <= 1e-8 else float("nan")
 
     @property
     def reversal(self) -> float:
