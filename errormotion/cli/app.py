@@ -32,9 +32,6 @@ model_app = typer.Typer(
     no_args_is_help=True, help="Thermal models: errors predicted from temperatures.", rich_markup_mode=None
 )
 app.add_typer(model_app, name="model")
-compensate_app = typer.Typer(no_args_is_help=True, help="Compensation: tables for controllers.", rich_markup_mode=None)
-app.add_typer(compensate_app, name="compensate")
-
 compensate_app = typer.Typer(no_args_is_help=True, help="Compensate measured errors.", rich_markup_mode=None)
 app.add_typer(compensate_app, name="compensate")
 
