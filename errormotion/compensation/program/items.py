@@ -41,7 +41,9 @@ class Left:
     axes : tuple of int
         Axes that it leads to a commanded position: no correction acts on them from here on.
     motion : int
-        Of the moves that follow without a word of their own; -1: as before.
+        Of the moves that follow without a word of their own; -1: none.
+    explicit : bool
+        Whether its line has the word of the motion.
     kind : str
         ``machine``, ``unknown`` or ``probe``.
     """
@@ -50,6 +52,7 @@ class Left:
     line: int
     axes: tuple[int, ...]
     motion: int
+    explicit: bool
     kind: str
 
 

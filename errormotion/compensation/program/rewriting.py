@@ -10,8 +10,8 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.compensation.program.dividing import Correcting, Division, divide
-from errormotion.compensation.program.items import LINE, RAPID, Item, Left, Move, Setting, Text
-from errormotion.compensation.program.path import Path
+from errormotion.compensation.program.items import RAPID, Item, Left, Move, Setting, Text
+from errormotion.compensation.program.path import Indices, Path
 from errormotion.compensation.program.reader import Reader
 from errormotion.compensation.program.writer import DECIMALS, Writer
 from errormotion.errors import ProgramError
@@ -191,17 +191,15 @@ class Rewriting:
         summary.unfed += int((~known).sum())
         self._show(moves, path, division, index)
 
-    def _show(self, moves: list[Move], path: Path, division: Division, index: Array) -> None:
+    def _show(self, moves: list[Move], path: Path, division: Division, index: Indices) -> None:
         """Keep points of the path for the page: the ends of pieces, ever fewer of them."""
         chosen = np.flatnonzero((self._count + np.arange(len(index))) % self._every == 0)
         self._count += len(index)
         k = index[chosen]
         places = path.machine(k, path.points(k, division.u[chosen]))
-        scaled = division.offset[chosen] * path.scale[k, None]
         turned = np.array(
             [moves[m].frame.vector(tuple(v)) for m, v in zip(k, division.offset[chosen].tolist(), strict=True)]
         ).reshape(-1, 3)
-        del scaled
         lines = np.where(path.kind[k] == RAPID, 0, [moves[m].block.line for m in k])
         self._shown.append(np.hstack([places, turned, path.tool[k], lines[:, None]]))
         while sum(map(len, self._shown)) > SHOWN:
@@ -216,8 +214,3 @@ class Rewriting:
             rows = np.concatenate(self._shown)
             summary.places, summary.offsets, summary.tools = rows[:, :3], rows[:, 3:6], rows[:, 6:9]
             summary.lines = rows[:, 9]
-
-
-def is_cut(move: Move) -> bool:
-    """Return whether a move cuts."""
-    return move.kind >= LINE
