@@ -33,7 +33,7 @@ from errormotion.campaign.timeline import follower
 from errormotion.datasets import provenance
 from errormotion.datasets.certificates import ATTRIBUTE
 from errormotion.datasets.files.folders import looking_beside
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
 from errormotion.errors import RunError
 from errormotion.tolerances.conformity import judge

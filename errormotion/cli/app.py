@@ -32,6 +32,8 @@ model_app = typer.Typer(
     no_args_is_help=True, help="Thermal models: errors predicted from temperatures.", rich_markup_mode=None
 )
 app.add_typer(model_app, name="model")
+compensate_app = typer.Typer(no_args_is_help=True, help="Compensation: tables for controllers.", rich_markup_mode=None)
+app.add_typer(compensate_app, name="compensate")
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[
@@ -616,3 +618,32 @@ def model_check(
     from errormotion.cli.commands import model as command
 
     command.check_model(model, errors, report, json_)
+
+
+@compensate_app.command("table")
+@guarded
+def compensate_table(
+    errors: Annotated[Path, typer.Argument(help="Errors over position or targets: NetCDF or a run folder.")],
+    for_: Annotated[
+        str,
+        typer.Option("--for", help="Format: linuxcnc, siemens, heidenhain, fanuc, generic, or that of a plugin."),
+    ],
+    axis: Annotated[str, typer.Option(help="Axis along which the points are: X, Y or Z.")],
+    component: Annotated[str, typer.Option(help="Axis that is corrected; default: the same.")] = "",
+    step: Annotated[str | None, typer.Option(help="Distance between points, such as 25mm; default: measured.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the files.")] = Path(),
+    at: Annotated[str, typer.Option(help="Positions of the other axes, mm: x,y,z.")] = "0,0,0",
+    time: Annotated[str | None, typer.Option(help="Instant of errors over time, such as '90 min'.")] = None,
+    point: Annotated[str | None, typer.Option("--functional-point", help="Tool, mm: x,y,z; default: measured.")] = None,
+    chain: Annotated[str, typer.Option(help="Chain of the machine, where the errors do not state it.")] = "",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting of the format.")
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Write a compensation table of one axis for a control."""
+    from errormotion.cli.commands import compensate as command
+
+    place = _millimetres("--at", at)
+    tool = None if point is None else _millimetres("--functional-point", point)
+    command.table(errors, for_, command.Choice(axis, component, step, place, time, tool, chain), out, set_ or [], json_)

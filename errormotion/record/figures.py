@@ -164,7 +164,7 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
 
 
 def _figure(errors: xr.Dataset, name: str) -> float:
-    from errormotion.datasets.merit import figures_of
+    from errormotion.datasets.results.merit import figures_of
 
     return next((each.value for each in figures_of(errors) if each.name == name), np.nan)
 

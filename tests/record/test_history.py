@@ -16,7 +16,7 @@ from errormotion import datasets
 from errormotion.cli.app import app
 from errormotion.datasets import provenance
 from errormotion.datasets.files import events
-from errormotion.datasets.merit import figures_of, stored
+from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.errors import RunError
 from errormotion.record.figures import follow
 from errormotion.record.history import history

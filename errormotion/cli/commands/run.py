@@ -18,7 +18,7 @@ from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, remarks
-from errormotion.datasets.merit import figures_of
+from errormotion.datasets.results.merit import figures_of
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run, load_tolerances
 

@@ -222,6 +222,11 @@ def correction(
         )
     if part:
         notes.append(f"Not known, and left as they are: {', '.join(part)}.")
+    for field in fields:
+        if missing := _unknown_rotations(field):
+            notes.append(
+                f"{field.name}: {', '.join(missing)} is not known; the correction holds on the line of the measurement."
+            )
     if not partial:
         _check_rotations(fields)
     made = Correction(tuple(fields), unknown, partial, tuple(notes))
@@ -230,13 +235,17 @@ def correction(
 
 def _check_rotations(fields: Sequence[Field]) -> None:
     for field in fields:
-        missing = [name for name in field.needed() if name in DOF[3:] and not field.known[DOF.index(name)]]
-        if missing:
+        if missing := _unknown_rotations(field):
             raise DatasetError(
                 f"{field.name}: {', '.join(missing)} is not known, and displaces the tool at the functional point "
                 f"{np.round(field.point, 6).tolist()} m or along the travel. Use the functional point of the "
                 "measurement, or a source that knows the rotations"
             )
+
+
+def _unknown_rotations(field: Field) -> list[str]:
+    """Return the rotations that displace the tool and are not known."""
+    return [name for name in field.needed() if name in DOF[3:] and not field.known[DOF.index(name)]]
 
 
 def _name(source: xr.Dataset | ThermalModel, number: int) -> str:

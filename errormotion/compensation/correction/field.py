@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array, products
 from errormotion.compensation.correction.places import Anywhere, Line, Places, Weights, of_targets
-from errormotion.datasets.reduction import influence_of
+from errormotion.datasets.results.reduction import influence_of
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.errors import DatasetError
 from errormotion.kinematics.chains import parse_chain

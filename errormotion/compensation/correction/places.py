@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from errormotion.arrays import Array
-from errormotion.datasets.interpolation import intensity
+from errormotion.datasets.results.interpolation import intensity
 
 _EDGE = 1e-6
 """Distance from the hull that is still on it, relative to the distance from the mean of the nodes."""
@@ -111,7 +111,7 @@ class Line:
         return Weights(np.array([before, before + 1]), np.array([1 - share, share]), inside)
 
     def added(self, points: Array, values: Array, own: Array) -> Array:
-        """Return the variance of an integrated Wiener process between two nodes; see `datasets.interpolation`.
+        """Return the variance of an integrated Wiener process between two nodes; see `datasets.results.interpolation`.
 
         Errors (node, ..., 6) that are known on several lines have one intensity.
         """

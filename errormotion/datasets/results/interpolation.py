@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array, products
-from errormotion.datasets.reduction import TOLERANCE, influence_of, rebuilt
+from errormotion.datasets.results.reduction import TOLERANCE, influence_of, rebuilt
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
