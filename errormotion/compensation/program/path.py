@@ -100,6 +100,10 @@ class Path:
         """Return the positions of the machine's axes (n, 3) at points of the program, m."""
         return self._rotated(index, points * self.scale[index, None], 1.0) + self._shift[index]
 
+    def vector(self, index: Indices, vectors: Array) -> Array:
+        """Return vectors (n, 3) of the program in the machine's axes, m."""
+        return self._rotated(index, vectors * self.scale[index, None], 1.0)
+
     def own(self, index: Indices, vectors: Array) -> Array:
         """Return vectors (n, 3) of the machine's axes, m, in coordinates of the program."""
         return self._rotated(index, vectors, -1.0) / self.scale[index, None]

@@ -19,6 +19,7 @@ DECIMALS = {UNITS["mm"]: 4, UNITS["inch"]: 5}
 
 _STOPS = {0.0, 1.0, 2.0, 30.0, 60.0}
 _NUMBER = re.compile(r"^\s*(?:[nN]\s*\d+\s*)?")
+_OF_MOVE = set("XYZIJKxyzijk")
 _AXES = "XYZ"
 _OFFSETS = "IJK"
 
@@ -340,12 +341,15 @@ def _ahead(word: str, text: str) -> str:
 
 
 def _joined(parts: Sequence[str | None], new: dict[int, str], tail: str = "") -> str:
-    """Return a line with other numbers; ``tail`` stands behind its last word. An empty number removes the word."""
+    """Return a line with other numbers; ``tail`` stands behind its last word of a position. An empty number removes the word."""
     found = [part or "" for part in parts]
-    end = -1
+    end = axis = -1
     for index in range(2, len(found), STRIDE):
         if found[index]:
             end = index
+            if found[index - 1] in _OF_MOVE:
+                axis = index
+    end = axis if axis >= 0 else end
     for index, number in new.items():
         found[index] = number
         if not number:

@@ -89,8 +89,8 @@ def test_no_more_pieces_than_the_tolerance_demands() -> None:
 def test_words_comments_and_codes_stay_in_place() -> None:
     lines = [*HEAD, "N10 g1 x100 y50 (to the side) M8 S800 f200 ; and on", "N20 X0 M0"]
     new = rewritten(lines, bent)
-    assert new[3].startswith("N10 g1 (to the side) M8 S800 f200 X")
-    assert new[3].endswith("; and on")
+    assert new[3].startswith("N10 g1 X")
+    assert new[3].endswith("(to the side) M8 S800 f200 ; and on")
     assert all(line.startswith("X") for line in new[4 : new.index(next(x for x in new if x.startswith("N20")))])
     assert "M0" not in new[-2]
     assert new[-1] == "M0"
@@ -194,3 +194,12 @@ def test_arcs_stay_arcs() -> None:
     new = moves_of(rewritten([*HEAD, "G0 X40", "G3 X40 Y0 I-40 J0"], bent))[2:]
     assert 4 <= len(new) <= 12
     assert all(move.kind > LINE for move in new)
+
+
+def test_the_points_for_the_page_have_the_correction_that_acts_there() -> None:
+    for seed in range(3):
+        made = Rewriting(Reader(ORIGINS), bent)
+        list(made.lines(Programs(Random(seed)).lines(40)))
+        found = made.summary
+        assert np.abs(found.offsets - waves(found.places)).max() < 2e-6
+        assert found.largest <= np.linalg.norm(found.offsets, axis=1).max() + 2e-6
