@@ -19,6 +19,10 @@ ORIGINS = Offsets(
 """Work offsets and tools that are all known."""
 
 
+CHORD = 3e-8
+"""Largest distance of an arc from the polyline in its place, m."""
+
+
 def field(shift: Callable[[np.ndarray], np.ndarray]) -> Callable[..., SimpleNamespace]:
     """Return a correction of the positions alone."""
     return lambda places, _: SimpleNamespace(offset=shift(places), valid=np.ones(len(places), bool))
@@ -38,8 +42,11 @@ def moves_of(lines: Sequence[str]) -> list[Move | Left | Setting]:
 
 
 def dense(move: Move, points: int) -> np.ndarray:
-    """Return positions of the machine's axes along a move, (points, 3), m."""
+    """Return positions of the machine's axes along a move, m: so many, or as many as an arc needs."""
     path = Path([move])
+    if move.kind > LINE:
+        radius = float(path.radius(path.arcs)[0]) * move.frame.scale
+        points = max(8, int(abs(move.sweep) / np.sqrt(8 * CHORD / radius)) + 2)
     index = np.zeros(points, int)
     return path.machine(index, path.points(index, np.linspace(0, 1, points)))
 
@@ -78,22 +85,13 @@ def deviations(
     for move in moves_of(tagged):
         if move.kind < LINE:
             continue
-        meant = dense(move, 200)
+        tag = move.block.text[move.block.text.index("(@") :]
+        meant = dense(move, 1000)
         if actual is np.asarray:
             meant = meant + correcting(meant, np.zeros_like(meant)).offset
-        tag = move.block.text[move.block.text.index("(@") :]
-        made = np.concatenate([actual(dense(each, 2 if each.kind == LINE else 1500)) for each in groups[tag]])
-        if actual is not np.asarray:
-            made = np.concatenate([actual(dense(each, 300 if each.kind == LINE else 1500)) for each in groups[tag]])
-            meant = dense(move, 1500)
+        made = np.concatenate([actual(dense(each, 2 if actual is np.asarray else 60)) for each in groups[tag]])
         away = max(
-            to_line(meant[:: max(1, len(meant) // 200)], made).max(),
-            to_line(made[:: max(1, len(made) // 200)], _finer(move, correcting, actual)).max(),
+            to_line(meant[:: len(meant) // 50 + 1], made).max(), to_line(made[:: len(made) // 50 + 1], meant).max()
         )
         found.append((move.block.text, float(away)))
     return found
-
-
-def _finer(move: Move, correcting: Callable[..., SimpleNamespace], actual: object) -> np.ndarray:
-    points = dense(move, 3000)
-    return points + correcting(points, np.zeros_like(points)).offset if actual is np.asarray else points

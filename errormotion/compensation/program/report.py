@@ -111,13 +111,13 @@ def _summary(outcome: Outcome, settings: Settings) -> list[str]:
     found = outcome.summary
     words = [
         f"Cuts follow the corrected path to {significant(1e6 * settings.tolerance, 2)} µm and the last printed digit.",
-        f"{integer(found.cuts)} cuts of {fixed(found.length, 3)} m and {integer(found.rapids)} rapid moves are corrected.",
+        f"Corrected: {integer(found.cuts)} cuts of {fixed(found.length, 3)} m, {integer(found.rapids)} rapid moves.",
     ]
     if found.outside[0]:
         count, line = found.outside
         words.append(
-            f"{integer(count)} moves lead outside of what was measured, the first in line {line}: there the correction is "
-            "held at the edge."
+            f"{integer(count)} moves lead outside of what was measured, the first in line {line}: "
+            "there the correction is held at the edge."
         )
     if found.uncorrected[0]:
         count, line = found.uncorrected

@@ -341,7 +341,7 @@ def _ahead(word: str, text: str) -> str:
 
 
 def _joined(parts: Sequence[str | None], new: dict[int, str], tail: str = "") -> str:
-    """Return a line with other numbers; ``tail`` stands behind its last word of a position. An empty number removes the word."""
+    """Return a line with other numbers, an empty one for no word; ``tail`` follows its last word of a position."""
     found = [part or "" for part in parts]
     end = axis = -1
     for index in range(2, len(found), STRIDE):
