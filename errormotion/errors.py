@@ -56,6 +56,10 @@ class RunError(ErrormotionError):
     """A run folder cannot be written, read or resumed."""
 
 
+class CompensationError(ErrormotionError):
+    """A correction cannot be made, or must not be written to a machine."""
+
+
 class PluginError(ErrormotionError):
     """A plugin is unknown or broken."""
 

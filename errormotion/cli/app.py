@@ -32,9 +32,7 @@ model_app = typer.Typer(
     no_args_is_help=True, help="Thermal models: errors predicted from temperatures.", rich_markup_mode=None
 )
 app.add_typer(model_app, name="model")
-compensate_app = typer.Typer(
-    no_args_is_help=True, help="Compensation: tables for controllers, corrected NC programs.", rich_markup_mode=None
-)
+compensate_app = typer.Typer(no_args_is_help=True, help="Compensate measured errors.", rich_markup_mode=None)
 app.add_typer(compensate_app, name="compensate")
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
@@ -216,6 +214,37 @@ def monitor(
     from errormotion.cli.commands import monitor as command
 
     command.run(bench, runs, interval, duration, json_)
+
+
+@compensate_app.command("run")
+@guarded
+def compensate_run(
+    bench: Annotated[Path, typer.Argument(help="A bench file with thermometers and, to write, a table [compensator].")],
+    model: Annotated[Path, typer.Option("--model", "-m", help="A thermal model of the machine.")],
+    arm: Annotated[
+        str | None,
+        typer.Option(metavar="MACHINE", help="Write offsets; the name of the machine as in the bench file."),
+    ] = None,
+    since: Annotated[
+        Path | None,
+        typer.Option(help="Log of a monitor or an earlier compensation that began in the reference state."),
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Where the errors are to vanish, mm; default: as the model states."),
+    ] = None,
+    runs: Annotated[Path, typer.Option(help="Folder for the run folder.")] = Path("runs"),
+    duration: Annotated[str | None, typer.Option(help="Ramp to zero and end after this time; default: never.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON document for each interval.")] = False,
+) -> None:
+    """Follow the temperatures of a machine with offsets; without --arm only compute and log them."""
+    from errormotion.cli.commands import follow as command
+
+    point = None if at is None else _millimetres("--at", at)
+    code = command.run(
+        bench, model, runs, arm=arm, since=since, functional_point=point, duration=duration, as_json=json_
+    )
+    raise typer.Exit(code)
 
 
 @app.command()
@@ -516,7 +545,7 @@ def plugins_check(
     plugin: Annotated[str, typer.Argument(help="Its id.")],
     address: Annotated[str | None, typer.Option(help="Address of a real instrument; default: its simulator.")] = None,
     mutants: Annotated[
-        int | None, typer.Option(min=0, help="How many changed frames an instrument has to stand; default 300, in 6 s.")
+        int | None, typer.Option(min=0, help="Changed frames to try: default 300 in 6 s; of more, all.")
     ] = None,
     json_: Json = False,
 ) -> None:

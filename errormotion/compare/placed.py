@@ -47,7 +47,9 @@ class Placed:
 
     def at_times(self, time: Array, grid: Array) -> Placed:
         """Return the errors at other instants."""
-        E, C, F, _ = interpolated(np.asarray(time, dtype=float), self.value, self.total, self.influence, grid)
+        E, C, F, _ = interpolated(
+            np.asarray(time, dtype=float), self.value, self.total, self.influence, grid, starting=True
+        )
         return replace(self, value=E, total=C, influence=F)
 
     def since_first(self) -> Placed:

@@ -25,7 +25,7 @@ import xarray as xr
 
 from errormotion.campaign.bench import Answer
 from errormotion.campaign.files import BenchPlan
-from errormotion.campaign.folder import RunFolder, now
+from errormotion.campaign.folder import FolderGoneError, RunFolder, now
 from errormotion.campaign.journal import cause_of, journal
 from errormotion.campaign.monitor.schema import SCHEMA
 from errormotion.campaign.monitor.sources import Source
@@ -165,7 +165,8 @@ class Monitor:
                 "invalid": {f"no answer of {name}": count for name, count in self._gaps.items()},
             }
             self.folder.step("monitor", "done" if status == "finished" else status, samples=self._recorder.committed)
-            self.folder.save(status=status, reason=reason, acquired=status == "finished")
+            if not isinstance(error, FolderGoneError):  # nothing is written where the folder was
+                self.folder.save(status=status, reason=reason, acquired=status == "finished")
 
     def watch(self, duration: float = math.inf) -> Iterator[Snapshot]:
         """Log rows, and yield each as a snapshot.

@@ -34,8 +34,8 @@ class CorrectionValues:
     offset : (n, 3)
         Translation that is added to the commands of X, Y, Z, m.
     covariance : (n, 3, 3) or None
-        Of the offset, m^2; None where it was not asked for. NaN for a component that is left as it is, and where too
-        few places were measured for an estimate of the interpolation.
+        Of the offset, m^2; None where it was not asked for. NaN where it is not valid, for a component that is left as
+        it is, and where too few places were measured for an estimate of the interpolation.
     valid : (n,) of bool
         Whether place, time and temperatures lie within what was measured. Elsewhere the offset is held at its value
         at the edge.
@@ -136,6 +136,8 @@ class Correction:
             valid &= each.inside & (each.of((~field.trained).astype(float)) == 0)
             turn += np.where(field.known[3:], each.of(field.values[:, 3:]), np.nan)
         found = self._covariance(places, times) if covariance else None
+        if found is not None:
+            found[~valid] = np.nan
         return CorrectionValues(offset, found, valid, turn)
 
     def _displacement(self, places: Array, time: Array | None) -> Array:

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.compensation.correction import Correction, correction
@@ -71,7 +71,7 @@ class AxisTable:
     def step(self) -> float:
         """Distance between points, m; NaN where it is not constant."""
         steps = np.diff(self.positions)
-        return float(steps.mean()) if np.ptp(steps) <= 1e-9 else float("nan")
+        return float(steps.mean()) if np.ptp(steps) <= 1e-8 else float("nan")
 
     @property
     def reversal(self) -> float:
@@ -137,11 +137,13 @@ def axis_table(
     positions = measured if step is None else _multiples(measured, step)
     fine = np.unique(np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in _pairs(measured, positions)]))
     fine = np.append(fine, max(measured[-1], positions[-1]))
-    offset, u = _along(made, positions, k, c, at, time)
-    fine_offset, fine_u = _along(made, fine, k, c, at, time)
+    offset, u, _ = _along(made, positions, k, c, at, time)
+    fine_offset, fine_u, valid = _along(made, fine, k, c, at, time)
     half, half_fine = (_reversal(errors, axis, component, x) / 2 for x in (positions, fine))
     notes = [note for note in made.notes if "left as they are" not in note]
-    if not np.isfinite(fine_u).all():
+    if not valid.all():
+        notes.append("Parts of the table lie outside of what was measured: the correction is held at the edge there.")
+    elif not np.isfinite(fine_u).all():
         notes.append("The uncertainty between measured places is unknown: there are too few of them.")
     return AxisTable(
         axis, component, positions, offset - half, offset + half, u, fine, fine_offset - half_fine,
@@ -186,12 +188,14 @@ def _pairs(measured: Array, positions: Array) -> list[tuple[float, float]]:
     return list(pairwise(edges))
 
 
-def _along(made: Correction, x: Array, k: int, c: int, at: ArrayLike, time: float | None) -> tuple[Array, Array]:
+def _along(
+    made: Correction, x: Array, k: int, c: int, at: ArrayLike, time: float | None
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     points = np.tile(np.asarray(at, dtype=float), (x.size, 1))
     points[:, k] = x
     values = made.at(points, time, covariance=True)
     variance = np.zeros(x.size) if values.covariance is None else values.covariance[:, c, c]
-    return values.offset[:, c], np.sqrt(np.maximum(variance, 0.0))
+    return values.offset[:, c], np.sqrt(np.maximum(variance, 0.0)), values.valid
 
 
 def _reversal(errors: xr.Dataset, axis: str, component: str, x: Array) -> Array:

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
-from errormotion.datasets.text.csv_text import Table
+from errormotion.datasets.text.csv_text import NUMBER, Table
 from errormotion.datasets.text.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
-NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _EMPTY = ("", "NaN", "nan")
 
 

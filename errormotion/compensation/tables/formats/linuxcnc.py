@@ -68,6 +68,7 @@ class LinuxCNCTable:
         what = "trims, added to the command" if settings.type else "positions that the axis reaches"
         comments = [
             f"COMP_FILE_TYPE = {settings.type}: nominal, forward, reverse ({what})",
+            "sign: a positive trim moves the axis in the positive direction",
             f"unit: {settings.unit}, machine coordinates of the joint",
             *table.comments,
             "The table ends above: the first line without three numbers ends it.",
